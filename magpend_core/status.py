@@ -1,0 +1,34 @@
+"""What became of a cell: one code, one sentence each."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """Outcome of one cell (one parameter set and initial condition)."""
+
+    PENDING = 0
+    PERIODIC = 1
+    BOUNDED = 2
+    DIVERGED = 3
+    STEP_LIMIT = 4
+    STEP_UNDERFLOW = 5
+    UNREACHED = 6
+
+    @property
+    def sentence(self) -> str:
+        """What the code means and, where something went wrong, what to do."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.PENDING: "not computed yet; run the same command again to complete it",
+    Status.PERIODIC: "the kept sections close on themselves: an orbit of period orbit_period",
+    Status.BOUNDED: "bounded, and not closed within the periods integrated and the longest period looked for: "
+    "chaotic, quasi-periodic, or still on the way to an orbit",
+    Status.DIVERGED: "a state left the bounds of the system or is not a number",
+    Status.STEP_LIMIT: "one period needed more steps than max_steps_per_period; raise it, or loosen rtol",
+    Status.STEP_UNDERFLOW: "the step size fell below the resolution of time; loosen rtol and atol",
+    Status.UNREACHED: "the branch ended at an earlier point of its path, so this point was not computed",
+}

@@ -1,0 +1,71 @@
+"""What the engine needs to know of a dynamical system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class System:
+    """A periodically forced system of ordinary differential equations, as compiled functions.
+
+    The functions of the hot path (`forcing`, `rhs`, `layers`) are decorated with `jit.inline` and
+    use arithmetic, `simd` and `vecmath` only: they are compiled for groups of lanes. `constants`
+    and `edges` run once per trajectory on plain numbers.
+
+    Attributes
+    ----------
+    name : str
+        Also names the compiled code: one name, one set of functions.
+    state_names : tuple of str
+    is_angle : tuple of bool
+        Which states live on a circle of 2 pi. They are brought back to (-pi, pi] at every section,
+        their full turns counted apart; `rhs` must not change under such a shift.
+    scales : tuple of float
+        Size of each state that counts as 1 when sections are compared.
+    parameter_names : tuple of str
+        Order of the packed parameter vector.
+    n_constants : int
+        Length of the vector that `constants` fills.
+    constants : callable
+        ``constants(frequency, p, out)``: from the drive frequency [Hz] and the packed parameters
+        `p` to what `forcing`, `rhs` and `layers` use.
+    forcing : callable
+        ``forcing(t, c)``: the explicit time dependence, a number, at time `t` [s] since the last
+        section; `c` is the tuple of constants.
+    rhs : callable
+        ``rhs(y, u, c)``: time derivatives as a tuple, from the states `y` and the forcing `u`.
+    n_edges : int
+        Number of known instants per period at which the forcing switches.
+    edges : callable
+        ``edges(frequency, p, times, half_widths)``: fills the instants [s] in [0, 1/frequency), in
+        rising order, and for each the distance in time of the forcing's nearest complex
+        singularity (infinite if there is none).
+    layers : callable
+        ``layers(y, dy, c)``: a tuple of ``(value, rate, half_width)``. The right-hand side changes
+        quickly where `value`, which moves at `rate`, passes zero, and has its nearest complex
+        singularity at an imaginary part `half_width` of `value`. An empty tuple if there are none.
+    escape : tuple of float
+        Bound on the absolute value of each state at a section; beyond it a trajectory has diverged.
+    """
+
+    name: str
+    state_names: tuple[str, ...]
+    is_angle: tuple[bool, ...]
+    scales: tuple[float, ...]
+    parameter_names: tuple[str, ...]
+    n_constants: int
+    constants: Callable[..., Any]
+    forcing: Callable[..., Any]
+    rhs: Callable[..., Any]
+    n_edges: int
+    edges: Callable[..., Any]
+    layers: Callable[..., Any]
+    escape: tuple[float, ...]
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return len(self.state_names)
