@@ -22,8 +22,11 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 
-from magpend_core.jit import inline, kernel, specialise
+from magpend_core import observers
+from magpend_core.jit import OPTIONS, inline, kernel, specialise
+from magpend_core.observers import Observer
 from magpend_core.simd import (
     WIDTH,
     absolute,
@@ -212,3 +215,274 @@ def attempt(w: Any, n_groups: int, limit: float, rtol: float, atol: float, max_a
             run_stage(w, group * ROWS.size, s)
     for group in range(n_groups):
         finish_step(w, group * ROWS.size, rtol, atol, max_attempts)
+
+
+def load_cell(w: Any, base: int, lane: int, frequency: float, p: Any, scratch: Any, edge_times: Any) -> None:
+    """Give a lane the constants and edges of a cell; the state stays."""
+    constants(frequency, p, scratch)
+    for i in range(NC):
+        w[base + ROWS.constants + i * WIDTH + lane] = scratch[i]
+    period = 1.0 / frequency
+    edges(frequency, p, edge_times[0], edge_times[1])
+    w[base + ROWS.period + lane] = period
+    w[base + ROWS.steps + lane] = 0.0
+    w[base + ROWS.rejected + lane] = 0.0
+
+
+def begin_period(w: Any, base: int, lane: int, edge_times: Any) -> int:
+    """Put a lane's time at the start of a period; return the number of the segment's end edge."""
+    w[base + ROWS.time + lane] = 0.0
+    w[base + ROWS.target + lane] = 0.0
+    w[base + ROWS.target_width + lane] = np.inf
+    w[base + ROWS.attempts + lane] = 0.0
+    first = 0
+    if NE > 0 and edge_times[0, 0] == 0.0:
+        w[base + ROWS.target_width + lane] = edge_times[1, 0]
+        first = 1
+    return begin_segment(w, base, lane, edge_times, first)
+
+
+def begin_segment(w: Any, base: int, lane: int, edge_times: Any, edge: int) -> int:
+    """Let a lane run from its last target to the edge number `edge`, or to the period's end."""
+    w[base + ROWS.start + lane] = w[base + ROWS.target + lane]
+    w[base + ROWS.start_width + lane] = w[base + ROWS.target_width + lane]
+    if edge < NE:
+        w[base + ROWS.target + lane] = edge_times[0, edge]
+        w[base + ROWS.target_width + lane] = edge_times[1, edge]
+        return edge
+    w[base + ROWS.target + lane] = w[base + ROWS.period + lane]
+    # the next period starts with edge 0 if that is at time 0
+    starts = NE > 0 and edge_times[0, 0] == 0.0
+    w[base + ROWS.target_width + lane] = edge_times[1, 0] if starts else np.inf
+    return NE
+
+
+def take_section(w: Any, base: int, lane: int, section: Any, turns: Any) -> bool:
+    """Copy a lane's state to `section`, angles wrapped in place; return whether it is in bounds."""
+    good = True
+    for i in range(N):
+        at = base + ROWS.state + i * WIDTH + lane
+        x = w[at]
+        if not abs(x) <= ESCAPE[i]:
+            good = False
+        elif IS_ANGLE[i] and not (-math.pi < x <= math.pi):
+            n = math.ceil((x - math.pi) / TWO_PI)
+            x -= n * TWO_PI
+            # rounding can leave x on the wrong side of the cut
+            if x <= -math.pi:
+                x = math.pi
+            turns[i] += n
+            w[at] = x
+            w[base + ROWS.fresh + lane] = 1.0
+        section[i] = x
+    return good
+
+
+def move_lane(w: Any, n_lanes: int, source: int, target: int) -> None:
+    """Copy all rows of one lane to another."""
+    a = (source // WIDTH) * ROWS.size + source % WIDTH
+    b = (target // WIDTH) * ROWS.size + target % WIDTH
+    for row in range(0, ROWS.size, WIDTH):
+        w[b + row] = w[a + row]
+
+
+class Work(NamedTuple):
+    """Per-lane bookkeeping of the scalar pass, one entry or row per lane."""
+
+    lanes: Any  # float64, the groups' rows
+    branch: Any  # int64
+    point: Any  # int64, within the branch
+    edge: Any  # int64, the edge at the end of the segment
+    i_period: Any  # int64, completed periods of this cell
+    turns: Any  # int64 (lanes, n_states), since the branch's start
+    edge_times: Any  # float64 (lanes, 2, n_edges)
+    memory: Any  # float64 (lanes, n_memory), the observer's own
+
+
+class Cells(NamedTuple):
+    """Input and output arrays of `advance`; the first two dims are branch and point."""
+
+    frequency: Any  # Hz
+    parameters: Any  # (..., n_parameters)
+    state: Any  # (branch, n_states): initial, at the end final
+    step_size: Any  # (branch,): initial [s] or 0, at the end the next
+    turns: Any  # int64 (branch, n_states): at the end the turns since the start
+    section: Any  # (..., n_keep, n_states)
+    measures: Any  # (..., n_measures)
+    status: Any  # int64
+    n_periods: Any  # int64
+    n_steps: Any  # int64, accepted
+    n_rejected: Any  # int64
+
+
+def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any) -> None:
+    """Put a branch's initial state and first cell into a lane."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    for i in range(N):
+        w_at = base + ROWS.state + i * WIDTH + column
+        work.lanes[w_at] = cells.state[branch, i]
+        work.turns[lane, i] = 0
+    work.branch[lane] = branch
+    start_point(cells, work, lane, 0, scratch)
+    # angles come in as given; from here on they are in (-pi, pi] at every section
+    take_section(work.lanes, base, column, scratch, work.turns[lane])
+    given = cells.step_size[branch]
+    work.lanes[base + ROWS.wish + column] = given if given > 0.0 else 1e-3 * work.lanes[base + ROWS.period + column]
+
+
+def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -> None:
+    """Begin the cell `point` of a lane's branch from the lane's state."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    branch = work.branch[lane]
+    frequency = cells.frequency[branch, point]
+    load_cell(work.lanes, base, column, frequency, cells.parameters[branch, point], scratch, work.edge_times[lane])
+    work.edge[lane] = begin_period(work.lanes, base, column, work.edge_times[lane])
+    work.point[lane] = point
+    work.i_period[lane] = 0
+    work.memory[lane, :] = 0.0
+    work.lanes[base + ROWS.fresh + column] = 1.0
+    work.lanes[base + ROWS.after_rejection + column] = 0.0
+    work.lanes[base + ROWS.event + column] = NOTHING
+
+
+def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
+    """Write a finished cell's outcome."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    at = (work.branch[lane], work.point[lane])
+    cells.status[at] = status
+    cells.n_periods[at] = work.i_period[lane]
+    cells.n_steps[at] = int(work.lanes[base + ROWS.steps + column])
+    cells.n_rejected[at] = int(work.lanes[base + ROWS.rejected + column])
+    if status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW:
+        cells.section[at] = np.nan
+
+
+def end_branch(cells: Cells, work: Work, lane: int, status: int) -> None:
+    """Write a branch's last state; mark the points that it did not reach."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    branch = work.branch[lane]
+    for point in range(work.point[lane] + 1, cells.frequency.shape[1]):
+        cells.status[branch, point] = UNREACHED
+        cells.section[branch, point] = np.nan
+    for i in range(N):
+        cells.state[branch, i] = work.lanes[base + ROWS.state + i * WIDTH + column]
+        cells.turns[branch, i] = work.turns[lane, i]
+    cells.step_size[branch] = work.lanes[base + ROWS.wish + column]
+
+
+def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scratch: Any) -> bool:
+    """Act on a lane's event; return True when its branch has ended."""
+    w, base, column = work.lanes, (lane // WIDTH) * ROWS.size, lane % WIDTH
+    event = w[base + ROWS.event + column]
+    w[base + ROWS.event + column] = NOTHING
+    status = PENDING
+    if event == REACHED:
+        if work.edge[lane] < NE:
+            work.edge[lane] = begin_segment(w, base, column, work.edge_times[lane], work.edge[lane] + 1)
+            return False
+        work.i_period[lane] += 1
+        if take_section(w, base, column, section, work.turns[lane]):
+            at = (work.branch[lane], work.point[lane])
+            status = observe(
+                section, work.turns[lane], work.i_period[lane], work.memory[lane],
+                cells.section[at], cells.measures[at], settings,
+            )  # fmt: skip
+        else:
+            status = DIVERGED
+        if status == PENDING:
+            work.edge[lane] = begin_period(w, base, column, work.edge_times[lane])
+            return False
+    elif event == TOO_MANY_STEPS:
+        status = STEP_LIMIT
+    else:
+        status = STEP_UNDERFLOW
+    end_cell(cells, work, lane, status)
+    failed = status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW
+    if failed or work.point[lane] + 1 == cells.frequency.shape[1]:
+        end_branch(cells, work, lane, status)
+        return True
+    start_point(cells, work, lane, work.point[lane] + 1, scratch)
+    return False
+
+
+def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, limit: float, max_attempts: float, settings: Any) -> None:
+    """Integrate all branches, `n_lanes` at a time, and fill the output arrays of `cells`."""
+    n_branches = cells.frequency.shape[0]
+    active = min(n_lanes, n_branches)
+    n_groups = (active + WIDTH - 1) // WIDTH
+    size = n_groups * WIDTH
+    work = Work(
+        np.zeros(n_groups * ROWS.size), np.zeros(size, np.int64), np.zeros(size, np.int64),
+        np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros((size, N), np.int64),
+        np.zeros((size, 2, max(NE, 1))), np.zeros((size, memory_size(settings, N))),
+    )  # fmt: skip
+    scratch = np.zeros(max(NC, N))
+    section = np.zeros(N)
+    for lane in range(size):
+        # lanes beyond the last branch repeat it, so that they hold ordinary numbers; no one looks
+        start_branch(cells, work, lane, min(lane, n_branches - 1), scratch)
+    next_branch = active
+    while active > 0:
+        attempt(work.lanes, (active + WIDTH - 1) // WIDTH, limit, rtol, atol, max_attempts)
+        lane = 0
+        while lane < active:
+            if work.lanes[(lane // WIDTH) * ROWS.size + ROWS.event + lane % WIDTH] == NOTHING:
+                lane += 1
+            elif not serve(cells, work, lane, settings, section, scratch):
+                lane += 1
+            elif next_branch < n_branches:
+                start_branch(cells, work, lane, next_branch, scratch)
+                next_branch += 1
+                lane += 1
+            else:
+                # the last lane moves here, with its event if it has one
+                active -= 1
+                copy_lane(work, active, lane)
+
+
+def copy_lane(work: Work, source: int, target: int) -> None:
+    """Copy everything that belongs to one lane to another."""
+    move_lane(work.lanes, 0, source, target)
+    work.branch[target] = work.branch[source]
+    work.point[target] = work.point[source]
+    work.edge[target] = work.edge[source]
+    work.i_period[target] = work.i_period[source]
+    work.turns[target] = work.turns[source]
+    work.edge_times[target] = work.edge_times[source]
+    work.memory[target] = work.memory[source]
+
+
+_INLINE = ("squared_error", "load_cell", "begin_segment", "begin_period", "take_section", "move_lane")
+_CALLED = (
+    "choose_step", "run_stage", "finish_step", "attempt",
+    "end_cell", "end_branch", "start_point", "start_branch", "serve", "copy_lane",
+)  # fmt: skip
+
+
+@lru_cache(maxsize=None)
+def engine_of(system: System, observer: Observer) -> Callable[..., None]:
+    """Compile `advance` for a system and an observer."""
+    name = f"{system.name}_{observer.name}"
+    bindings: dict[str, Any] = {
+        "ROWS": rows_of(system),
+        "N": system.n_states,
+        "NC": system.n_constants,
+        "NE": system.n_edges,
+        "IS_ANGLE": system.is_angle,
+        "SCALES": system.scales,
+        "ESCAPE": system.escape,
+        "constants": system.constants,
+        "edges": system.edges,
+        "forcing": system.forcing,
+        "rhs": system.rhs,
+        "layers": system.layers,
+        "memory_size": observer.memory_size,
+        **observer.bindings,
+    }
+    for key in ("_lag_distance", "_largest_lag", "_smallest_divisor", "closed_period"):
+        bindings[key] = inline(specialise(getattr(observers, key), name, **bindings))
+    bindings["observe"] = inline(specialise(observer.observe, name, **bindings))
+    for key in (*_INLINE, *_CALLED):
+        function = specialise(globals()[key], name, **bindings)
+        bindings[key] = inline(function) if key in _INLINE else njit(**OPTIONS)(function)
+    return kernel(specialise(advance, name, **bindings))
