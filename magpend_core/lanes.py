@@ -58,7 +58,7 @@ STAGES = np.array(
 )
 ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
 N_STAGES = 7
-A = tuple(tuple(float(x) for x in row) for row in STAGES)
+ZERO = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
 
 SAFETY = 0.9
 SHRINK = 0.2
@@ -323,7 +323,7 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any)
         work.lanes[w_at] = cells.state[branch, i]
         work.turns[lane, i] = 0
     work.branch[lane] = branch
-    start_point(cells, work, lane, 0, scratch)
+    start_point(cells, work, lane, ZERO, scratch)
     # angles come in as given; from here on they are in (-pi, pi] at every section
     take_section(work.lanes, base, column, scratch, work.turns[lane])
     given = cells.step_size[branch]
@@ -339,10 +339,18 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -
     work.edge[lane] = begin_period(work.lanes, base, column, work.edge_times[lane])
     work.point[lane] = point
     work.i_period[lane] = 0
-    work.memory[lane, :] = 0.0
+    for i in range(work.memory.shape[1]):
+        work.memory[lane, i] = 0.0
     work.lanes[base + ROWS.fresh + column] = 1.0
     work.lanes[base + ROWS.after_rejection + column] = 0.0
     work.lanes[base + ROWS.event + column] = NOTHING
+
+
+def forget(cells: Cells, branch: int, point: int) -> None:
+    """Take back the sections of a cell that failed."""
+    for i in range(cells.section.shape[2]):
+        for k in range(N):
+            cells.section[branch, point, i, k] = np.nan
 
 
 def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
@@ -354,7 +362,7 @@ def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
     cells.n_steps[at] = int(work.lanes[base + ROWS.steps + column])
     cells.n_rejected[at] = int(work.lanes[base + ROWS.rejected + column])
     if status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW:
-        cells.section[at] = np.nan
+        forget(cells, work.branch[lane], work.point[lane])
 
 
 def end_branch(cells: Cells, work: Work, lane: int, status: int) -> None:
@@ -363,7 +371,7 @@ def end_branch(cells: Cells, work: Work, lane: int, status: int) -> None:
     branch = work.branch[lane]
     for point in range(work.point[lane] + 1, cells.frequency.shape[1]):
         cells.status[branch, point] = UNREACHED
-        cells.section[branch, point] = np.nan
+        forget(cells, branch, point)
     for i in range(N):
         cells.state[branch, i] = work.lanes[base + ROWS.state + i * WIDTH + column]
         cells.turns[branch, i] = work.turns[lane, i]
@@ -424,7 +432,7 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, limit: float, 
     next_branch = active
     while active > 0:
         attempt(work.lanes, (active + WIDTH - 1) // WIDTH, limit, rtol, atol, max_attempts)
-        lane = 0
+        lane = ZERO
         while lane < active:
             if work.lanes[(lane // WIDTH) * ROWS.size + ROWS.event + lane % WIDTH] == NOTHING:
                 lane += 1
@@ -447,15 +455,19 @@ def copy_lane(work: Work, source: int, target: int) -> None:
     work.point[target] = work.point[source]
     work.edge[target] = work.edge[source]
     work.i_period[target] = work.i_period[source]
-    work.turns[target] = work.turns[source]
-    work.edge_times[target] = work.edge_times[source]
-    work.memory[target] = work.memory[source]
+    for i in range(N):
+        work.turns[target, i] = work.turns[source, i]
+    for i in range(NE):
+        work.edge_times[target, 0, i] = work.edge_times[source, 0, i]
+        work.edge_times[target, 1, i] = work.edge_times[source, 1, i]
+    for i in range(work.memory.shape[1]):
+        work.memory[target, i] = work.memory[source, i]
 
 
 _INLINE = ("squared_error", "load_cell", "begin_segment", "begin_period", "take_section", "move_lane")
 _CALLED = (
     "choose_step", "run_stage", "finish_step", "attempt",
-    "end_cell", "end_branch", "start_point", "start_branch", "serve", "copy_lane",
+    "forget", "end_cell", "end_branch", "start_point", "start_branch", "serve", "copy_lane",
 )  # fmt: skip
 
 
