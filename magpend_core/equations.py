@@ -26,7 +26,7 @@ from magpend_core.jit import inline
 from magpend_core.simd import absolute, sqrt
 from magpend_core.vecmath import TWO_OVER_PI, TWO_PI, atan, exp, sincos, wrapped
 
-LOAD_SWEEPS = 3
+LOAD_SWEEPS = 4
 """Fixed-point sweeps for the bearing loads; three reach 1e-12 relative on the preset."""
 
 VACUUM_PERMEABILITY = 1.25663706212e-6  # N/A2, CODATA 2018
@@ -56,11 +56,15 @@ class LinkConstants(NamedTuple):
     one_minus_mu0: Any
     c0: Any  # s/rad
     eps: Any  # s/rad
+    per_eps: Any  # rad/s
     omega: Any  # rad/s, of the drive
     phase: Any  # rad, Eq. 14 corrected
     offset: Any  # a of Eq. 13
     drive_amplitude: Any  # N m, 2 q/pi
     eps_drive: Any
+    compliance1: Any  # 1/(kg m2), acceleration per torque on link 1, links in line
+    friction_jump1: Any  # rad/s2, change of acceleration when joint 1 reverses
+    friction_jump2: Any  # rad/s2
 
 
 class FittedConstants(NamedTuple):
@@ -81,12 +85,14 @@ class FittedConstants(NamedTuple):
     m: Any  # slope of the middle of the peaks
     n: Any  # rad
     eps_mag: Any  # 1/rad
+    per_eps_mag: Any  # rad
     l1: Any  # m
     l2: Any
     h: Any
     per_h: Any  # 1/m
     delta2: Any  # m2
     delta: Any  # m
+    magnet_jump: Any  # rad/s2, change of acceleration from one bump to the other
 
 
 class DipoleConstants(NamedTuple):
@@ -111,12 +117,17 @@ def link_constants(frequency: Any, p: Any) -> Any:
     )  # fmt: skip
     B1 = J1 + e1 * e1 * m1 + l1 * l1 * m2
     B2 = J2 + e2 * e2 * m2
+    N12 = m2 * e2 * l1
     phase = (math.pi - TWO_PI * duty) / 2.0
+    per_det = 1.0 / (B1 * B2 - N12 * N12)
+    jump1 = 2.0 * (T1 + mu * g * (m1 + m2)) * B2 * per_det
+    jump2 = 2.0 * (T2 + mu * g * m2) * (B1 + N12) * per_det
     return LinkConstants(
-        B1, B2, m2 * e2 * l1, m1 * g * e1 + m2 * g * l1, m2 * g * e2, B1 * B2,
+        B1, B2, N12, m1 * g * e1 + m2 * g * l1, m2 * g * e2, B1 * B2,
         m1 * g, m2 * g, m1 * e1, m2 * e2, m2 * l1, m1 * e1 + m2 * l1,
-        T1, T2, 2.0 * c, c, mu, mu0, 1.0 - mu0, c0, eps,
+        T1, T2, 2.0 * c, c, mu, mu0, 1.0 - mu0, c0, eps, 1.0 / eps,
         TWO_PI * frequency, phase, -sincos(phase)[0], TWO_OVER_PI * q, eps_drive,
+        B2 * per_det, jump1, jump2,
     )  # fmt: skip
 
 

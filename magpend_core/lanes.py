@@ -60,10 +60,11 @@ ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 /
 N_STAGES = 7
 ZERO = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
 
-SAFETY = 0.9
+SAFETY = 0.85
 SHRINK = 0.2
 GROW = 5.0
 _LN2_TENTH = math.log(2.0) / 10.0
+_LN2_SIXTH = math.log(2.0) / 6.0
 
 # events that the vector part leaves for the scalar pass
 NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW = 0.0, 1.0, 2.0, 3.0
@@ -87,6 +88,8 @@ class Rows(NamedTuple):
     target: int  # s, end of the segment
     start_width: int  # s, half-width of the edge at the start
     target_width: int  # s
+    start_ratio: int  # step_ratio of the edge at the start
+    target_ratio: int
     period: int  # s
     steps: int  # accepted in this cell
     rejected: int  # rejected attempts in this cell
@@ -98,20 +101,30 @@ class Rows(NamedTuple):
 def rows_of(system: System) -> Rows:
     """Lay out a group for a system."""
     counts = [
-        system.n_states, N_STAGES * system.n_states, system.n_states, system.n_constants, *[1] * 14,
+        system.n_states, N_STAGES * system.n_states, system.n_states, system.n_constants, *[1] * 16,
     ]  # fmt: skip
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
     return Rows(*(int(x) for x in offsets))
 
 
-def choose_step(w: Any, base: int, limit: float) -> None:
+def step_ratio(slack: Any, strength: Any) -> Any:
+    """Largest step near a layer, in units of the distance from its complex singularity.
+
+    The right-hand side near a layer behaves like (J/pi) atan(t/d), whose derivatives at a distance R
+    from the poles at +-i d grow like J d n!/R^(n+1): a step h = c R leaves an error in proportion to
+    J d c^6 for a method of order 5, so that c = (slack/(J d))^(1/6).
+    """
+    return exp(log2_rough(maximum(slack / maximum(strength, 1e-300), 1e-300)) * _LN2_SIXTH)
+
+
+def choose_step(w: Any, base: int, slack: float) -> None:
     """Set the step of the next attempt.
 
     The step is the least of what error control wants and, for each layer and edge, what keeps it in
     proportion to the distance from the nearest complex singularity: with D the distance in time to
-    the crossing and d the half-width in time, at most max(limit D/(1 + limit), limit d) towards
-    the crossing and limit sqrt(D^2 + d^2) away from it. It ends on the segment's end exactly, and
-    the last two steps before that share the rest.
+    the crossing, d the half-width in time and c the layer's `step_ratio`, at most
+    max(c D/(1 + c), c d) towards the crossing and c sqrt(D^2 + d^2) away from it. It ends on the
+    segment's end exactly, and the last two steps before that share the rest.
     """
     y = load_rows(w, base + ROWS.state, N)
     dy = load_rows(w, base + ROWS.slopes, N)
@@ -119,18 +132,20 @@ def choose_step(w: Any, base: int, limit: float) -> None:
     t = load(w, base + ROWS.time)
     remaining = load(w, base + ROWS.target) - t
     h = load(w, base + ROWS.wish)
-    approach = limit / (1.0 + limit)
-    for value, rate, half_width in layers(y, dy, c):
-        distance = absolute(value)
-        towards = maximum(approach * distance, limit * half_width)
-        away = limit * sqrt(value * value + half_width * half_width)
-        h = minimum(where_less(value * rate, 0.0, towards, away) / absolute(rate), h)
+    for value, rate, half_width, jump in layers(y, dy, c):
+        speed = absolute(rate)
+        ratio = step_ratio(slack * speed, jump * half_width)
+        towards = maximum(ratio / (1.0 + ratio) * absolute(value), ratio * half_width)
+        away = ratio * sqrt(value * value + half_width * half_width)
+        h = minimum(where_less(value * rate, 0.0, towards, away) / speed, h)
     if NE > 0:
         passed = t - load(w, base + ROWS.start)
         width = load(w, base + ROWS.start_width)
-        h = minimum(limit * sqrt(passed * passed + width * width), h)
+        ratio = load(w, base + ROWS.start_ratio)
+        h = minimum(ratio * sqrt(passed * passed + width * width), h)
         width = load(w, base + ROWS.target_width)
-        h = minimum(maximum(approach * remaining, limit * width), h)
+        ratio = load(w, base + ROWS.target_ratio)
+        h = minimum(maximum(ratio / (1.0 + ratio) * remaining, ratio * width), h)
     shared = where_less(remaining, 2.0 * h, 0.5 * remaining, h)
     h = where_less(h, remaining, shared, remaining)
     h = where_less(0.5, load(w, base + ROWS.fresh), 0.0, h)
@@ -171,19 +186,20 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
     """Accept or reject the attempt, lane by lane, and set the next wish and the event."""
     e2 = minimum(squared_error(w, base, rtol, atol), 1e20)
     factor = SAFETY * exp(log2_rough(maximum(e2, 1e-20)) * -_LN2_TENTH)
-    factor = minimum(maximum(factor, SHRINK), GROW)
-    factor = where_less(0.5, load(w, base + ROWS.after_rejection), minimum(factor, 1.0), factor)
+    bounded = minimum(maximum(factor, SHRINK), GROW)
+    bounded = where_less(0.5, load(w, base + ROWS.after_rejection), minimum(bounded, 1.0), bounded)
     h = load(w, base + ROWS.step)
     wish = load(w, base + ROWS.wish)
     t = load(w, base + ROWS.time)
     target = load(w, base + ROWS.target)
     rejected = where_less(1.0, e2, 1.0, 0.0)
-    # an attempt cut short by a layer or a target says little about the step that error control
-    # allows afterwards: the old wish stands unless the error asks for more
-    next_wish = where_less(h, wish, maximum(wish, h * factor), h * factor)
-    next_wish = where_less(0.5, rejected, h * factor, next_wish)
+    # an attempt cut short by a layer or a target: the old wish stands unless the error says that
+    # it is too much, or allows more
+    next_wish = where_less(h, wish, minimum(h * factor, maximum(wish, h * bounded)), h * bounded)
+    next_wish = where_less(0.5, rejected, h * bounded, next_wish)
     stepped = where_less(0.0, h, 1.0, 0.0)
-    store(w, base + ROWS.wish, where_less(0.5, stepped, next_wish, wish))
+    next_wish = where_less(0.5, stepped, next_wish, wish)
+    store(w, base + ROWS.wish, next_wish)
     for i in range(N):
         row = base + i * WIDTH
         old = load(w, row + ROWS.state)
@@ -206,10 +222,10 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
     store(w, base + ROWS.event, event)
 
 
-def attempt(w: Any, n_groups: int, limit: float, rtol: float, atol: float, max_attempts: float) -> None:
+def attempt(w: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float) -> None:
     """Advance all groups by one attempted step."""
     for group in range(n_groups):
-        choose_step(w, group * ROWS.size, limit)
+        choose_step(w, group * ROWS.size, slack)
     for s in range(1, N_STAGES):
         for group in range(n_groups):
             run_stage(w, group * ROWS.size, s)
@@ -217,43 +233,51 @@ def attempt(w: Any, n_groups: int, limit: float, rtol: float, atol: float, max_a
         finish_step(w, group * ROWS.size, rtol, atol, max_attempts)
 
 
-def load_cell(w: Any, base: int, lane: int, frequency: float, p: Any, scratch: Any, edge_times: Any) -> None:
+def load_cell(
+    w: Any, base: int, lane: int, frequency: float, p: Any, slack: float, scratch: Any, edge_table: Any
+) -> None:
     """Give a lane the constants and edges of a cell; the state stays."""
     constants(frequency, p, scratch)
     for i in range(NC):
         w[base + ROWS.constants + i * WIDTH + lane] = scratch[i]
     period = 1.0 / frequency
-    edges(frequency, p, edge_times[0], edge_times[1])
+    edges(frequency, p, edge_table[0], edge_table[1], edge_table[2])
+    for i in range(NE):
+        edge_table[2, i] = step_ratio(slack, edge_table[2, i] * edge_table[1, i])
     w[base + ROWS.period + lane] = period
     w[base + ROWS.steps + lane] = 0.0
     w[base + ROWS.rejected + lane] = 0.0
 
 
-def begin_period(w: Any, base: int, lane: int, edge_times: Any) -> int:
+def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
     """Put a lane's time at the start of a period; return the number of the segment's end edge."""
     w[base + ROWS.time + lane] = 0.0
-    w[base + ROWS.target + lane] = 0.0
-    w[base + ROWS.target_width + lane] = np.inf
     w[base + ROWS.attempts + lane] = 0.0
-    first = 0
-    if NE > 0 and edge_times[0, 0] == 0.0:
-        w[base + ROWS.target_width + lane] = edge_times[1, 0]
-        first = 1
-    return begin_segment(w, base, lane, edge_times, first)
+    if NE > 0 and edge_table[0, 0] == 0.0:
+        set_target(w, base, lane, 0.0, edge_table, 0)
+        return begin_segment(w, base, lane, edge_table, 1)
+    set_target(w, base, lane, 0.0, edge_table, NE)
+    return begin_segment(w, base, lane, edge_table, 0)
 
 
-def begin_segment(w: Any, base: int, lane: int, edge_times: Any, edge: int) -> int:
+def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge: int) -> None:
+    """Let a segment end at `time`, with the layer of the edge number `edge` (none for n_edges)."""
+    w[base + ROWS.target + lane] = time
+    w[base + ROWS.target_width + lane] = edge_table[1, edge] if edge < NE else np.inf
+    w[base + ROWS.target_ratio + lane] = edge_table[2, edge] if edge < NE else 1.0
+
+
+def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> int:
     """Let a lane run from its last target to the edge number `edge`, or to the period's end."""
     w[base + ROWS.start + lane] = w[base + ROWS.target + lane]
     w[base + ROWS.start_width + lane] = w[base + ROWS.target_width + lane]
+    w[base + ROWS.start_ratio + lane] = w[base + ROWS.target_ratio + lane]
     if edge < NE:
-        w[base + ROWS.target + lane] = edge_times[0, edge]
-        w[base + ROWS.target_width + lane] = edge_times[1, edge]
+        set_target(w, base, lane, edge_table[0, edge], edge_table, edge)
         return edge
-    w[base + ROWS.target + lane] = w[base + ROWS.period + lane]
     # the next period starts with edge 0 if that is at time 0
-    starts = NE > 0 and edge_times[0, 0] == 0.0
-    w[base + ROWS.target_width + lane] = edge_times[1, 0] if starts else np.inf
+    first = 0 if NE > 0 and edge_table[0, 0] == 0.0 else NE
+    set_target(w, base, lane, w[base + ROWS.period + lane], edge_table, first)
     return NE
 
 
@@ -295,7 +319,7 @@ class Work(NamedTuple):
     edge: Any  # int64, the edge at the end of the segment
     i_period: Any  # int64, completed periods of this cell
     turns: Any  # int64 (lanes, n_states), since the branch's start
-    edge_times: Any  # float64 (lanes, 2, n_edges)
+    edge_table: Any  # float64 (lanes, 3, n_edges): time [s], half-width [s], step_ratio
     memory: Any  # float64 (lanes, n_memory), the observer's own
 
 
@@ -304,6 +328,7 @@ class Cells(NamedTuple):
 
     frequency: Any  # Hz
     parameters: Any  # (..., n_parameters)
+    slack: float  # see step_ratio
     state: Any  # (branch, n_states): initial, at the end final
     step_size: Any  # (branch,): initial [s] or 0, at the end the next
     turns: Any  # int64 (branch, n_states): at the end the turns since the start
@@ -335,8 +360,9 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     branch = work.branch[lane]
     frequency = cells.frequency[branch, point]
-    load_cell(work.lanes, base, column, frequency, cells.parameters[branch, point], scratch, work.edge_times[lane])
-    work.edge[lane] = begin_period(work.lanes, base, column, work.edge_times[lane])
+    p = cells.parameters[branch, point]
+    load_cell(work.lanes, base, column, frequency, p, cells.slack, scratch, work.edge_table[lane])
+    work.edge[lane] = begin_period(work.lanes, base, column, work.edge_table[lane])
     work.point[lane] = point
     work.i_period[lane] = 0
     for i in range(work.memory.shape[1]):
@@ -386,7 +412,7 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     status = PENDING
     if event == REACHED:
         if work.edge[lane] < NE:
-            work.edge[lane] = begin_segment(w, base, column, work.edge_times[lane], work.edge[lane] + 1)
+            work.edge[lane] = begin_segment(w, base, column, work.edge_table[lane], work.edge[lane] + 1)
             return False
         work.i_period[lane] += 1
         if take_section(w, base, column, section, work.turns[lane]):
@@ -398,7 +424,7 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
         else:
             status = DIVERGED
         if status == PENDING:
-            work.edge[lane] = begin_period(w, base, column, work.edge_times[lane])
+            work.edge[lane] = begin_period(w, base, column, work.edge_table[lane])
             return False
     elif event == TOO_MANY_STEPS:
         status = STEP_LIMIT
@@ -413,7 +439,9 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     return False
 
 
-def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, limit: float, max_attempts: float, settings: Any) -> None:
+def advance(
+    cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: float, settings: Any
+) -> None:
     """Integrate all branches, `n_lanes` at a time, and fill the output arrays of `cells`."""
     n_branches = cells.frequency.shape[0]
     active = min(n_lanes, n_branches)
@@ -422,7 +450,7 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, limit: float, 
     work = Work(
         np.zeros(n_groups * ROWS.size), np.zeros(size, np.int64), np.zeros(size, np.int64),
         np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros((size, N), np.int64),
-        np.zeros((size, 2, max(NE, 1))), np.zeros((size, memory_size(settings, N))),
+        np.zeros((size, 3, max(NE, 1))), np.zeros((size, memory_size(settings, N))),
     )  # fmt: skip
     scratch = np.zeros(max(NC, N))
     section = np.zeros(N)
@@ -431,7 +459,7 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, limit: float, 
         start_branch(cells, work, lane, min(lane, n_branches - 1), scratch)
     next_branch = active
     while active > 0:
-        attempt(work.lanes, (active + WIDTH - 1) // WIDTH, limit, rtol, atol, max_attempts)
+        attempt(work.lanes, (active + WIDTH - 1) // WIDTH, cells.slack, rtol, atol, max_attempts)
         lane = ZERO
         while lane < active:
             if work.lanes[(lane // WIDTH) * ROWS.size + ROWS.event + lane % WIDTH] == NOTHING:
@@ -458,13 +486,15 @@ def copy_lane(work: Work, source: int, target: int) -> None:
     for i in range(N):
         work.turns[target, i] = work.turns[source, i]
     for i in range(NE):
-        work.edge_times[target, 0, i] = work.edge_times[source, 0, i]
-        work.edge_times[target, 1, i] = work.edge_times[source, 1, i]
+        for k in range(3):
+            work.edge_table[target, k, i] = work.edge_table[source, k, i]
     for i in range(work.memory.shape[1]):
         work.memory[target, i] = work.memory[source, i]
 
 
-_INLINE = ("squared_error", "load_cell", "begin_segment", "begin_period", "take_section", "move_lane")
+_INLINE = (
+    "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period", "take_section", "move_lane",
+)  # fmt: skip
 _CALLED = (
     "choose_step", "run_stage", "finish_step", "attempt",
     "forget", "end_cell", "end_branch", "start_point", "start_branch", "serve", "copy_lane",

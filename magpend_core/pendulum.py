@@ -19,6 +19,7 @@ from magpend_core.equations import (
     link_constants,
     solve_accelerations,
 )
+from magpend_core.jacobian import acceleration_slopes, dipole_torque_slopes, fitted_torque_slopes
 from magpend_core.jit import inline
 from magpend_core.parameters import (
     DipoleMagnet,
@@ -30,7 +31,7 @@ from magpend_core.parameters import (
     _names,
 )
 from magpend_core.system import System
-from magpend_core.vecmath import sincos
+from magpend_core.vecmath import exp, sincos, wrapped
 
 _LINK_NAMES = _names(Pendulum) + _names(Friction) + _names(Drive)
 _N_LINK_PARAMETERS = len(_LINK_NAMES)
@@ -45,10 +46,11 @@ def _fitted_constants(frequency: Any, p: Any, out: Any) -> None:
         out[i] = values[i]
     alpha1, alpha2, beta1, beta2, gamma1, gamma2, p1, p2 = p[18], p[19], p[20], p[21], p[22], p[23], p[24], p[25]
     r1, r2, c1, c2, eps_mag, l2, h, delta = p[26], p[27], p[28], p[29], p[30], p[31], p[32], p[33]
+    magnet_jump = (abs(alpha1) + abs(alpha2)) * values.compliance1
     magnet = FittedConstants(
         0.5 * alpha1, 0.5 * alpha2, beta1, beta2, 1.0 / gamma1, 1.0 / gamma2, p1, p2, r1, r2,
-        1.0 / c1, 1.0 / c2, -0.5 * (p1 + p2), -0.5 * (r1 + r2), eps_mag,
-        p[1], l2, h, 1.0 / h, delta * delta, delta,
+        1.0 / c1, 1.0 / c2, -0.5 * (p1 + p2), -0.5 * (r1 + r2), eps_mag, 1.0 / eps_mag,
+        p[1], l2, h, 1.0 / h, delta * delta, delta, magnet_jump,
     )  # fmt: skip
     for i in range(N_FITTED):
         out[N_LINK + i] = magnet[i]
@@ -92,21 +94,79 @@ def _dipole_rhs(y: Any, u: Any, c: Any) -> Any:
 
 
 @inline
-def _edges(frequency: Any, p: Any, times: Any, half_widths: Any) -> None:
+def _edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
     """Rising edge at 0, falling edge at d/f; sin(omega t + phase) + a has slope omega cos(phase)."""
-    duty, eps_drive = p[15], p[17]
-    slope = 2.0 * math.pi * frequency * sincos(math.pi * (0.5 - duty))[1]
+    k = _link_constants(frequency, p)
+    width = 1.0 / (k.eps_drive * k.omega * sincos(k.phase)[1])
+    jump = math.pi * k.drive_amplitude * k.compliance1
     times[0] = 0.0
-    times[1] = duty / frequency
-    half_widths[0] = 1.0 / (eps_drive * slope)
-    half_widths[1] = half_widths[0]
+    times[1] = p[15] / frequency
+    for i in range(2):
+        half_widths[i] = width
+        jumps[i] = abs(jump)
 
 
 @inline
-def _friction_layers(y: Any, dy: Any, c: Any) -> Any:
+def _friction_layers(y: Any, dy: Any, k: Any) -> Any:
     """Velocity reversals in the joints: atan(eps v) has its poles at v = +-i/eps."""
-    k = LinkConstants(*c[:N_LINK])
-    return (y[2], dy[2], 1.0 / k.eps), (y[3] - y[2], dy[3] - dy[2], 1.0 / k.eps)
+    return (y[2], dy[2], k.per_eps, k.friction_jump1), (y[3] - y[2], dy[3] - dy[2], k.per_eps, k.friction_jump2)
+
+
+@inline
+def _fitted_layers(y: Any, dy: Any, c: Any) -> Any:
+    """The friction's layers and the two of the magnets, from one bump to the other and dy/dx."""
+    link = LinkConstants(*c[:N_LINK])
+    k = FittedConstants(*c[N_LINK:])
+    psi_rel = wrapped(y[1] - y[0])
+    u = (psi_rel + k.beta1) * k.per_gamma1
+    jump = k.magnet_jump * exp(-(u * u))
+    x = wrapped(y[0]) - (k.m * psi_rel + k.n)
+    s1, c1 = sincos(y[0])
+    s2, c2 = sincos(y[1])
+    dx = k.l1 * s1 + k.l2 * s2
+    friction1, friction2 = _friction_layers(y, dy, link)
+    return (
+        friction1,
+        friction2,
+        (x, y[2] - k.m * (y[3] - y[2]), k.per_eps_mag, jump),
+        (dx, k.l1 * c1 * y[2] + k.l2 * c2 * y[3], k.delta, jump),
+    )
+
+
+@inline
+def _dipole_layers(y: Any, dy: Any, c: Any) -> Any:
+    """The friction's layers; the dipoles' field has none."""
+    return _friction_layers(y, dy, LinkConstants(*c[:N_LINK]))
+
+
+@inline
+def _fitted_jacobian(y: Any, u: Any, c: Any) -> Any:
+    psi1, psi2, w1, w2 = y
+    s1, c1 = sincos(psi1)
+    s2, c2 = sincos(psi2)
+    _, _, a1, a2 = _fitted_rhs(y, u, c)
+    slopes = fitted_torque_slopes(psi1, psi2, s1, c1, s2, c2, FittedConstants(*c[N_LINK:]))
+    zero = 0.0 * psi1
+    one = zero + 1.0
+    # `+` joins tuples
+    return (zero, zero, one, zero, zero, zero, zero, one) + acceleration_slopes(
+        s1, c1, s2, c2, w1, w2, a1, a2, slopes, LinkConstants(*c[:N_LINK])
+    )
+
+
+@inline
+def _dipole_jacobian(y: Any, u: Any, c: Any) -> Any:
+    psi1, psi2, w1, w2 = y
+    s1, c1 = sincos(psi1)
+    s2, c2 = sincos(psi2)
+    _, _, a1, a2 = _dipole_rhs(y, u, c)
+    slopes = dipole_torque_slopes(psi1, psi2, s1, c1, s2, c2, DipoleConstants(*c[N_LINK:]))
+    zero = 0.0 * psi1
+    one = zero + 1.0
+    # `+` joins tuples
+    return (zero, zero, one, zero, zero, zero, zero, one) + acceleration_slopes(
+        s1, c1, s2, c2, w1, w2, a1, a2, slopes, LinkConstants(*c[:N_LINK])
+    )
 
 
 PENDULUM_FITTED = System(
@@ -121,7 +181,8 @@ PENDULUM_FITTED = System(
     rhs=_fitted_rhs,
     n_edges=2,
     edges=_edges,
-    layers=_friction_layers,
+    layers=_fitted_layers,
+    jacobian=_fitted_jacobian,
     escape=(math.inf, math.inf, 1e4, 1e4),
 )
 """The pendulum with the fitted magnet torque (Eq. 1-20)."""
@@ -138,7 +199,8 @@ PENDULUM_DIPOLE = System(
     rhs=_dipole_rhs,
     n_edges=2,
     edges=_edges,
-    layers=_friction_layers,
+    layers=_dipole_layers,
+    jacobian=_dipole_jacobian,
     escape=(math.inf, math.inf, 1e4, 1e4),
 )
 """The pendulum with point dipoles (Eq. 1-16)."""

@@ -54,9 +54,7 @@ class Sections:
     step_size: np.ndarray
 
 
-def layer_limit(rtol: float) -> float:
-    """Step near a layer or edge in units of the distance from its complex singularity."""
-    return float(1.0)
+SLACK = 1.0
 
 
 def run_branches(
@@ -75,7 +73,7 @@ def run_branches(
     step_size: np.ndarray | None = None,
     system: System = PENDULUM_FITTED,
     n_lanes: int = N_LANES,
-    _limit=None,
+    _slack=SLACK,
 ) -> Sections:
     frequency = _array(frequency_hz, 2)
     initial = _array(initial_states, 2)
@@ -88,6 +86,7 @@ def run_branches(
     cells = Cells(
         frequency=frequency,
         parameters=packed,
+        slack=_slack * (rtol + atol),
         state=initial.copy(),
         step_size=np.zeros(n_branches) if step_size is None else _array(step_size, 1).copy(),
         turns=np.zeros((n_branches, n), np.int64),
@@ -100,7 +99,7 @@ def run_branches(
     )
     engine = engine_of(system, RECORD_CLOSED if stop_when_closed else RECORD_LAST)
     if n_branches * n_points > 0:
-        engine(cells, int(n_lanes), float(rtol), float(atol), layer_limit(rtol) if _limit is None else _limit, float(max_steps_per_period), settings)
+        engine(cells, int(n_lanes), float(rtol), float(atol), float(max_steps_per_period), settings)
     angles = [FIRST_TURN + i for i, angle in enumerate(system.is_angle) if angle]
     return Sections(
         section=cells.section,

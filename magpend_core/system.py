@@ -40,13 +40,16 @@ class System:
     n_edges : int
         Number of known instants per period at which the forcing switches.
     edges : callable
-        ``edges(frequency, p, times, half_widths)``: fills the instants [s] in [0, 1/frequency), in
-        rising order, and for each the distance in time of the forcing's nearest complex
-        singularity (infinite if there is none).
+        ``edges(frequency, p, times, half_widths, jumps)``: fills the instants [s] in
+        [0, 1/frequency), in rising order; for each the distance in time of the forcing's nearest
+        complex singularity [s]; and the change of the right-hand side across the edge.
     layers : callable
-        ``layers(y, dy, c)``: a tuple of ``(value, rate, half_width)``. The right-hand side changes
-        quickly where `value`, which moves at `rate`, passes zero, and has its nearest complex
-        singularity at an imaginary part `half_width` of `value`. An empty tuple if there are none.
+        ``layers(y, dy, c)``: a tuple of ``(value, rate, half_width, jump)``. Where `value`, which
+        moves at `rate`, passes zero, the right-hand side changes quickly, by about `jump`, and has
+        its nearest complex singularity at an imaginary part `half_width` of `value`. An empty tuple
+        if there are none.
+    jacobian : callable
+        ``jacobian(y, u, c)``: derivatives of `rhs` by the states, as one flat tuple, row by row.
     escape : tuple of float
         Bound on the absolute value of each state at a section; beyond it a trajectory has diverged.
     """
@@ -63,6 +66,7 @@ class System:
     n_edges: int
     edges: Callable[..., Any]
     layers: Callable[..., Any]
+    jacobian: Callable[..., Any]
     escape: tuple[float, ...]
 
     @property

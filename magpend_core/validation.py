@@ -1,0 +1,87 @@
+"""Checks of numerical arguments: one clear error that names the argument, the value and the bound."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+def check_array(name: str, values: Any, ndim: int | tuple[int, ...]) -> np.ndarray:
+    """Return `values` as a contiguous float64 array of finite numbers with `ndim` dimensions.
+
+    Raises
+    ------
+    ValueError
+        If the shape does not fit or a number is not finite.
+    """
+    array = np.ascontiguousarray(values, dtype=np.float64) if np.ndim(values) else np.asarray(values, np.float64)
+    allowed = (ndim,) if isinstance(ndim, int) else ndim
+    if array.ndim not in allowed:
+        wanted = " or ".join(str(n) for n in allowed)
+        raise ValueError(f"{name} has {array.ndim} dimensions (shape {array.shape}); it must have {wanted}.")
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        where = tuple(int(i) for i in bad[0])
+        raise ValueError(f"{name}{list(where) if where else ''} = {array[where]} is not finite; give finite numbers.")
+    return array
+
+
+def check_states(values: Any, ndim: int | tuple[int, ...], n_states: int = 4, name: str = "state") -> np.ndarray:
+    """Return states as an array whose last dimension has `n_states` entries.
+
+    Raises
+    ------
+    ValueError
+        See `check_array`.
+    """
+    array = check_array(name, values, ndim)
+    if array.shape[-1] != n_states:
+        raise ValueError(
+            f"{name} has {array.shape[-1]} numbers per state (shape {array.shape}); it must have {n_states}."
+        )
+    return array
+
+
+def check_frequency(values: Any, ndim: int) -> np.ndarray:
+    """Return drive frequencies [Hz], all positive.
+
+    Raises
+    ------
+    ValueError
+        See `check_array`; or if a frequency is not positive.
+    """
+    array = check_array("frequency_hz", values, ndim)
+    if np.any(array <= 0.0):
+        raise ValueError(f"frequency_hz = {array[array <= 0.0].flat[0]} is out of bounds: it must be greater than 0.")
+    return array
+
+
+def check_count(name: str, value: Any, least: int) -> int:
+    """Return a whole number of at least `least`.
+
+    Raises
+    ------
+    ValueError
+        If it is not a whole number or too small.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise ValueError(f"{name} = {value!r} is not a whole number; give an integer of {least} or more.")
+    if value < least:
+        raise ValueError(f"{name} = {value} is out of bounds: it must be {least} or more.")
+    return int(value)
+
+
+def check_tolerance(name: str, value: Any, least: float = 0.0) -> float:
+    """Return a tolerance: positive, at least `least`, below 1.
+
+    Raises
+    ------
+    ValueError
+        If it is not a number in these bounds.
+    """
+    number = float(check_array(name, value, 0))
+    if not max(least, 0.0) <= number < 1.0 or number == 0.0:
+        bound = f"at least {least:g} and less than 1" if least else "greater than 0 and less than 1"
+        raise ValueError(f"{name} = {number:g} is out of bounds: it must be {bound}.")
+    return number
