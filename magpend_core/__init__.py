@@ -1,18 +1,27 @@
 """Physics and kernels of magpend: the forced double pendulum with magnets, many at a time."""
 
 from magpend_core.jit import source_digest as kernel_version
+from magpend_core.model import Torques, accelerations, energy, jacobian, torques
 from magpend_core.parameters import ParameterError, Parameters, load_preset, preset_names, preset_provenance
-from magpend_core.sections import Sections, run_branches
+from magpend_core.sections import Sections, run_branches, sections
 from magpend_core.status import Status
+from magpend_core.trajectory import trajectory
 
 __all__ = [
     "ParameterError",
     "Parameters",
     "Sections",
     "Status",
+    "Torques",
+    "accelerations",
+    "energy",
+    "jacobian",
     "kernel_version",
     "load_preset",
     "preset_names",
     "preset_provenance",
     "run_branches",
+    "sections",
+    "torques",
+    "trajectory",
 ]

@@ -501,9 +501,8 @@ _CALLED = (
 )  # fmt: skip
 
 
-@lru_cache(maxsize=None)
-def engine_of(system: System, observer: Observer) -> Callable[..., None]:
-    """Compile `advance` for a system and an observer."""
+def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
+    """Names that the templates of this module use, bound to a system and an observer."""
     name = f"{system.name}_{observer.name}"
     bindings: dict[str, Any] = {
         "ROWS": rows_of(system),
@@ -521,10 +520,17 @@ def engine_of(system: System, observer: Observer) -> Callable[..., None]:
         "memory_size": observer.memory_size,
         **observer.bindings,
     }
-    for key in ("_lag_distance", "_largest_lag", "_smallest_divisor", "closed_period"):
+    for key in observers.HELPERS:
         bindings[key] = inline(specialise(getattr(observers, key), name, **bindings))
     bindings["observe"] = inline(specialise(observer.observe, name, **bindings))
     for key in (*_INLINE, *_CALLED):
         function = specialise(globals()[key], name, **bindings)
         bindings[key] = inline(function) if key in _INLINE else njit(**OPTIONS)(function)
-    return kernel(specialise(advance, name, **bindings))
+    return bindings
+
+
+@lru_cache(maxsize=None)
+def engine_of(system: System, observer: Observer) -> Callable[..., None]:
+    """Compile `advance` for a system and an observer."""
+    bindings = engine_bindings(system, observer)
+    return kernel(specialise(advance, f"{system.name}_{observer.name}", **bindings))

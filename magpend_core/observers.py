@@ -51,6 +51,9 @@ class Observer:
     bindings: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
 
+HELPERS = ("_lag_distance", "_largest_lag", "_smallest_divisor", "closed_period")
+"""Templates here that an observer calls, callees first."""
+
 # layout of an observer's memory: three numbers, then a ring of the last `window` sections
 _SETTLED, _PERIOD, _KEPT, _RING = 0, 1, 2, 3
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,13 @@ from magpend_core.observers import FIRST_TURN, ORBIT_PERIOD, RECORD_CLOSED, RECO
 from magpend_core.parameters import Parameters
 from magpend_core.pendulum import PENDULUM_FITTED, system_of
 from magpend_core.system import System
+from magpend_core.validation import (
+    check_array,
+    check_count,
+    check_frequency,
+    check_states,
+    check_tolerance,
+)
 
 N_LANES = 64
 """Lanes in flight: four groups, whose numbers just fit the first-level caches."""
@@ -54,7 +61,31 @@ class Sections:
     step_size: np.ndarray
 
 
-SLACK = 1.0
+SLACK = 1e4
+"""Product of slack and tolerance in the step limiter (see `lanes.step_ratio`), chosen on the preset.
+
+Over 2 to 2.8 Hz and tolerances from 1e-5 to 1e-11 it needs the fewest steps for the error reached, or
+nearly so, with at most 6 % of the attempts rejected; ten times more or less costs 10 to 20 %.
+"""
+
+LEAST_RTOL = 1e-13
+"""Below this, rounding errors decide and the step size collapses."""
+
+
+def slack_of(rtol: float, atol: float) -> float:
+    """Slack of the step limiter for given tolerances."""
+    return SLACK * (rtol + atol)
+
+
+def check_tolerances(rtol: Any, atol: Any) -> tuple[float, float]:
+    """Return both tolerances as numbers.
+
+    Raises
+    ------
+    ValueError
+        If one is out of bounds.
+    """
+    return check_tolerance("rtol", rtol, LEAST_RTOL), check_tolerance("atol", atol)
 
 
 def run_branches(
@@ -73,33 +104,67 @@ def run_branches(
     step_size: np.ndarray | None = None,
     system: System = PENDULUM_FITTED,
     n_lanes: int = N_LANES,
-    _slack=SLACK,
 ) -> Sections:
-    frequency = _array(frequency_hz, 2)
-    initial = _array(initial_states, 2)
-    packed = _array(parameters, 3)
-    n_branches, n_points = frequency.shape
-    shape = (n_branches, n_points)
-    window = max(64, 4 * max_orbit_period)
-    settings = Settings(int(n_transient), int(n_keep), int(max_orbit_period), float(closure_tolerance), window)
-    n = system.n_states
-    cells = Cells(
-        frequency=frequency,
-        parameters=packed,
-        slack=_slack * (rtol + atol),
-        state=initial.copy(),
-        step_size=np.zeros(n_branches) if step_size is None else _array(step_size, 1).copy(),
-        turns=np.zeros((n_branches, n), np.int64),
-        section=np.full((*shape, n_keep, n), np.nan),
-        measures=np.zeros((*shape, 1 + n)),
-        status=np.zeros(shape, np.int64),
-        n_periods=np.zeros(shape, np.int64),
-        n_steps=np.zeros(shape, np.int64),
-        n_rejected=np.zeros(shape, np.int64),
-    )
-    engine = engine_of(system, RECORD_CLOSED if stop_when_closed else RECORD_LAST)
-    if n_branches * n_points > 0:
-        engine(cells, int(n_lanes), float(rtol), float(atol), float(max_steps_per_period), settings)
+    """Walk many branches through their points; each point starts where the one before ended.
+
+    A sweep is the case of one point per branch. All start at the drive's rising edge. The numbers of
+    a branch depend on that branch alone, to the last bit: not on its neighbours, `n_lanes` or the
+    CPU.
+
+    Parameters
+    ----------
+    parameters
+        Packed parameters of each point, shape (branch, point, len(system.parameter_names)) [SI]; see
+        `Parameters.pack`.
+    frequency_hz
+        Drive frequency of each point, shape (branch, point) [Hz].
+    initial_states
+        Shape (branch, n_states) [rad, rad/s].
+    n_transient
+        Drive periods that each point runs before its sections are kept.
+    n_keep
+        Sections kept per point, one per drive period.
+    rtol, atol
+        Relative and absolute tolerance of the error control; `rtol` at least 1e-13.
+    max_steps_per_period
+        Limit on the attempted steps in one drive period; beyond it a cell ends as ``STEP_LIMIT``.
+    stop_when_closed
+        Keep sections as soon as the orbit has closed, `n_transient` periods at the latest. What
+        closed means, and what is not excluded, is said in `observers.closed_period`.
+    closure_tolerance
+        Largest distance from the orbit at which it counts as closed (rates in units of 10 rad/s).
+        Below about ten times `rtol` the integration's own errors stand in the way.
+    max_orbit_period
+        Longest orbit period looked for [drive periods].
+    step_size
+        First step of each branch, shape (branch,) [s]; 0 or None lets the engine choose. With the
+        values of an earlier result the branch goes on bit for bit.
+    system
+        What is integrated.
+    n_lanes
+        Trajectories in flight.
+
+    Returns
+    -------
+    Sections
+        With leading dims (branch, point).
+
+    Raises
+    ------
+    ValueError
+        If an argument has the wrong shape or is out of bounds.
+    """
+    n_transient = check_count("n_transient", n_transient, 0)
+    n_keep = check_count("n_keep", n_keep, 1)
+    max_orbit_period = check_count("max_orbit_period", max_orbit_period, 1)
+    tolerance = check_tolerance("closure_tolerance", closure_tolerance)
+    rtol, atol = check_tolerances(rtol, atol)
+    settings = Settings(n_transient, n_keep, max_orbit_period, tolerance, max(64, 4 * max_orbit_period))
+    cells = _cells(parameters, frequency_hz, initial_states, step_size, n_keep, slack_of(rtol, atol), system)
+    attempts = float(check_count("max_steps_per_period", max_steps_per_period, 1))
+    if cells.status.size:
+        engine = engine_of(system, RECORD_CLOSED if stop_when_closed else RECORD_LAST)
+        engine(cells, check_count("n_lanes", n_lanes, 1), rtol, atol, attempts, settings)
     angles = [FIRST_TURN + i for i, angle in enumerate(system.is_angle) if angle]
     return Sections(
         section=cells.section,
@@ -114,5 +179,90 @@ def run_branches(
     )
 
 
-def _array(values: Any, ndim: int) -> np.ndarray:
-    return np.ascontiguousarray(values, dtype=np.float64)
+def _cells(
+    parameters: Any, frequency_hz: Any, initial_states: Any, step_size: Any, n_keep: int, slack: float, system: System
+) -> Cells:
+    """Check the input arrays and allocate the output."""
+    frequency = check_frequency(frequency_hz, 2)
+    n_branches, n_points = frequency.shape
+    packed = check_array("parameters", parameters, 3)
+    if packed.shape != (n_branches, n_points, len(system.parameter_names)):
+        raise ValueError(
+            f"parameters has shape {packed.shape}; with frequency_hz of shape {frequency.shape} and "
+            f"{len(system.parameter_names)} parameters it must be {(*frequency.shape, len(system.parameter_names))}."
+        )
+    initial = check_states(initial_states, 2, system.n_states, "initial_states")
+    first_step = np.zeros(n_branches) if step_size is None else check_array("step_size", step_size, 1)
+    for name, array in (("initial_states", initial), ("step_size", first_step)):
+        if len(array) != n_branches:
+            raise ValueError(f"{name} has {len(array)} rows; frequency_hz has {n_branches} branches.")
+    n = system.n_states
+    return Cells(
+        frequency=frequency,
+        parameters=packed,
+        slack=slack,
+        state=initial.copy(),
+        step_size=first_step.copy(),
+        turns=np.zeros((n_branches, n), np.int64),
+        section=np.full((n_branches, n_points, n_keep, n), np.nan),
+        measures=np.zeros((n_branches, n_points, 1 + n)),
+        status=np.zeros((n_branches, n_points), np.int64),
+        n_periods=np.zeros((n_branches, n_points), np.int64),
+        n_steps=np.zeros((n_branches, n_points), np.int64),
+        n_rejected=np.zeros((n_branches, n_points), np.int64),
+    )
+
+
+def sections(
+    parameters: Parameters,
+    frequency_hz: np.ndarray,
+    initial_states: np.ndarray,
+    *,
+    n_transient: int,
+    n_keep: int,
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    **options: Any,
+) -> Sections:
+    """Stroboscopic sections of many independent trajectories with common parameters.
+
+    Parameters
+    ----------
+    parameters
+        See `load_preset`.
+    frequency_hz
+        Drive frequency of each cell, shape (n,), or one number for all [Hz].
+    initial_states
+        Shape (n, 4): psi1, psi2, psi1_dot, psi2_dot at a rising edge of the drive [rad, rad/s].
+    n_transient, n_keep, rtol, atol
+        As for `run_branches`.
+    options
+        Further keywords of `run_branches`.
+
+    Returns
+    -------
+    Sections
+        With leading dim (cell,): ``section`` is (n, n_keep, 4).
+
+    Raises
+    ------
+    ValueError
+        If an argument has the wrong shape or is out of bounds.
+
+    Examples
+    --------
+    >>> result = sections(load_preset(), [2.2], [[0.2, 0.2, 0.0, 0.0]], n_transient=0, n_keep=1)
+    >>> result.section.shape
+    (1, 1, 4)
+    """
+    initial = check_states(initial_states, 2, name="initial_states")
+    frequency = np.asarray(frequency_hz, np.float64)
+    if frequency.ndim == 0:
+        frequency = np.full(len(initial), float(frequency))
+    packed = np.broadcast_to(parameters.pack(), (len(initial), 1, len(parameters.names)))
+    result = run_branches(
+        packed, check_frequency(frequency, 1)[:, None], initial, n_transient=n_transient, n_keep=n_keep,
+        rtol=rtol, atol=atol, system=system_of(parameters), **options,
+    )  # fmt: skip
+    per_cell = ("section", "turns", "status", "orbit_period", "n_periods", "n_steps", "n_rejected")
+    return replace(result, **{name: getattr(result, name)[:, 0] for name in per_cell})

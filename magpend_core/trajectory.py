@@ -1,0 +1,194 @@
+"""Dense output of one trajectory: time series and portraits on a given time grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from numba import njit
+
+from magpend_core.jit import OPTIONS, kernel, specialise
+from magpend_core.lanes import (
+    DIVERGED,
+    N_STAGES,
+    REACHED,
+    STEP_LIMIT,
+    STEP_UNDERFLOW,
+    TOO_MANY_STEPS,
+    UNDERFLOW,
+    ZERO,
+    engine_bindings,
+)
+from magpend_core.observers import RECORD_LAST
+from magpend_core.parameters import Parameters
+from magpend_core.pendulum import system_of
+from magpend_core.sections import check_tolerances, slack_of
+from magpend_core.simd import WIDTH
+from magpend_core.status import Status
+from magpend_core.system import System
+from magpend_core.validation import check_array, check_count, check_frequency, check_states
+from magpend_core.vecmath import TWO_PI
+
+# Continuous extension of order 4 of the Dormand-Prince pair: y(t + x h) = y + h sum_i k_i P_i(x),
+# P_i(x) = sum_j DENSE[i, j] x^(j + 1). Shampine, Math. Comp. 46 (1986) 135-150.
+DENSE = np.array(
+    [
+        [1.0, -8048581381 / 2820520608, 8663915743 / 2820520608, -12715105075 / 11282082432],
+        [0.0, 0.0, 0.0, 0.0],
+        [0.0, 131558114200 / 32700410799, -68118460800 / 10900136933, 87487479700 / 32700410799],
+        [0.0, -1754552775 / 470086768, 14199869525 / 1410260304, -10690763975 / 1880347072],
+        [0.0, 127303824393 / 49829197408, -318862633887 / 49829197408, 701980252875 / 199316789632],
+        [0.0, -282668133 / 205662961, 2019193451 / 616988883, -1453857185 / 822651844],
+        [0.0, 40617522 / 29380423, -110615467 / 29380423, 69997945 / 29380423],
+    ]
+)
+
+
+def interpolate(w: Any, y0: Any, k0: Any, x: float, h: float, out: Any) -> None:
+    """Write the state at the fraction `x` of lane 0's last accepted step to `out`."""
+    for i in range(N):
+        total = 0.0
+        for s in range(N_STAGES):
+            slope = k0[i] if s == 0 else w[ROWS.slopes + (s * N + i) * WIDTH]
+            p = ((DENSE[s, 3] * x + DENSE[s, 2]) * x + DENSE[s, 1]) * x + DENSE[s, 0]
+            total += slope * p * x
+        out[i] = y0[i] + h * total
+
+
+def prepare(
+    frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any
+) -> Any:
+    """Return the rows of one group: the trajectory in lane 0, copies that stand still beside it."""
+    w = np.zeros(ROWS.size)
+    for lane in range(WIDTH):
+        load_cell(w, 0, lane, frequency, p, slack, scratch, edge_table)
+        for i in range(N):
+            w[ROWS.state + i * WIDTH + lane] = state[i]
+        w[ROWS.fresh + lane] = 1.0
+        w[ROWS.wish + lane] = 1e-3 * w[ROWS.period + lane]
+    return w
+
+
+def fill(
+    w: Any, y0: Any, k0: Any, t0: float, times: Any, begin: float, turns: Any, done: int, out: Any
+) -> int:
+    """Write all states that fall into lane 0's last accepted step; return how many are written."""
+    h = w[ROWS.step]
+    while done < len(times) and times[done] - begin <= w[ROWS.time]:
+        # a step of size 0 only fills the first slope; at the start that is what is due
+        x = (times[done] - begin - t0) / h if h > 0.0 else 0.0
+        for i in range(N):
+            total = 0.0
+            for s in range(N_STAGES):
+                slope = k0[i] if s == 0 else w[ROWS.slopes + (s * N + i) * WIDTH]
+                p = ((DENSE[s, 3] * x + DENSE[s, 2]) * x + DENSE[s, 1]) * x + DENSE[s, 0]
+                total += slope * p * x
+            out[done, i] = y0[i] + h * total + TWO_PI * turns[i]
+        done += 1
+    return done
+
+
+def follow(
+    frequency: float, p: Any, state: Any, times: Any, rtol: float, atol: float, slack: float,
+    max_attempts: float, out: Any,
+) -> int:  # fmt: skip
+    """Fill `out` (len(times), N) at rising `times`; return 0, or the status of a failure."""
+    scratch, section = np.zeros(NC), np.zeros(N)
+    edge_table = np.zeros((3, max(NE, 1)))
+    w = prepare(frequency, p, state, slack, scratch, edge_table)
+    y0, k0 = np.zeros(N), np.zeros(N)
+    turns = np.zeros(N, np.int64)
+    edge = begin_period(w, 0, 0, edge_table)
+    take_section(w, 0, 0, section, turns)
+    done, i_period = ZERO, ZERO
+    while done < len(times):
+        t0 = w[ROWS.time]
+        for i in range(N):
+            y0[i] = w[ROWS.state + i * WIDTH]
+            k0[i] = w[ROWS.slopes + i * WIDTH]
+        attempt(w, 1, slack, rtol, atol, max_attempts)
+        if w[ROWS.event] == TOO_MANY_STEPS:
+            return STEP_LIMIT
+        if w[ROWS.event] == UNDERFLOW:
+            return STEP_UNDERFLOW
+        if w[ROWS.after_rejection] == 0.0:
+            begin = i_period * w[ROWS.period]
+            done = fill(w, y0, k0, t0, times, begin, turns, done, out)
+        if w[ROWS.event] == REACHED and edge < NE:
+            edge = begin_segment(w, 0, 0, edge_table, edge + 1)
+        elif w[ROWS.event] == REACHED:
+            if not take_section(w, 0, 0, section, turns):
+                return DIVERGED
+            i_period += 1
+            edge = begin_period(w, 0, 0, edge_table)
+    return 0
+
+
+@lru_cache(maxsize=None)
+def _follower(system: System) -> Callable[..., int]:
+    bindings = engine_bindings(system, RECORD_LAST)
+    for template in (prepare, fill):
+        bindings[template.__name__] = njit(**OPTIONS)(specialise(template, system.name, **bindings))
+    return kernel(specialise(follow, system.name, **bindings))
+
+
+def trajectory(
+    parameters: Parameters,
+    frequency_hz: float,
+    initial_state: np.ndarray,
+    times: np.ndarray,
+    *,
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    max_steps_per_period: int = 20_000,
+) -> np.ndarray:
+    """States of one trajectory on a time grid, started at the drive's rising edge.
+
+    Parameters
+    ----------
+    parameters
+        See `load_preset`.
+    frequency_hz
+        Drive frequency [Hz].
+    initial_state
+        ``(psi1, psi2, psi1_dot, psi2_dot)`` at time 0 [rad, rad/s].
+    times
+        Rising times [s], the first at least 0; shape (n,).
+    rtol, atol
+        Relative and absolute tolerance of the error control; `rtol` at least 1e-13.
+    max_steps_per_period
+        Limit on the attempted steps in one drive period.
+
+    Returns
+    -------
+    ndarray
+        Shape (n, 4); angles are not wrapped. Between steps the values are those of the
+        Dormand-Prince pair's continuous extension of order 4.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of bounds.
+    ArithmeticError
+        If the trajectory diverges or meets the step limit before the last time; the message is
+        the sentence of the `Status`.
+    """
+    system = system_of(parameters)
+    frequency = float(check_frequency(frequency_hz, ndim=0))
+    state = check_states(initial_state, 1, system.n_states, "initial_state")
+    grid = check_array("times", times, 1)
+    if len(grid) and (grid[0] < 0.0 or np.any(np.diff(grid) <= 0.0)):
+        raise ValueError("times must start at 0 or later and rise from entry to entry.")
+    rtol, atol = check_tolerances(rtol, atol)
+    attempts = check_count("max_steps_per_period", max_steps_per_period, 1)
+    out = np.empty((len(grid), system.n_states))
+    slack = slack_of(rtol, atol)
+    code = _follower(system)(
+        frequency, parameters.pack(), state, grid, rtol, atol, slack, float(attempts), out
+    )
+    if code:
+        raise ArithmeticError(f"The trajectory ended early: {Status(code).sentence}.")
+    return out
