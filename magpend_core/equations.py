@@ -23,7 +23,7 @@ import math
 from typing import Any, NamedTuple
 
 from magpend_core.jit import inline
-from magpend_core.simd import absolute, sqrt
+from magpend_core.simd import absolute, maximum, sqrt
 from magpend_core.vecmath import TWO_OVER_PI, TWO_PI, atan, exp, sincos, wrapped
 
 LOAD_SWEEPS = 4
@@ -196,6 +196,45 @@ def loads(s1: Any, c1: Any, s12: Any, c12: Any, w1: Any, w2: Any, a1: Any, a2: A
     return sqrt(along1 * along1 + across1 * across1), sqrt(along * along + across * across)
 
 
+class _LoadTerms(NamedTuple):
+    """Forces in the joints as functions of the accelerations, in the frame of link 1 (see `loads`)."""
+
+    along0: Any  # N, joint 2, what does not depend on the accelerations
+    across0: Any
+    along10: Any  # N, joint 1
+    across10: Any
+    sine: Any  # kg m, m2 e2 sin(psi1 - psi2)
+    cosine: Any  # kg m, m2 e2 cos(psi1 - psi2)
+
+
+@inline
+def _newton_step(a1: Any, a2: Any, a1_free: Any, a2_free: Any, effect: Any, f: Any, k: Any) -> Any:
+    """One Newton step for a = a_free + P N(a).
+
+    With K = P dN/da, about 2e-3 in size, the inverse of 1 - K is taken as 1 + K.
+    """
+    p11, p12, p21, p22 = effect
+    along_a = f.sine * a2
+    across_a = f.cosine * a2
+    along = f.along0 - along_a
+    across = f.across0 + (k.m2_l1 * a1 + across_a)
+    along1 = f.along10 - along_a
+    across1 = f.across10 + (k.m1_e1_m2_l1 * a1 + across_a)
+    load1 = sqrt(along1 * along1 + across1 * across1)
+    load2 = sqrt(along * along + across * across)
+    r1 = (a1_free - a1) + (p11 * load1 + p12 * load2)
+    r2 = (a2_free - a2) + (p21 * load1 + p22 * load2)
+    # change of the loads along (r1, r2); weightless joints have load 0 and no gradient
+    sine = f.sine * r2
+    cosine = f.cosine * r2
+    change1 = (across1 * (k.m1_e1_m2_l1 * r1 + cosine) - along1 * sine) / maximum(load1, 1e-290)
+    change2 = (across * (k.m2_l1 * r1 + cosine) - along * sine) / maximum(load2, 1e-290)
+    return (
+        a1 + (r1 + (p11 * change1 + p12 * change2)),
+        a2 + (r2 + (p21 * change1 + p22 * change2)),
+    )
+
+
 @inline
 def solve_accelerations(
     s1: Any, c1: Any, s2: Any, c2: Any, w1: Any, w2: Any, torque1: Any, torque2: Any, k: Any
@@ -231,19 +270,7 @@ def solve_accelerations(
     across0 = k.m2_g * s1 + m2e2w2w2 * s12
     along10 = along0 + (k.m1_g * c1 + k.m1_e1 * w1w1)
     across10 = across0 + k.m1_g * s1
-    m2e2s12 = k.m2_e2 * s12
-    m2e2c12 = k.m2_e2 * c12
-    a1 = a1_free
-    a2 = a2_free
-    for _ in range(LOAD_SWEEPS):
-        along_a = m2e2s12 * a2
-        across_a = m2e2c12 * a2
-        along = along0 - along_a
-        across = across0 + (k.m2_l1 * a1 + across_a)
-        along1 = along10 - along_a
-        across1 = across10 + (k.m1_e1_m2_l1 * a1 + across_a)
-        load1 = sqrt(along1 * along1 + across1 * across1)
-        load2 = sqrt(along * along + across * across)
-        a1 = a1_free + (p11 * load1 + p12 * load2)
-        a2 = a2_free + (p21 * load1 + p22 * load2)
-    return a1, a2
+    effect = (p11, p12, p21, p22)
+    terms = _LoadTerms(along0, across0, along10, across10, k.m2_e2 * s12, k.m2_e2 * c12)
+    a1, a2 = _newton_step(a1_free, a2_free, a1_free, a2_free, effect, terms, k)
+    return _newton_step(a1, a2, a1_free, a2_free, effect, terms, k)
