@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from magpend_core.jit import inline
 from magpend_core.simd import absolute, maximum, sqrt
-from magpend_core.vecmath import TWO_OVER_PI, TWO_PI, atan, exp, sincos, wrapped
+from magpend_core.vecmath import TWO_OVER_PI, TWO_PI, atan, exp, sin, sincos, wrapped
 
 LOAD_SWEEPS = 4
 """Fixed-point sweeps for the bearing loads; three reach 1e-12 relative on the preset."""
@@ -52,8 +52,8 @@ class LinkConstants(NamedTuple):
     viscous1: Any  # N m s, 2 c
     viscous2: Any  # N m s, c
     mu: Any  # m
-    mu0: Any  # 1
-    one_minus_mu0: Any
+    stribeck_floor: Any  # 2 mu0/pi
+    stribeck_drop: Any  # 2 (1 - mu0)/pi
     c0: Any  # s/rad
     eps: Any  # s/rad
     per_eps: Any  # rad/s
@@ -63,8 +63,8 @@ class LinkConstants(NamedTuple):
     drive_amplitude: Any  # N m, 2 q/pi
     eps_drive: Any
     compliance1: Any  # 1/(kg m2), acceleration per torque on link 1, links in line
-    friction_jump1: Any  # rad/s2, change of acceleration when joint 1 reverses
-    friction_jump2: Any  # rad/s2
+    per_reversal1: Any  # 1/(rad2/s3), see `System.layers`
+    per_reversal2: Any
 
 
 class FittedConstants(NamedTuple):
@@ -90,9 +90,10 @@ class FittedConstants(NamedTuple):
     l2: Any
     h: Any
     per_h: Any  # 1/m
+    l1_per_h: Any
+    l2_per_h: Any
     delta2: Any  # m2
-    delta: Any  # m
-    magnet_jump: Any  # rad/s2, change of acceleration from one bump to the other
+    per_magnet_jump: Any  # 1/(rad2/s2), see `System.layers`
 
 
 class DipoleConstants(NamedTuple):
@@ -125,22 +126,22 @@ def link_constants(frequency: Any, p: Any) -> Any:
     return LinkConstants(
         B1, B2, N12, m1 * g * e1 + m2 * g * l1, m2 * g * e2, B1 * B2,
         m1 * g, m2 * g, m1 * e1, m2 * e2, m2 * l1, m1 * e1 + m2 * l1,
-        T1, T2, 2.0 * c, c, mu, mu0, 1.0 - mu0, c0, eps, 1.0 / eps,
-        TWO_PI * frequency, phase, -sincos(phase)[0], TWO_OVER_PI * q, eps_drive,
-        B2 * per_det, jump1, jump2,
+        T1, T2, 2.0 * c, c, mu, TWO_OVER_PI * mu0, TWO_OVER_PI * (1.0 - mu0), c0, eps, 1.0 / eps,
+        TWO_PI * frequency, phase, -sin(phase), TWO_OVER_PI * q, eps_drive,
+        B2 * per_det, eps / max(jump1, 1e-30), eps / max(jump2, 1e-30),
     )  # fmt: skip
 
 
 @inline
 def drive(t: Any, k: Any) -> Any:
     """Driving torque M_e [N m] at time `t` [s] after a rising edge (Eq. 12-15)."""
-    return k.drive_amplitude * atan(k.eps_drive * (sincos(k.omega * t + k.phase)[0] + k.offset))
+    return k.drive_amplitude * atan(k.eps_drive * (sin(k.omega * t + k.phase) + k.offset))
 
 
 @inline
 def stribeck(v: Any, k: Any) -> Any:
     """Factor of the dry friction at relative velocity `v` [rad/s], in (-1, 1) (Eq. 7-8)."""
-    return (TWO_OVER_PI * atan(k.eps * v)) * (k.one_minus_mu0 * exp(-(k.c0 * absolute(v))) + k.mu0)
+    return atan(k.eps * v) * (k.stribeck_drop * exp(-(k.c0 * absolute(v))) + k.stribeck_floor)
 
 
 @inline
@@ -163,9 +164,9 @@ def fitted_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: 
     """Generalised torques (Q1, Q2) [N m] of the fitted magnet force (Eq. 20)."""
     dx = k.l1 * s1 + k.l2 * s2
     dy = k.h - k.l1 * c1 - k.l2 * c2
-    fx = magnet_moment(psi1, psi2 - psi1, k) * k.per_h
-    fy = fx * (dy * dx / (dx * dx + k.delta2))
-    return k.l1 * (fx * c1 + fy * s1), k.l2 * (fx * c2 + fy * s2)
+    moment = magnet_moment(psi1, psi2 - psi1, k)
+    slope = dy * dx / (dx * dx + k.delta2)  # Fy/Fx
+    return (moment * k.l1_per_h) * (c1 + slope * s1), (moment * k.l2_per_h) * (c2 + slope * s2)
 
 
 @inline

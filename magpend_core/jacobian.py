@@ -19,9 +19,9 @@ from magpend_core.vecmath import TWO_OVER_PI, atan, exp, sincos, wrapped
 def stribeck_slope(v: Any, k: Any) -> Any:
     """Derivative of `equations.stribeck` [s/rad]."""
     x = k.eps * v
-    decay = k.one_minus_mu0 * exp(-(k.c0 * absolute(v)))
-    steep = k.eps / (1.0 + x * x) * (decay + k.mu0)
-    return TWO_OVER_PI * (steep - atan(x) * (decay * k.c0) * copysign(1.0, v))
+    decay = k.stribeck_drop * exp(-(k.c0 * absolute(v)))
+    steep = k.eps / (1.0 + x * x) * (decay + k.stribeck_floor)
+    return steep - atan(x) * (decay * k.c0) * copysign(1.0, v)
 
 
 @inline

@@ -41,7 +41,7 @@ from magpend_core.simd import (
 )
 from magpend_core.status import Status
 from magpend_core.system import System
-from magpend_core.vecmath import TWO_PI, exp, log2_rough
+from magpend_core.vecmath import TWO_PI, exp2_rough, log2_rough
 
 # Dormand and Prince, J. Comput. Appl. Math. 6 (1980) 19-26, RK5(4)7M
 NODES = np.array([0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0])
@@ -63,8 +63,6 @@ ZERO = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every
 SAFETY = 0.85
 SHRINK = 0.2
 GROW = 5.0
-_LN2_TENTH = math.log(2.0) / 10.0
-_LN2_SIXTH = math.log(2.0) / 6.0
 
 # events that the vector part leaves for the scalar pass
 NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW = 0.0, 1.0, 2.0, 3.0
@@ -107,14 +105,14 @@ def rows_of(system: System) -> Rows:
     return Rows(*(int(x) for x in offsets))
 
 
-def step_ratio(slack: Any, strength: Any) -> Any:
+def step_ratio(room: Any) -> Any:
     """Largest step near a layer, in units of the distance from its complex singularity.
 
     The right-hand side near a layer behaves like (J/pi) atan(t/d), whose derivatives at a distance R
     from the poles at +-i d grow like J d n!/R^(n+1): a step h = c R leaves an error in proportion to
-    J d c^6 for a method of order 5, so that c = (slack/(J d))^(1/6).
+    J d c^6 for a method of order 5. So c = (slack/(J d))^(1/6), with `room` = slack/(J d).
     """
-    return exp(log2_rough(maximum(slack / maximum(strength, 1e-300), 1e-300)) * _LN2_SIXTH)
+    return exp2_rough(log2_rough(minimum(maximum(room, 1e-30), 1e30)) * (1.0 / 6.0))
 
 
 def choose_step(w: Any, base: int, slack: float) -> None:
@@ -132,12 +130,16 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     t = load(w, base + ROWS.time)
     remaining = load(w, base + ROWS.target) - t
     h = load(w, base + ROWS.wish)
-    for value, rate, half_width, jump in layers(y, dy, c):
+    for value, rate, half_width, per_strength in layers(y, dy, c):
         speed = absolute(rate)
-        ratio = step_ratio(slack * speed, jump * half_width)
-        towards = maximum(ratio / (1.0 + ratio) * absolute(value), ratio * half_width)
+        ratio = step_ratio(slack * speed * per_strength)
+        distance = absolute(value)
+        nearing = value * rate
+        # the two bounds of the docstring over one common division
+        towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
         away = ratio * sqrt(value * value + half_width * half_width)
-        h = minimum(where_less(value * rate, 0.0, towards, away) / speed, h)
+        length = where_less(nearing, 0.0, towards, away)
+        h = minimum(length / (speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)), h)
     if NE > 0:
         passed = t - load(w, base + ROWS.start)
         width = load(w, base + ROWS.start_width)
@@ -185,7 +187,7 @@ def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
 def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> None:
     """Accept or reject the attempt, lane by lane, and set the next wish and the event."""
     e2 = minimum(squared_error(w, base, rtol, atol), 1e20)
-    factor = SAFETY * exp(log2_rough(maximum(e2, 1e-20)) * -_LN2_TENTH)
+    factor = SAFETY * exp2_rough(log2_rough(maximum(e2, 1e-20)) * -0.1)
     bounded = minimum(maximum(factor, SHRINK), GROW)
     bounded = where_less(0.5, load(w, base + ROWS.after_rejection), minimum(bounded, 1.0), bounded)
     h = load(w, base + ROWS.step)
@@ -243,7 +245,7 @@ def load_cell(
     period = 1.0 / frequency
     edges(frequency, p, edge_table[0], edge_table[1], edge_table[2])
     for i in range(NE):
-        edge_table[2, i] = step_ratio(slack, edge_table[2, i] * edge_table[1, i])
+        edge_table[2, i] = step_ratio(slack / (edge_table[2, i] * edge_table[1, i]))
     w[base + ROWS.period + lane] = period
     w[base + ROWS.steps + lane] = 0.0
     w[base + ROWS.rejected + lane] = 0.0

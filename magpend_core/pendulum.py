@@ -46,11 +46,12 @@ def _fitted_constants(frequency: Any, p: Any, out: Any) -> None:
         out[i] = values[i]
     alpha1, alpha2, beta1, beta2, gamma1, gamma2, p1, p2 = p[18], p[19], p[20], p[21], p[22], p[23], p[24], p[25]
     r1, r2, c1, c2, eps_mag, l2, h, delta = p[26], p[27], p[28], p[29], p[30], p[31], p[32], p[33]
-    magnet_jump = (abs(alpha1) + abs(alpha2)) * values.compliance1
+    jump = (abs(alpha1) + abs(alpha2)) * values.compliance1
+    per_magnet_jump = eps_mag / max(jump, 1e-30)
     magnet = FittedConstants(
         0.5 * alpha1, 0.5 * alpha2, beta1, beta2, 1.0 / gamma1, 1.0 / gamma2, p1, p2, r1, r2,
         1.0 / c1, 1.0 / c2, -0.5 * (p1 + p2), -0.5 * (r1 + r2), eps_mag, 1.0 / eps_mag,
-        p[1], l2, h, 1.0 / h, delta * delta, delta, magnet_jump,
+        p[1], l2, h, 1.0 / h, p[1] / h, l2 / h, delta * delta, per_magnet_jump,
     )  # fmt: skip
     for i in range(N_FITTED):
         out[N_LINK + i] = magnet[i]
@@ -109,28 +110,26 @@ def _edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> 
 @inline
 def _friction_layers(y: Any, dy: Any, k: Any) -> Any:
     """Velocity reversals in the joints: atan(eps v) has its poles at v = +-i/eps."""
-    return (y[2], dy[2], k.per_eps, k.friction_jump1), (y[3] - y[2], dy[3] - dy[2], k.per_eps, k.friction_jump2)
+    return (
+        (y[2], dy[2], k.per_eps, k.per_reversal1),
+        (y[3] - y[2], dy[3] - dy[2], k.per_eps, k.per_reversal2),
+    )
 
 
 @inline
 def _fitted_layers(y: Any, dy: Any, c: Any) -> Any:
-    """The friction's layers and the two of the magnets, from one bump to the other and dy/dx."""
-    link = LinkConstants(*c[:N_LINK])
+    """The friction's layers and that of the magnets, between the two bumps.
+
+    The zero of dx, the regularised other singularity of Eq. 20, is so near that of x, and as wide,
+    that one layer serves for both.
+    """
     k = FittedConstants(*c[N_LINK:])
     psi_rel = wrapped(y[1] - y[0])
     u = (psi_rel + k.beta1) * k.per_gamma1
-    jump = k.magnet_jump * exp(-(u * u))
     x = wrapped(y[0]) - (k.m * psi_rel + k.n)
-    s1, c1 = sincos(y[0])
-    s2, c2 = sincos(y[1])
-    dx = k.l1 * s1 + k.l2 * s2
-    friction1, friction2 = _friction_layers(y, dy, link)
-    return (
-        friction1,
-        friction2,
-        (x, y[2] - k.m * (y[3] - y[2]), k.per_eps_mag, jump),
-        (dx, k.l1 * c1 * y[2] + k.l2 * c2 * y[3], k.delta, jump),
-    )
+    magnet = (x, y[2] - k.m * (y[3] - y[2]), k.per_eps_mag, k.per_magnet_jump * exp(u * u))
+    friction1, friction2 = _friction_layers(y, dy, LinkConstants(*c[:N_LINK]))
+    return friction1, friction2, magnet
 
 
 @inline

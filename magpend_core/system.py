@@ -44,10 +44,11 @@ class System:
         [0, 1/frequency), in rising order; for each the distance in time of the forcing's nearest
         complex singularity [s]; and the change of the right-hand side across the edge.
     layers : callable
-        ``layers(y, dy, c)``: a tuple of ``(value, rate, half_width, jump)``. Where `value`, which
-        moves at `rate`, passes zero, the right-hand side changes quickly, by about `jump`, and has
-        its nearest complex singularity at an imaginary part `half_width` of `value`. An empty tuple
-        if there are none.
+        ``layers(y, dy, c)``: a tuple of ``(value, rate, half_width, per_strength)``. Where `value`,
+        which moves at `rate`, passes zero, the right-hand side changes quickly, and has its nearest
+        complex singularity at an imaginary part `half_width` of `value`. `per_strength` is
+        1/(half_width * jump), with the change of the right-hand side across the layer. An empty
+        tuple if there are none.
     jacobian : callable
         ``jacobian(y, u, c)``: derivatives of `rhs` by the states, as one flat tuple, row by row.
     escape : tuple of float

@@ -31,16 +31,18 @@ from magpend_core.simd import (
 TWO_PI = 2.0 * math.pi
 TWO_OVER_PI = 2.0 / math.pi
 _INV_TWO_PI = 1.0 / TWO_PI
+_INV_PI = 1.0 / math.pi
 
 _ROUND = 6755399441055744.0  # 1.5 * 2**52: adding it leaves the nearest integer in the low bits
 _LOG2_E = 1.4426950408889634
 _LN2_HIGH = 0.6931471803691238  # upper 33 bits of ln 2, so that k * _LN2_HIGH is exact
 _LN2_LOW = 1.9082149292705877e-10
-# pi/2 as a sum of two numbers of 33 bits and a rest, so that n times the first two is exact
-# for |n| < 2**20
+# pi/2 as a sum of a number of 33 bits, so that n times it is exact for |n| < 2**20, and a rest that
+# is good to 4e-27
 _PIO2_1 = 1.5707963267341256
-_PIO2_2 = 6.077100506303966e-11
-_PIO2_3 = 2.0222662487959506e-21
+_PIO2_2 = 6.077100506506192e-11
+_PI_1 = 2.0 * _PIO2_1
+_PI_2ND = 2.0 * _PIO2_2
 _TAN_PI_8 = 0.41421356237309503
 _TAN_3PI_8 = 2.414213562373095
 _PI_2 = math.pi / 2
@@ -54,17 +56,16 @@ def exp(x: Any) -> Any:
     shifted = x * _LOG2_E + _ROUND
     k = shifted - _ROUND
     r = (x - k * _LN2_HIGH) - k * _LN2_LOW
-    p = 2.5100375832561234e-08
-    p = p * r + 2.7620075879983367e-07
-    p = p * r + 2.7557268480310024e-06
-    p = p * r + 2.4801521322368692e-05
-    p = p * r + 0.00019841269863040545
-    p = p * r + 0.0013888888917196719
-    p = p * r + 0.008333333333330065
-    p = p * r + 0.041666666666624164
-    p = p * r + 0.16666666666666669
-    p = p * r + 0.5000000000000001
-    return times_power_of_two(1.0 + (r + (r * r) * p), shifted)
+    # r coth(r/2) is even in r and needs five coefficients; exp(r) = 1 + r + r c/(2 - c) (fdlibm).
+    # The quotient costs less than the four products that it saves: dividers are idle here.
+    u = r * r
+    p = 4.1437544291331705e-08
+    p = p * u - 1.653405978460107e-06
+    p = p * u + 6.613756471462368e-05
+    p = p * u - 0.002777777777756408
+    p = p * u + 0.1666666666666666
+    c = r - u * p
+    return times_power_of_two(1.0 + (r + (r * c) / (2.0 - c)), shifted)
 
 
 @inline
@@ -72,7 +73,7 @@ def sincos(x: Any) -> Any:
     """Sine and cosine, for ``|x| < 1e6``."""
     shifted = x * TWO_OVER_PI + _ROUND
     n = shifted - _ROUND
-    r = ((x - n * _PIO2_1) - n * _PIO2_2) - n * _PIO2_3
+    r = (x - n * _PIO2_1) - n * _PIO2_2
     u = r * r
     s = 1.5918129294866608e-10
     s = s * u - 2.5051131845003624e-08
@@ -94,6 +95,24 @@ def sincos(x: Any) -> Any:
 
 
 @inline
+def sin(x: Any) -> Any:
+    """Sine alone, for ``|x| < 1e6``."""
+    shifted = x * _INV_PI + _ROUND
+    n = shifted - _ROUND
+    r = (x - n * _PI_1) - n * _PI_2ND
+    u = r * r
+    s = 2.731444766986399e-15
+    s = s * u - 7.643970296798572e-13
+    s = s * u + 1.6058977312464087e-10
+    s = s * u - 2.5052107616996182e-08
+    s = s * u + 2.7557319219163234e-06
+    s = s * u - 0.00019841269841254974
+    s = s * u + 0.008333333333333316
+    s = s * u - 0.16666666666666666
+    return negate_if_bit(r + (r * u) * s, shifted, 0)
+
+
+@inline
 def atan(x: Any) -> Any:
     """Inverse tangent, in [-pi/2, pi/2]."""
     a = absolute(x)
@@ -103,17 +122,16 @@ def atan(x: Any) -> Any:
     base = where_less(a, _TAN_PI_8, 0.0, where_less(a, _TAN_3PI_8, _PI_4, _PI_2))
     w = top / bottom
     u = w * w
-    p = -0.01917688711906226
-    p = p * u + 0.03923165829558719
-    p = p * u - 0.0508544973794026
-    p = p * u + 0.0585814891280221
-    p = p * u - 0.06664511447381948
-    p = p * u + 0.07692183190826087
-    p = p * u - 0.09090904578123903
-    p = p * u + 0.11111111015256361
-    p = p * u - 0.14285714284666542
-    p = p * u + 0.1999999999999552
-    p = p * u - 0.3333333333333333
+    p = 0.02275052699336167
+    p = p * u - 0.04483334622272886
+    p = p * u + 0.05736332165907643
+    p = p * u - 0.06649613695291669
+    p = p * u + 0.0769105515839315
+    p = p * u - 0.09090852557176049
+    p = p * u + 0.11111109636534361
+    p = p * u - 0.1428571426609662
+    p = p * u + 0.19999999999898407
+    p = p * u - 0.3333333333333325
     return copysign(base + (w + (w * u) * p), x)
 
 
@@ -125,6 +143,16 @@ def log2_rough(x: Any) -> Any:
     p = p * m - 0.7020775351811126
     p = p * m + 1.4421473582825293
     return binary_exponent(x) + m * p
+
+
+@inline
+def exp2_rough(x: Any) -> Any:
+    """Power of two to 1e-4, for ``|x| < 1000``: for step sizes, not for physics."""
+    shifted = x + _ROUND
+    r = x - (shifted - _ROUND)
+    p = 0.05550360297541146 * r + 0.2402265069591007
+    p = p * r + 0.6931471805599453
+    return times_power_of_two(1.0 + r * p, shifted)
 
 
 @inline
