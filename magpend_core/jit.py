@@ -67,9 +67,18 @@ def inline(function: F) -> F:
     return njit(forceinline=True, **OPTIONS)(function)  # type: ignore[no-any-return]
 
 
-def kernel(function: F) -> F:
-    """Compile an entry point and keep its machine code in the digest-named cache folder."""
-    if CACHE_FOLDER is None:
+def is_covered(*functions: Callable[..., Any]) -> bool:
+    """Whether `source_digest` covers the functions: whether all are defined in ``magpend_core``."""
+    return all(f.__module__.partition(".")[0] == "magpend_core" for f in functions)
+
+
+def kernel(function: F, cached: bool = True) -> F:
+    """Compile an entry point and keep its machine code in the digest-named cache folder.
+
+    Pass ``cached=False`` for one that calls functions from outside the package (see `is_covered`):
+    the digest does not change with them, so a kept answer could be an old one.
+    """
+    if CACHE_FOLDER is None or not cached:
         return njit(**OPTIONS)(function)  # type: ignore[no-any-return]
     # numba picks the folder while it decorates; the setting is put back so that other users of
     # numba in the same process keep theirs.

@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit
 
 from magpend_core import observers
-from magpend_core.jit import OPTIONS, inline, kernel, specialise
+from magpend_core.jit import OPTIONS, inline, is_covered, kernel, specialise
 from magpend_core.observers import Observer
 from magpend_core.simd import (
     WIDTH,
@@ -535,4 +535,5 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
 def engine_of(system: System, observer: Observer) -> Callable[..., None]:
     """Compile `advance` for a system and an observer."""
     bindings = engine_bindings(system, observer)
-    return kernel(specialise(advance, f"{system.name}_{observer.name}", **bindings))
+    cached = is_covered(*system.functions, observer.observe, observer.memory_size)
+    return kernel(specialise(advance, f"{system.name}_{observer.name}", **bindings), cached)

@@ -71,6 +71,11 @@ class System:
     escape: tuple[float, ...]
 
     @property
+    def functions(self) -> tuple[Callable[..., Any], ...]:
+        """All compiled functions."""
+        return self.constants, self.forcing, self.rhs, self.edges, self.layers, self.jacobian
+
+    @property
     def n_states(self) -> int:
         """Number of states."""
         return len(self.state_names)
