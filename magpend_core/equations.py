@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from magpend_core.jit import inline
 from magpend_core.simd import absolute, maximum, sqrt
-from magpend_core.vecmath import TWO_OVER_PI, TWO_PI, atan, exp, sin, sincos, wrapped
+from magpend_core.vecmath import TWO_OVER_PI, TWO_PI, atan, exp, sin, wrapped
 
 LOAD_SWEEPS = 4
 """Fixed-point sweeps for the bearing loads; three reach 1e-12 relative on the preset."""

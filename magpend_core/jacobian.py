@@ -12,7 +12,7 @@ from typing import Any
 from magpend_core.equations import magnet_moment, stribeck
 from magpend_core.jit import inline
 from magpend_core.simd import absolute, copysign, sqrt
-from magpend_core.vecmath import TWO_OVER_PI, atan, exp, sincos, wrapped
+from magpend_core.vecmath import TWO_OVER_PI, atan, exp, wrapped
 
 
 @inline

@@ -64,7 +64,7 @@ CACHE_FOLDER = _cache_folder()
 
 def inline(function: F) -> F:
     """Compile a helper of the hot path; it dissolves into its caller."""
-    return njit(forceinline=True, **OPTIONS)(function)  # type: ignore[no-any-return]
+    return njit(forceinline=True, **OPTIONS)(function)
 
 
 def is_covered(*functions: Callable[..., Any]) -> bool:
@@ -79,15 +79,15 @@ def kernel(function: F, cached: bool = True) -> F:
     the digest does not change with them, so a kept answer could be an old one.
     """
     if CACHE_FOLDER is None or not cached:
-        return njit(**OPTIONS)(function)  # type: ignore[no-any-return]
+        return njit(**OPTIONS)(function)
     # numba picks the folder while it decorates; the setting is put back so that other users of
     # numba in the same process keep theirs.
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(CACHE_FOLDER)
+    settings: Any = numba.config
+    before, settings.CACHE_DIR = settings.CACHE_DIR, str(CACHE_FOLDER)
     try:
-        return njit(cache=True, **OPTIONS)(function)  # type: ignore[no-any-return]
+        return njit(cache=True, **OPTIONS)(function)
     finally:
-        numba.config.CACHE_DIR = before
+        settings.CACHE_DIR = before
 
 
 def specialise(template: Callable[..., Any], name: str, **bindings: Any) -> Callable[..., Any]:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,7 +58,7 @@ STAGES = np.array(
 )
 ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
 N_STAGES = 7
-ZERO = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
+ZERO: Any = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
 
 SAFETY = 0.85
 SHRINK = 0.2
@@ -67,7 +67,11 @@ GROW = 5.0
 # events that the vector part leaves for the scalar pass
 NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW = 0.0, 1.0, 2.0, 3.0
 PENDING, DIVERGED = int(Status.PENDING), int(Status.DIVERGED)
-STEP_LIMIT, STEP_UNDERFLOW, UNREACHED = int(Status.STEP_LIMIT), int(Status.STEP_UNDERFLOW), int(Status.UNREACHED)
+STEP_LIMIT, STEP_UNDERFLOW, UNREACHED = (
+    int(Status.STEP_LIMIT),
+    int(Status.STEP_UNDERFLOW),
+    int(Status.UNREACHED),
+)
 
 
 class Rows(NamedTuple):
@@ -354,7 +358,9 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any)
     # angles come in as given; from here on they are in (-pi, pi] at every section
     take_section(work.lanes, base, column, scratch, work.turns[lane])
     given = cells.step_size[branch]
-    work.lanes[base + ROWS.wish + column] = given if given > 0.0 else 1e-3 * work.lanes[base + ROWS.period + column]
+    work.lanes[base + ROWS.wish + column] = (
+        given if given > 0.0 else 1e-3 * work.lanes[base + ROWS.period + column]
+    )
 
 
 def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -> None:
@@ -441,9 +447,7 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     return False
 
 
-def advance(
-    cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: float, settings: Any
-) -> None:
+def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: float, settings: Any) -> None:
     """Integrate all branches, `n_lanes` at a time, and fill the output arrays of `cells`."""
     n_branches = cells.frequency.shape[0]
     active = min(n_lanes, n_branches)
@@ -464,9 +468,9 @@ def advance(
         attempt(work.lanes, (active + WIDTH - 1) // WIDTH, cells.slack, rtol, atol, max_attempts)
         lane = ZERO
         while lane < active:
-            if work.lanes[(lane // WIDTH) * ROWS.size + ROWS.event + lane % WIDTH] == NOTHING:
-                lane += 1
-            elif not serve(cells, work, lane, settings, section, scratch):
+            if work.lanes[(lane // WIDTH) * ROWS.size + ROWS.event + lane % WIDTH] == NOTHING or not serve(
+                cells, work, lane, settings, section, scratch
+            ):
                 lane += 1
             elif next_branch < n_branches:
                 start_branch(cells, work, lane, next_branch, scratch)
@@ -531,7 +535,7 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
     return bindings
 
 
-@lru_cache(maxsize=None)
+@cache
 def engine_of(system: System, observer: Observer) -> Callable[..., None]:
     """Compile `advance` for a system and an observer."""
     bindings = engine_bindings(system, observer)

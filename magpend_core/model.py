@@ -5,7 +5,7 @@ They are evaluated by the very functions that the engine integrates.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from magpend_core.equations import (
 from magpend_core.jit import inline, kernel, specialise
 from magpend_core.parameters import Parameters
 from magpend_core.pendulum import PENDULUM_FITTED, system_of
-from magpend_core.simd import WIDTH, load, load_rows, store, store_rows
+from magpend_core.simd import WIDTH, load, load_rows, store_rows
 from magpend_core.system import System
 from magpend_core.validation import check_frequency, check_states
 from magpend_core.vecmath import sincos
@@ -59,7 +59,7 @@ def _rates(t: Any, y: Any, c: Any) -> Any:
 
 
 def _slopes(t: Any, y: Any, c: Any) -> Any:
-    return jacobian(y, forcing(t, c), c)
+    return rhs_jacobian(y, forcing(t, c), c)
 
 
 @inline
@@ -116,14 +116,14 @@ def _evaluate(t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
 _QUANTITIES = {"rates": (_rates, 4), "slopes": (_slopes, 16), "torques": (_torques, 8)}
 
 
-@lru_cache(maxsize=None)
+@cache
 def _evaluator(system: System, name: str) -> Any:
     bindings: dict[str, Any] = {
         "N": system.n_states,
         "NC": system.n_constants,
         "rhs": system.rhs,
         "forcing": system.forcing,
-        "jacobian": system.jacobian,
+        "rhs_jacobian": system.jacobian,
         "constants": system.constants,
         "moments": _fitted_moments if system is PENDULUM_FITTED else _dipole_moments,
     }
@@ -203,9 +203,7 @@ def jacobian(
     return flat.reshape((*flat.shape[:-1], 4, 4))
 
 
-def torques(
-    t: float | np.ndarray, state: np.ndarray, parameters: Parameters, frequency_hz: float
-) -> Torques:
+def torques(t: float | np.ndarray, state: np.ndarray, parameters: Parameters, frequency_hz: float) -> Torques:
     """Bearing loads, friction, drive and magnet torques at given states.
 
     Parameters

@@ -17,8 +17,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from magpend_core.jit import inline
 from magpend_core.status import Status
 from magpend_core.vecmath import TWO_PI

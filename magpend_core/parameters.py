@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from importlib import resources
 from typing import Any, Self
@@ -22,7 +22,7 @@ NON_NEGATIVE = "0 or greater"
 FRACTION = "between 0 and 1, both excluded"
 FINITE = "a finite number"
 
-_BOUNDS = {
+_BOUNDS: dict[str, Callable[[float], bool]] = {
     POSITIVE: lambda x: x > 0.0,
     NON_NEGATIVE: lambda x: x >= 0.0,
     FRACTION: lambda x: 0.0 < x < 1.0,
@@ -48,14 +48,16 @@ def _quantity(unit: str, meaning: str, bound: str) -> Any:
     return field(metadata={"unit": unit, "meaning": meaning, "bound": bound})
 
 
+def _wanted(bound: str) -> str:
+    return bound if bound == FINITE else f"a number {bound}"
+
+
 def _problem(name: str, value: Any, bound: str) -> str | None:
     """Return the sentence for a bad value, or None."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        return f"{name} = {value!r} is not a number; give {bound}."
+        return f"{name} = {value!r} is not a number; give {_wanted(bound)}."
     if not math.isfinite(value):
-        return f"{name} = {value!r} is not finite; give a number {bound}." if bound != FINITE else (
-            f"{name} = {value!r} is not finite; give {bound}."
-        )
+        return f"{name} = {value!r} is not finite; give {_wanted(bound)}."
     if not _BOUNDS[bound](value):
         return f"{name} = {value!r} is out of bounds: it must be {bound}."
     return None
@@ -238,9 +240,7 @@ def _names(group: type[_Group]) -> tuple[str, ...]:
 
 def describe(parameters: Parameters) -> dict[str, dict[str, str]]:
     """Unit, meaning and bound of every parameter, by name."""
-    return {
-        f.name: dict(f.metadata) for group in parameters._groups() for f in fields(group)
-    }
+    return {f.name: dict(f.metadata) for group in parameters._groups() for f in fields(group)}
 
 
 def unknown_name_problem(name: str, known: tuple[str, ...]) -> str:

@@ -44,7 +44,16 @@ def _fitted_constants(frequency: Any, p: Any, out: Any) -> None:
     values = _link_constants(frequency, p)
     for i in range(N_LINK):
         out[i] = values[i]
-    alpha1, alpha2, beta1, beta2, gamma1, gamma2, p1, p2 = p[18], p[19], p[20], p[21], p[22], p[23], p[24], p[25]
+    alpha1, alpha2, beta1, beta2, gamma1, gamma2, p1, p2 = (
+        p[18],
+        p[19],
+        p[20],
+        p[21],
+        p[22],
+        p[23],
+        p[24],
+        p[25],
+    )
     r1, r2, c1, c2, eps_mag, l2, h, delta = p[26], p[27], p[28], p[29], p[30], p[31], p[32], p[33]
     jump = (abs(alpha1) + abs(alpha2)) * values.compliance1
     per_magnet_jump = eps_mag / max(jump, 1e-30)

@@ -180,7 +180,13 @@ def run_branches(
 
 
 def _cells(
-    parameters: Any, frequency_hz: Any, initial_states: Any, step_size: Any, n_keep: int, slack: float, system: System
+    parameters: Any,
+    frequency_hz: Any,
+    initial_states: Any,
+    step_size: Any,
+    n_keep: int,
+    slack: float,
+    system: System,
 ) -> Cells:
     """Check the input arrays and allocate the output."""
     frequency = check_frequency(frequency_hz, 2)

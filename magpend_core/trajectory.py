@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
-
 from numba import njit
 
 from magpend_core.jit import OPTIONS, kernel, specialise
@@ -58,9 +57,7 @@ def interpolate(w: Any, y0: Any, k0: Any, x: float, h: float, out: Any) -> None:
         out[i] = y0[i] + h * total
 
 
-def prepare(
-    frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any
-) -> Any:
+def prepare(frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any) -> Any:
     """Return the rows of one group: the trajectory in lane 0, copies that stand still beside it."""
     w = np.zeros(ROWS.size)
     for lane in range(WIDTH):
@@ -127,7 +124,7 @@ def follow(
     return 0
 
 
-@lru_cache(maxsize=None)
+@cache
 def _follower(system: System) -> Callable[..., int]:
     bindings = engine_bindings(system, RECORD_LAST)
     for template in (prepare, fill):

@@ -15,7 +15,7 @@ def check_array(name: str, values: Any, ndim: int | tuple[int, ...]) -> np.ndarr
     ValueError
         If the shape does not fit or a number is not finite.
     """
-    array = np.ascontiguousarray(values, dtype=np.float64) if np.ndim(values) else np.asarray(values, np.float64)
+    array = np.asarray(values, dtype=np.float64, order="C")
     allowed = (ndim,) if isinstance(ndim, int) else ndim
     if array.ndim not in allowed:
         wanted = " or ".join(str(n) for n in allowed)
@@ -23,11 +23,14 @@ def check_array(name: str, values: Any, ndim: int | tuple[int, ...]) -> np.ndarr
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):
         where = tuple(int(i) for i in bad[0])
-        raise ValueError(f"{name}{list(where) if where else ''} = {array[where]} is not finite; give finite numbers.")
+        entry = name + (str(list(where)) if where else "")
+        raise ValueError(f"{entry} = {array[where]} is not finite; give finite numbers.")
     return array
 
 
-def check_states(values: Any, ndim: int | tuple[int, ...], n_states: int = 4, name: str = "state") -> np.ndarray:
+def check_states(
+    values: Any, ndim: int | tuple[int, ...], n_states: int = 4, name: str = "state"
+) -> np.ndarray:
     """Return states as an array whose last dimension has `n_states` entries.
 
     Raises
@@ -52,8 +55,9 @@ def check_frequency(values: Any, ndim: int) -> np.ndarray:
         See `check_array`; or if a frequency is not positive.
     """
     array = check_array("frequency_hz", values, ndim)
-    if np.any(array <= 0.0):
-        raise ValueError(f"frequency_hz = {array[array <= 0.0].flat[0]} is out of bounds: it must be greater than 0.")
+    bad = array[array <= 0.0]
+    if bad.size:
+        raise ValueError(f"frequency_hz = {bad.flat[0]} is out of bounds: it must be greater than 0.")
     return array
 
 
