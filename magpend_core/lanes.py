@@ -60,6 +60,8 @@ ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 /
 N_STAGES = 7
 ZERO: Any = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
 
+FIRST_STEP = 1e-3
+"""First step of a branch in drive periods; error control finds the right size within a few steps."""
 SAFETY = 0.85
 SHRINK = 0.2
 GROW = 5.0
@@ -67,11 +69,8 @@ GROW = 5.0
 # events that the vector part leaves for the scalar pass
 NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW = 0.0, 1.0, 2.0, 3.0
 PENDING, DIVERGED = int(Status.PENDING), int(Status.DIVERGED)
-STEP_LIMIT, STEP_UNDERFLOW, UNREACHED = (
-    int(Status.STEP_LIMIT),
-    int(Status.STEP_UNDERFLOW),
-    int(Status.UNREACHED),
-)
+STEP_LIMIT, STEP_UNDERFLOW = int(Status.STEP_LIMIT), int(Status.STEP_UNDERFLOW)
+UNREACHED = int(Status.UNREACHED)
 
 
 class Rows(NamedTuple):
@@ -358,9 +357,8 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any)
     # angles come in as given; from here on they are in (-pi, pi] at every section
     take_section(work.lanes, base, column, scratch, work.turns[lane])
     given = cells.step_size[branch]
-    work.lanes[base + ROWS.wish + column] = (
-        given if given > 0.0 else 1e-3 * work.lanes[base + ROWS.period + column]
-    )
+    cautious = FIRST_STEP * work.lanes[base + ROWS.period + column]
+    work.lanes[base + ROWS.wish + column] = given if given > 0.0 else cautious
 
 
 def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -> None:
@@ -380,6 +378,11 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -
     work.lanes[base + ROWS.event + column] = NOTHING
 
 
+def has_failed(status: int) -> bool:
+    """Whether a cell's sections are not to be used."""
+    return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW  # noqa: SIM109
+
+
 def forget(cells: Cells, branch: int, point: int) -> None:
     """Take back the sections of a cell that failed."""
     for i in range(cells.section.shape[2]):
@@ -395,7 +398,7 @@ def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
     cells.n_periods[at] = work.i_period[lane]
     cells.n_steps[at] = int(work.lanes[base + ROWS.steps + column])
     cells.n_rejected[at] = int(work.lanes[base + ROWS.rejected + column])
-    if status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW:
+    if has_failed(status):
         forget(cells, work.branch[lane], work.point[lane])
 
 
@@ -439,8 +442,7 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     else:
         status = STEP_UNDERFLOW
     end_cell(cells, work, lane, status)
-    failed = status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW
-    if failed or work.point[lane] + 1 == cells.frequency.shape[1]:
+    if has_failed(status) or work.point[lane] + 1 == cells.frequency.shape[1]:
         end_branch(cells, work, lane, status)
         return True
     start_point(cells, work, lane, work.point[lane] + 1, scratch)
@@ -468,9 +470,8 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: 
         attempt(work.lanes, (active + WIDTH - 1) // WIDTH, cells.slack, rtol, atol, max_attempts)
         lane = ZERO
         while lane < active:
-            if work.lanes[(lane // WIDTH) * ROWS.size + ROWS.event + lane % WIDTH] == NOTHING or not serve(
-                cells, work, lane, settings, section, scratch
-            ):
+            event = work.lanes[(lane // WIDTH) * ROWS.size + ROWS.event + lane % WIDTH]
+            if event == NOTHING or not serve(cells, work, lane, settings, section, scratch):
                 lane += 1
             elif next_branch < n_branches:
                 start_branch(cells, work, lane, next_branch, scratch)
@@ -499,7 +500,8 @@ def copy_lane(work: Work, source: int, target: int) -> None:
 
 
 _INLINE = (
-    "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period", "take_section", "move_lane",
+    "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period",
+    "take_section", "move_lane", "has_failed",
 )  # fmt: skip
 _CALLED = (
     "choose_step", "run_stage", "finish_step", "attempt",

@@ -58,7 +58,7 @@ def _problem(name: str, value: Any, bound: str) -> str | None:
         return f"{name} = {value!r} is not a number; give {_wanted(bound)}."
     if not math.isfinite(value):
         return f"{name} = {value!r} is not finite; give {_wanted(bound)}."
-    if not _BOUNDS[bound](value):
+    if not _BOUNDS[bound](float(value)):
         return f"{name} = {value!r} is out of bounds: it must be {bound}."
     return None
 

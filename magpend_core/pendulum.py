@@ -44,16 +44,8 @@ def _fitted_constants(frequency: Any, p: Any, out: Any) -> None:
     values = _link_constants(frequency, p)
     for i in range(N_LINK):
         out[i] = values[i]
-    alpha1, alpha2, beta1, beta2, gamma1, gamma2, p1, p2 = (
-        p[18],
-        p[19],
-        p[20],
-        p[21],
-        p[22],
-        p[23],
-        p[24],
-        p[25],
-    )
+    alpha1, alpha2, beta1, beta2 = p[18], p[19], p[20], p[21]
+    gamma1, gamma2, p1, p2 = p[22], p[23], p[24], p[25]
     r1, r2, c1, c2, eps_mag, l2, h, delta = p[26], p[27], p[28], p[29], p[30], p[31], p[32], p[33]
     jump = (abs(alpha1) + abs(alpha2)) * values.compliance1
     per_magnet_jump = eps_mag / max(jump, 1e-30)
@@ -156,10 +148,9 @@ def _fitted_jacobian(y: Any, u: Any, c: Any) -> Any:
     slopes = fitted_torque_slopes(psi1, psi2, s1, c1, s2, c2, FittedConstants(*c[N_LINK:]))
     zero = 0.0 * psi1
     one = zero + 1.0
-    # `+` joins tuples
-    return (zero, zero, one, zero, zero, zero, zero, one) + acceleration_slopes(
-        s1, c1, s2, c2, w1, w2, a1, a2, slopes, LinkConstants(*c[:N_LINK])
-    )
+    kinematic = (zero, zero, one, zero, zero, zero, zero, one)
+    k = LinkConstants(*c[:N_LINK])
+    return kinematic + acceleration_slopes(s1, c1, s2, c2, w1, w2, a1, a2, slopes, k)
 
 
 @inline
@@ -171,10 +162,9 @@ def _dipole_jacobian(y: Any, u: Any, c: Any) -> Any:
     slopes = dipole_torque_slopes(psi1, psi2, s1, c1, s2, c2, DipoleConstants(*c[N_LINK:]))
     zero = 0.0 * psi1
     one = zero + 1.0
-    # `+` joins tuples
-    return (zero, zero, one, zero, zero, zero, zero, one) + acceleration_slopes(
-        s1, c1, s2, c2, w1, w2, a1, a2, slopes, LinkConstants(*c[:N_LINK])
-    )
+    kinematic = (zero, zero, one, zero, zero, zero, zero, one)
+    k = LinkConstants(*c[:N_LINK])
+    return kinematic + acceleration_slopes(s1, c1, s2, c2, w1, w2, a1, a2, slopes, k)
 
 
 PENDULUM_FITTED = System(

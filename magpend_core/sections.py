@@ -192,10 +192,11 @@ def _cells(
     frequency = check_frequency(frequency_hz, 2)
     n_branches, n_points = frequency.shape
     packed = check_array("parameters", parameters, 3)
-    if packed.shape != (n_branches, n_points, len(system.parameter_names)):
+    wanted = (n_branches, n_points, len(system.parameter_names))
+    if packed.shape != wanted:
         raise ValueError(
-            f"parameters has shape {packed.shape}; with frequency_hz of shape {frequency.shape} and "
-            f"{len(system.parameter_names)} parameters it must be {(*frequency.shape, len(system.parameter_names))}."
+            f"parameters has shape {packed.shape}; frequency_hz of shape {frequency.shape} and "
+            f"{system.name} with {wanted[2]} parameters ask for {wanted}."
         )
     initial = check_states(initial_states, 2, system.n_states, "initial_states")
     first_step = np.zeros(n_branches) if step_size is None else check_array("step_size", step_size, 1)

@@ -57,11 +57,10 @@ def _is_number(x: Any) -> bool:
 
 
 def _splat(builder: Any, scalar: Any) -> Any:
-    vector = builder.insert_element(
-        ir.Constant(_VECTOR, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0)
-    )
-    mask = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
-    return builder.shuffle_vector(vector, ir.Constant(_VECTOR, ir.Undefined), mask)
+    index = ir.IntType(32)
+    undefined = ir.Constant(_VECTOR, ir.Undefined)
+    vector = builder.insert_element(undefined, scalar, ir.Constant(index, 0))
+    return builder.shuffle_vector(vector, undefined, ir.Constant(ir.VectorType(index, WIDTH), [0] * WIDTH))
 
 
 def _as(builder: Any, value: Any, numba_type: Any, target: Any) -> Any:

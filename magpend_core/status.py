@@ -25,8 +25,8 @@ class Status(IntEnum):
 _SENTENCES = {
     Status.PENDING: "not computed yet; run the same command again to complete it",
     Status.PERIODIC: "the kept sections close on themselves: an orbit of period orbit_period",
-    Status.BOUNDED: "bounded, and not closed within the periods integrated and the longest period looked for: "
-    "chaotic, quasi-periodic, or still on the way to an orbit",
+    Status.BOUNDED: "bounded, and not closed within the periods integrated and the longest period looked "
+    "for: chaotic, quasi-periodic, or still on the way to an orbit",
     Status.DIVERGED: "a state left the bounds of the system or is not a number",
     Status.STEP_LIMIT: "one period needed more steps than max_steps_per_period; raise it, or loosen rtol",
     Status.STEP_UNDERFLOW: "the step size fell below the resolution of time; loosen rtol and atol",

@@ -12,6 +12,7 @@ from numba import njit
 from magpend_core.jit import OPTIONS, kernel, specialise
 from magpend_core.lanes import (
     DIVERGED,
+    FIRST_STEP,
     N_STAGES,
     REACHED,
     STEP_LIMIT,
@@ -65,7 +66,7 @@ def prepare(frequency: float, p: Any, state: Any, slack: float, scratch: Any, ed
         for i in range(N):
             w[ROWS.state + i * WIDTH + lane] = state[i]
         w[ROWS.fresh + lane] = 1.0
-        w[ROWS.wish + lane] = 1e-3 * w[ROWS.period + lane]
+        w[ROWS.wish + lane] = FIRST_STEP * w[ROWS.period + lane]
     return w
 
 
