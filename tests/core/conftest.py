@@ -1,0 +1,137 @@
+"""What the tests of the core share: reference numbers, parameter sets, a second system, subprocesses."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import magpend_core
+from magpend_core import load_preset
+from magpend_core.jit import inline
+from magpend_core.parameters import DipoleMagnet, Parameters
+from magpend_core.system import System
+from magpend_core.vecmath import sincos
+
+DATA = Path(__file__).parent / "data"
+
+
+@pytest.fixture(scope="session")
+def preset():
+    return load_preset()
+
+
+@pytest.fixture(scope="session")
+def dipoles(preset):
+    """The preset with point dipoles that are about as strong as the fitted magnets."""
+    magnet = DipoleMagnet(pole1=12.0, pole2=12.0, l2=preset.magnet.l2, h=preset.magnet.h)
+    return Parameters(
+        pendulum=preset.pendulum, friction=preset.friction, drive=preset.drive, magnet=magnet
+    )
+
+
+@pytest.fixture(scope="session")
+def bare():
+    """The two links alone: no friction, no drive, no magnets."""
+    return load_preset(T1=0.0, T2=0.0, c=0.0, mu=0.0, q=0.0, alpha1=0.0, alpha2=0.0)
+
+
+@pytest.fixture(scope="session")
+def reference():
+    """Read a file of reference numbers (see data/README.md)."""
+
+    def read(name):
+        return json.loads((DATA / f"{name}.json").read_text("utf-8"))
+
+    return read
+
+
+@inline
+def _oscillator_constants(frequency, p, out):
+    for i in range(4):
+        out[i] = p[i]
+    out[4] = 2.0 * np.pi * frequency
+
+
+@inline
+def _oscillator_forcing(t, c):
+    return c[3] * sincos(c[4] * t)[1]
+
+
+@inline
+def _oscillator_rhs(y, u, c):
+    damping, linear, cubic = c[0], c[1], c[2]
+    x, v, a11, a12, a21, a22 = y
+    stiffness = linear + 3.0 * cubic * x * x
+    return (
+        v,
+        u - damping * v - linear * x - cubic * x * x * x,
+        a21,
+        a22,
+        -damping * a21 - stiffness * a11,
+        -damping * a22 - stiffness * a12,
+    )
+
+
+@inline
+def _no_edges(frequency, p, times, half_widths, jumps):
+    return
+
+
+@inline
+def _no_layers(y, dy, c):
+    return ()
+
+
+@inline
+def _oscillator_jacobian(y, u, c):
+    zero = 0.0 * y[0]
+    return (zero, zero + 1.0, -c[1] - 3.0 * c[2] * y[0] * y[0], zero - c[0])
+
+
+@pytest.fixture(scope="session")
+def oscillator():
+    """x'' = amplitude cos(2 pi f t) - damping x' - linear x - cubic x^3, with its variational equation.
+
+    The last four states are the derivative of (x, x') by the initial state, row by row.
+    """
+    return System(
+        name="forced_oscillator",
+        state_names=("x", "v", "a11", "a12", "a21", "a22"),
+        is_angle=(False,) * 6,
+        scales=(1.0,) * 6,
+        parameter_names=("damping", "linear", "cubic", "amplitude"),
+        n_constants=5,
+        constants=_oscillator_constants,
+        forcing=_oscillator_forcing,
+        rhs=_oscillator_rhs,
+        n_edges=0,
+        edges=_no_edges,
+        layers=_no_layers,
+        jacobian=_oscillator_jacobian,
+        escape=(1e3, 1e3, 1e6, 1e6, 1e6, 1e6),
+    )
+
+
+@pytest.fixture
+def run_python(tmp_path):
+    """Run a script in a fresh interpreter; return what it prints.
+
+    `package` is the folder that holds ``magpend_core``; the compile cache is `tmp_path` unless `env`
+    says otherwise.
+    """
+
+    def run(script, *, package=Path(magpend_core.__file__).parent.parent, **env):
+        keep = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA_", "MAGPEND_", "COV"))}
+        settings = {"MAGPEND_CACHE_DIR": str(tmp_path / "cache"), **env, "PYTHONPATH": str(package)}
+        done = subprocess.run(
+            [sys.executable, "-W", "error", "-c", script],
+            env=keep | settings, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
