@@ -230,12 +230,11 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
 def attempt(w: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float) -> None:
     """Advance all groups by one attempted step."""
     for group in range(n_groups):
-        choose_step(w, group * ROWS.size, slack)
-    for s in range(1, N_STAGES):
-        for group in range(n_groups):
-            run_stage(w, group * ROWS.size, s)
-    for group in range(n_groups):
-        finish_step(w, group * ROWS.size, rtol, atol, max_attempts)
+        base = group * ROWS.size
+        choose_step(w, base, slack)
+        for s in range(1, N_STAGES):
+            run_stage(w, base, s)
+        finish_step(w, base, rtol, atol, max_attempts)
 
 
 def load_cell(
@@ -380,7 +379,7 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -
 
 def has_failed(status: int) -> bool:
     """Whether a cell's sections are not to be used."""
-    return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW  # noqa: SIM109
+    return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW
 
 
 def forget(cells: Cells, branch: int, point: int) -> None:
