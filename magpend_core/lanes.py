@@ -285,15 +285,21 @@ def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> i
     return NE
 
 
+def in_bounds(w: Any, base: int, lane: int) -> bool:
+    """Whether no state of a lane has escaped or is NaN."""
+    for i in range(N):
+        if not abs(w[base + ROWS.state + i * WIDTH + lane]) <= ESCAPE[i]:
+            return False
+    return True
+
+
 def take_section(w: Any, base: int, lane: int, section: Any, turns: Any) -> bool:
     """Copy a lane's state to `section`, angles wrapped in place; return whether it is in bounds."""
-    good = True
+    good = in_bounds(w, base, lane)
     for i in range(N):
         at = base + ROWS.state + i * WIDTH + lane
         x = w[at]
-        if not abs(x) <= ESCAPE[i]:
-            good = False
-        elif IS_ANGLE[i] and not (-math.pi < x <= math.pi):
+        if good and IS_ANGLE[i] and not (-math.pi < x <= math.pi):
             n = math.ceil((x - math.pi) / TWO_PI)
             x -= n * TWO_PI
             # rounding can leave x on the wrong side of the cut
@@ -306,7 +312,7 @@ def take_section(w: Any, base: int, lane: int, section: Any, turns: Any) -> bool
     return good
 
 
-def move_lane(w: Any, n_lanes: int, source: int, target: int) -> None:
+def move_lane(w: Any, source: int, target: int) -> None:
     """Copy all rows of one lane to another."""
     a = (source // WIDTH) * ROWS.size + source % WIDTH
     b = (target // WIDTH) * ROWS.size + target % WIDTH
@@ -436,6 +442,9 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
         if status == PENDING:
             work.edge[lane] = begin_period(w, base, column, work.edge_table[lane])
             return False
+    elif not in_bounds(w, base, column):
+        # a blow-up within a period shrinks the step before a section could show it
+        status = DIVERGED
     elif event == TOO_MANY_STEPS:
         status = STEP_LIMIT
     else:
@@ -484,7 +493,7 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: 
 
 def copy_lane(work: Work, source: int, target: int) -> None:
     """Copy everything that belongs to one lane to another."""
-    move_lane(work.lanes, 0, source, target)
+    move_lane(work.lanes, source, target)
     work.branch[target] = work.branch[source]
     work.point[target] = work.point[source]
     work.edge[target] = work.edge[source]
@@ -500,7 +509,7 @@ def copy_lane(work: Work, source: int, target: int) -> None:
 
 _INLINE = (
     "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period",
-    "take_section", "move_lane", "has_failed",
+    "in_bounds", "take_section", "move_lane", "has_failed",
 )  # fmt: skip
 _CALLED = (
     "choose_step", "run_stage", "finish_step", "attempt",
