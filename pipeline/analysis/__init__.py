@@ -1,0 +1,1 @@
+"""Analyses of a cube: Dataset in, labelled data out. Nothing here integrates."""

@@ -1,0 +1,11 @@
+"""Figures of a cube: Dataset in, matplotlib Figure out.
+
+Nothing here integrates, opens a store or touches pyplot: figures are plain objects, so they can be made
+in any thread and without a display.
+"""
+
+from pipeline.plots.bifurcation import plot_bifurcation
+from pipeline.plots.style import save_figure
+from pipeline.plots.trajectory import plot_trajectory
+
+__all__ = ["plot_bifurcation", "plot_trajectory", "save_figure"]
