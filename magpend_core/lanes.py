@@ -175,7 +175,7 @@ def run_stage(w: Any, base: int, s: int) -> None:
 def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
     """Mean square of the scaled error estimate of the attempt."""
     total = 0.0 * load(w, base + ROWS.step)
-    for i in range(N):
+    for i in range(N_CONTROLLED):
         row = base + i * WIDTH
         error = ERROR[0] * load(w, row + ROWS.slopes)
         for j in range(2, N_STAGES):
@@ -184,7 +184,7 @@ def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
         scaled = error / (atol + rtol * size)
         total = total + scaled * scaled
     h = load(w, base + ROWS.step)
-    return (h * h) * total * (1.0 / N)
+    return (h * h) * total * (1.0 / N_CONTROLLED)
 
 
 def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> None:
@@ -523,6 +523,7 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
     bindings: dict[str, Any] = {
         "ROWS": rows_of(system),
         "N": system.n_states,
+        "N_CONTROLLED": system.controlled,
         "NC": system.n_constants,
         "NE": system.n_edges,
         "IS_ANGLE": system.is_angle,

@@ -53,6 +53,8 @@ class System:
         ``jacobian(y, u, c)``: derivatives of `rhs` by the states, as one flat tuple, row by row.
     escape : tuple of float
         Bound on the absolute value of each state at a section; beyond it a trajectory has diverged.
+    n_controlled : int or None
+        How many of the states, from the first, enter the error control; None for all.
     """
 
     name: str
@@ -69,11 +71,17 @@ class System:
     layers: Callable[..., Any]
     jacobian: Callable[..., Any]
     escape: tuple[float, ...]
+    n_controlled: int | None = None
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
         """All compiled functions."""
         return self.constants, self.forcing, self.rhs, self.edges, self.layers, self.jacobian
+
+    @property
+    def controlled(self) -> int:
+        """Number of states in the error control."""
+        return self.n_states if self.n_controlled is None else self.n_controlled
 
     @property
     def n_states(self) -> int:
