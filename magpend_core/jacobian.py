@@ -11,7 +11,7 @@ from typing import Any
 
 from magpend_core.equations import magnet_moment, stribeck
 from magpend_core.jit import inline
-from magpend_core.simd import absolute, copysign, sqrt
+from magpend_core.simd import absolute, copysign, maximum, sqrt
 from magpend_core.vecmath import TWO_OVER_PI, atan, exp, wrapped
 
 
@@ -115,8 +115,9 @@ def acceleration_slopes(
     across = k.m2_g * s1 + swing + k.m2_l1 * a1
     along1 = along + k.m1_g * c1 + k.m1_e1 * w1 * w1
     across1 = across + k.m1_g * s1 + k.m1_e1 * a1
-    n2 = sqrt(along * along + across * across)
-    n1 = sqrt(along1 * along1 + across1 * across1)
+    # weightless joints at rest have load 0 and no gradient
+    n2 = maximum(sqrt(along * along + across * across), 1e-290)
+    n1 = maximum(sqrt(along1 * along1 + across1 * across1), 1e-290)
     x2, y2 = along / n2, across / n2
     x1, y1 = along1 / n1, across1 / n1
     m_g = k.m1_g + k.m2_g
