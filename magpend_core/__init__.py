@@ -2,6 +2,7 @@
 
 from magpend_core.jit import source_digest as kernel_version
 from magpend_core.model import Torques, accelerations, energy, jacobian, torques
+from magpend_core.orbits import PeriodicOrbits, polish_orbits
 from magpend_core.parameters import ParameterError, Parameters, load_preset, preset_names, preset_provenance
 from magpend_core.sections import Sections, run_branches, sections
 from magpend_core.status import Status
@@ -10,6 +11,7 @@ from magpend_core.trajectory import trajectory
 __all__ = [
     "ParameterError",
     "Parameters",
+    "PeriodicOrbits",
     "Sections",
     "Status",
     "Torques",
@@ -18,6 +20,7 @@ __all__ = [
     "jacobian",
     "kernel_version",
     "load_preset",
+    "polish_orbits",
     "preset_names",
     "preset_provenance",
     "run_branches",

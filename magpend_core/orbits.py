@@ -1,0 +1,246 @@
+"""Periodic orbits: Newton's method on the stroboscopic map, with Floquet multipliers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magpend_core.pendulum import PENDULUM_FITTED
+from magpend_core.sections import run_branches
+from magpend_core.system import System
+from magpend_core.validation import check_array, check_frequency, check_states, check_tolerance
+from magpend_core.variational import with_tangents
+
+RTOL = 1e-12
+"""Tolerance of the integrations here: the residual can then go below 1e-10."""
+
+TRUST = 0.5
+"""Longest Newton step in units of the system's scales; a longer one is shortened to this."""
+
+
+@dataclass(frozen=True)
+class PeriodicOrbits:
+    """Polished orbits, one per row.
+
+    Attributes
+    ----------
+    section : ndarray, (n, n_states)
+        A point of the orbit on the stroboscopic section, angles in (-pi, pi] [rad, rad/s].
+    orbit_period : ndarray of int, (n,)
+        Least period found [drive periods].
+    multipliers : ndarray of complex, (n, n_states)
+        Floquet multipliers over the orbit's period, by falling modulus.
+    residual : ndarray, (n,)
+        Certificate: scaled distance between the point and its image after the period.
+    converged : ndarray of bool, (n,)
+        Whether the residual is within the tolerance.
+    n_iterations : ndarray of int, (n,)
+        Newton steps taken.
+    """
+
+    section: np.ndarray
+    orbit_period: np.ndarray
+    multipliers: np.ndarray
+    residual: np.ndarray
+    converged: np.ndarray
+    n_iterations: np.ndarray
+
+    @property
+    def is_stable(self) -> np.ndarray:
+        """Whether all multipliers lie inside the unit circle."""
+        return np.asarray(np.abs(self.multipliers).max(axis=1) < 1.0)
+
+
+def stroboscopic_map(
+    parameters: np.ndarray,
+    frequency_hz: np.ndarray,
+    points: np.ndarray,
+    n_periods: int,
+    *,
+    rtol: float = RTOL,
+    system: System = PENDULUM_FITTED,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Images of section points after `n_periods` drive periods, and the map's derivatives.
+
+    Parameters
+    ----------
+    parameters
+        Packed parameters, shape (n, n_parameters) [SI].
+    frequency_hz
+        Shape (n,) [Hz].
+    points
+        Shape (n, n_states) [rad, rad/s].
+    n_periods
+        Drive periods.
+    rtol
+        Relative and absolute tolerance.
+    system
+        What is integrated.
+
+    Returns
+    -------
+    images : ndarray, (n, n_periods, n_states)
+        Sections after 1, 2, ... drive periods, angles in (-pi, pi]; NaN where the integration failed.
+    derivatives : ndarray, (n, n_states, n_states)
+        Derivative of the last image by the point: the monodromy matrix on a periodic orbit.
+
+    Raises
+    ------
+    ValueError
+        See `run_branches`.
+    """
+    n = system.n_states
+    extended = with_tangents(system, n)
+    identity = np.broadcast_to(np.eye(n).ravel(), (len(points), n * n))
+    result = run_branches(
+        np.asarray(parameters)[:, None, :],
+        np.asarray(frequency_hz)[:, None],
+        np.concatenate([points, identity], axis=1),
+        n_transient=0,
+        n_keep=n_periods,
+        rtol=rtol,
+        atol=rtol,
+        system=extended,
+    )
+    states = result.section[:, 0]
+    # tangent vector k, the derivative by state k, is a column
+    derivatives = states[:, -1, n:].reshape(len(points), n, n).transpose(0, 2, 1)
+    return states[:, :, :n], derivatives
+
+
+def wrap_angles(states: np.ndarray, system: System = PENDULUM_FITTED) -> np.ndarray:
+    """Bring the angles among states (or differences of states) to (-pi, pi]."""
+    wrapped = np.array(states, dtype=np.float64)
+    angles = np.asarray(system.is_angle)
+    values = wrapped[..., angles]
+    wrapped[..., angles] = values - 2.0 * np.pi * np.ceil((values - np.pi) / (2.0 * np.pi))
+    return wrapped
+
+
+def scaled_distance(a: np.ndarray, b: np.ndarray, system: System = PENDULUM_FITTED) -> np.ndarray:
+    """Largest difference between states in units of the system's scales, angles on their circle."""
+    difference = np.abs(wrap_angles(np.asarray(a) - np.asarray(b), system)) / np.asarray(system.scales)
+    return np.asarray(difference.max(axis=-1))
+
+
+def polish_orbits(
+    parameters: np.ndarray,
+    frequency_hz: np.ndarray,
+    points: np.ndarray,
+    orbit_period: np.ndarray,
+    *,
+    tolerance: float = 1e-10,
+    max_iterations: int = 12,
+    system: System = PENDULUM_FITTED,
+) -> PeriodicOrbits:
+    """Find the periodic orbits near given section points.
+
+    Parameters
+    ----------
+    parameters
+        Packed parameters of each orbit, shape (n, n_parameters) [SI].
+    frequency_hz
+        Shape (n,) [Hz].
+    points
+        Guesses of one section point each, shape (n, n_states) [rad, rad/s].
+    orbit_period
+        Period of each orbit in drive periods, shape (n,); a multiple of the true one is reduced.
+    tolerance
+        Scaled residual at which an orbit counts as found.
+    max_iterations
+        Limit on the Newton steps.
+    system
+        What is integrated.
+
+    Returns
+    -------
+    PeriodicOrbits
+        In the order of the guesses; rows that did not converge hold the last iterate.
+
+    Raises
+    ------
+    ValueError
+        If an argument has the wrong shape or is out of bounds.
+    """
+    frequency = check_frequency(frequency_hz, 1)
+    packed = check_array("parameters", parameters, 2)
+    guesses = check_states(points, 2, system.n_states, "points")
+    tolerance = check_tolerance("tolerance", tolerance)
+    periods = np.asarray(orbit_period)
+    if not (len(packed) == len(frequency) == len(guesses) == len(periods)):
+        raise ValueError(
+            f"parameters, frequency_hz, points and orbit_period have {len(packed)}, {len(frequency)}, "
+            f"{len(guesses)} and {len(periods)} rows; they must agree."
+        )
+    if len(periods) and (not np.issubdtype(periods.dtype, np.integer) or periods.min() < 1):
+        raise ValueError(f"orbit_period = {periods.tolist()} must be whole numbers of 1 or more.")
+    n = system.n_states
+    found = PeriodicOrbits(
+        section=guesses.copy(),
+        orbit_period=periods.astype(np.int64),
+        multipliers=np.full((len(guesses), n), np.nan, dtype=np.complex128),
+        residual=np.full(len(guesses), np.nan),
+        converged=np.zeros(len(guesses), dtype=bool),
+        n_iterations=np.zeros(len(guesses), dtype=np.int64),
+    )
+    for period in np.unique(found.orbit_period):
+        rows = np.flatnonzero(found.orbit_period == period)
+        _newton(found, rows, int(period), packed, frequency, tolerance, max_iterations, system)
+    return found
+
+
+def _newton(
+    found: PeriodicOrbits,
+    rows: np.ndarray,
+    period: int,
+    packed: np.ndarray,
+    frequency: np.ndarray,
+    tolerance: float,
+    max_iterations: int,
+    system: System,
+) -> None:
+    """Iterate the orbits of one period in place."""
+    for iteration in range(max_iterations + 1):
+        images, derivatives = stroboscopic_map(
+            packed[rows], frequency[rows], found.section[rows], period, system=system
+        )
+        found.residual[rows] = scaled_distance(images[:, -1], found.section[rows], system)
+        found.n_iterations[rows] = iteration
+        done = found.residual[rows] <= tolerance
+        for row, orbit, derivative in zip(rows[done], images[done], derivatives[done], strict=True):
+            least = _least_period(orbit, tolerance, system)
+            if least < period:
+                again = np.array([row])
+                _newton(found, again, least, packed, frequency, tolerance, max_iterations, system)
+                continue
+            multipliers = np.linalg.eigvals(derivative)
+            found.orbit_period[row] = period
+            found.multipliers[row] = multipliers[np.argsort(-np.abs(multipliers), kind="stable")]
+            found.converged[row] = True
+        going = np.isfinite(found.residual[rows]) & ~done
+        rows, images, derivatives = rows[going], images[going], derivatives[going]
+        if not len(rows) or iteration == max_iterations:
+            return
+        mismatch = wrap_angles(images[:, -1] - found.section[rows], system)
+        found.section[rows] = wrap_angles(
+            found.section[rows] + _newton_steps(derivatives, mismatch, system), system
+        )
+
+
+def _newton_steps(derivatives: np.ndarray, mismatch: np.ndarray, system: System) -> np.ndarray:
+    """Solve (1 - M) step = mismatch for each orbit, in the least-squares sense if singular."""
+    matrices = np.eye(system.n_states) - derivatives
+    steps = np.einsum("nij,nj->ni", np.linalg.pinv(matrices, rcond=1e-14), mismatch)
+    longest = np.abs(steps / np.asarray(system.scales)).max(axis=1, keepdims=True)
+    return np.asarray(steps * np.minimum(1.0, TRUST / np.maximum(longest, 1e-300)))
+
+
+def _least_period(orbit: np.ndarray, tolerance: float, system: System) -> int:
+    """Smallest divisor of the period after which the orbit is back.
+
+    Images of a point that is off by the tolerance differ by a multiple of it along the orbit.
+    """
+    period = len(orbit)
+    back = scaled_distance(orbit, orbit[-1], system) <= 1e4 * tolerance
+    return next(q for q in range(1, period + 1) if period % q == 0 and back[q - 1])
