@@ -27,7 +27,7 @@ def preset():
 @pytest.fixture(scope="session")
 def dipoles(preset):
     """The preset with point dipoles that are about as strong as the fitted magnets."""
-    magnet = DipoleMagnet(pole1=12.0, pole2=12.0, l2=preset.magnet.l2, h=preset.magnet.h)
+    magnet = DipoleMagnet(pole1=120.0, pole2=120.0, l2=preset.magnet.l2, h=preset.magnet.h)
     return Parameters(
         pendulum=preset.pendulum, friction=preset.friction, drive=preset.drive, magnet=magnet
     )

@@ -193,7 +193,7 @@ def test_dipole_torques__equal_the_force_between_poles(dipoles):
 def test_dipole_torques__opposite_poles_attract(dipoles):
     y = [0.05, 0.05, 0.0, 0.0]
     assert torques(0.0, y, dipoles, 2.0).magnet_moment > 0.0
-    assert torques(0.0, y, dipoles.replace(pole2=-12.0), 2.0).magnet_moment < 0.0
+    assert torques(0.0, y, dipoles.replace(pole2=-120.0), 2.0).magnet_moment < 0.0
 
 
 @pytest.mark.parametrize("duty_cycle", [0.4927, 0.5, 0.2, 0.85])

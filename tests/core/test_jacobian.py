@@ -1,0 +1,85 @@
+"""The analytic Jacobian against differences of order 8."""
+
+import numpy as np
+import pytest
+
+from magpend_core import accelerations, jacobian, load_preset
+
+# central differences of order 8, for steps 1 to 4
+WEIGHTS = np.array([4 / 5, -1 / 5, 4 / 105, -1 / 280])
+FREQUENCY = 2.2
+
+
+def by_differences(t, y, parameters, steps):
+    """Derivatives of the accelerations by the four states, with the largest terms of the sums."""
+    columns = []
+    for i in range(4):
+        shifts = np.zeros((8, 4))
+        shifts[:, i] = np.array([1, -1, 2, -2, 3, -3, 4, -4]) * steps[i]
+        values = accelerations(t, y + shifts, parameters, FREQUENCY)
+        columns.append(WEIGHTS @ (values[0::2] - values[1::2]) / steps[i])
+    return np.stack(columns, axis=1)
+
+
+def states(n, seed, spread, slowest):
+    """States with both relative velocities away from 0 by `slowest`."""
+    rng = np.random.default_rng(seed)
+    y = rng.uniform(-1.0, 1.0, (20 * n, 4)) * spread
+    away = np.minimum(abs(y[:, 2]), abs(y[:, 3] - y[:, 2])) > slowest
+    return y[away][:n]
+
+
+def assert_slopes(parameters, y, steps, bound):
+    worst = 0.0
+    for t, state in zip(np.linspace(0.0, 0.4, len(y)), y, strict=True):
+        expected = by_differences(t, state, parameters, steps)
+        value = jacobian(t, state, parameters, FREQUENCY)
+        assert (value[:2] == [[0, 0, 1, 0], [0, 0, 0, 1]]).all()
+        worst = max(worst, np.max(abs(value[2:] - expected)) / (1.0 + np.max(abs(expected))))
+    assert worst < bound
+
+
+@pytest.fixture(params=["fitted", "dipole"])
+def parameters(request, preset, dipoles):
+    return {"fitted": preset, "dipole": dipoles}[request.param]
+
+
+def test_jacobian__equals_differences_at_ordinary_states(parameters):
+    y = states(60, 1, [np.pi, np.pi, 20.0, 20.0], 0.5)
+    # the rates' layers are 1e-3 wide and 0.5 away; the magnet's layer is 1e-2 wide
+    assert_slopes(parameters, y, [5e-4, 5e-4, 0.02, 0.02], 1e-10)
+
+
+def test_jacobian__equals_differences_near_the_magnet(parameters):
+    y = states(60, 2, [0.15, 0.3, 3.0, 3.0], 0.3)
+    assert_slopes(parameters, y, [2e-4, 2e-4, 0.01, 0.01], 1e-10)
+
+
+def test_jacobian__equals_differences_inside_the_friction_layers(parameters):
+    # rates of the size of the layer's width, 1e-3 rad/s: the slopes are a thousand times steeper
+    y = states(60, 3, [0.15, 0.3, 3e-3, 3e-3], 6e-4)
+    assert_slopes(parameters, y, [2e-4, 2e-4, 2e-5, 2e-5], 1e-10)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [{"mu": 2e-3, "T1": 0.0, "T2": 0.0}, {"mu": 0.0, "c": 0.5}, {"delta": 0.05, "beta1": 0.2, "r2": 0.1}],
+)
+def test_jacobian__equals_differences_with_other_weights_of_the_terms(overrides):
+    # in the first the loads are all of the friction, and four times what they are in the preset
+    y = states(40, 4, [0.2, 0.4, 5.0, 5.0], 0.3)
+    assert_slopes(load_preset(**overrides), y, [2e-4, 2e-4, 0.01, 0.01], 2e-9)
+
+
+def test_jacobian__is_continuous_at_reversals(preset):
+    y = np.array([0.1, 0.2, 1e-9, 0.5])
+    right, left = jacobian(0.1, y, preset, FREQUENCY), jacobian(0.1, y * [1, 1, -1, 1], preset, FREQUENCY)
+    # 2e-9 rad/s apart, with second derivatives of up to 1e6
+    assert np.max(abs(right - left)) < 1e-2
+
+
+def test_jacobian__full_turns_change_nothing(preset):
+    y = np.array([0.05, 0.1, 1.0, -2.0])
+    turned = y + 2.0 * np.pi * np.array([2, -3, 0, 0])
+    a, b = jacobian(0.1, y, preset, FREQUENCY), jacobian(0.1, turned, preset, FREQUENCY)
+    assert b == pytest.approx(a, rel=1e-10, abs=1e-9)

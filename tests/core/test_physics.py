@@ -1,0 +1,144 @@
+"""What the model must do: modes, energies, wells, symmetry, coexisting motions."""
+
+import numpy as np
+import pytest
+from scipy.integrate import simpson
+from scipy.optimize import root
+
+from magpend_core import accelerations, energy, jacobian, load_preset, sections, torques, trajectory
+
+HANGING = np.zeros(4)
+
+
+def test_jacobian__small_angle_modes(bare):
+    eigenvalues = np.linalg.eigvals(jacobian(0.0, HANGING, bare, 1.0))
+    assert abs(eigenvalues.real).max() < 1e-12
+    modes = np.unique(np.round(abs(eigenvalues.imag) / (2.0 * np.pi), 9))
+    # of the paper's constants, to the digits given
+    assert modes == pytest.approx([0.926, 1.433], abs=5e-4)
+
+
+def test_trajectory__oscillates_in_its_modes(bare):
+    # a small swing in one mode comes back after its period
+    values, vectors = np.linalg.eig(jacobian(0.0, HANGING, bare, 1.0))
+    for k in np.flatnonzero(values.imag > 0.0):
+        start = 1e-4 * np.real(vectors[:, k])
+        period = 2.0 * np.pi / values[k].imag
+        back = trajectory(bare, 1.0, start, [period], rtol=1e-10, atol=1e-14)[0]
+        # the period depends on the amplitude only from its square on
+        assert np.max(abs(back - start)) < 1e-7 * np.max(abs(start))
+
+
+@pytest.mark.parametrize("start", [[2.0, 1.0, 0.0, 0.0], [0.3, -0.5, 12.0, -20.0]])
+def test_sections__conserve_energy_without_friction_drive_and_magnets(bare, start):
+    result = sections(bare, 1.0, [start], n_transient=0, n_keep=10, rtol=1e-11, atol=1e-11)
+    before, after = energy(np.array(start), bare), energy(result.section[0], bare)
+    # ten periods of a few hundred steps, each within 1e-11
+    assert np.max(abs(after - before)) < 1e-9 * before
+    # and the angles did move
+    assert np.ptp(result.section[0, :, 0]) > 0.1
+
+
+def balance(parameters, frequency, start, n_periods, n_points=40_001):
+    """Energy gained over whole periods, and the work of all torques with its parts."""
+    t = np.linspace(0.0, n_periods / frequency, n_points)
+    y = trajectory(parameters, frequency, start, t, rtol=1e-11, atol=1e-11)
+    f = torques(t, y, parameters, frequency)
+    w1, w2 = y[:, 2], y[:, 3]
+    r1, r2 = f.friction.T
+    q1, q2 = f.magnet_torque.T
+    powers = {"drive": f.drive * w1, "friction": -r1 * w1 - r2 * (w2 - w1), "magnets": q1 * w1 + q2 * w2}
+    gained = energy(y[-1], parameters) - energy(y[0], parameters)
+    return gained, {name: simpson(power, x=t) for name, power in powers.items()}
+
+
+@pytest.mark.parametrize(("frequency", "start"), [(2.2, [0.2, 0.2, 0.0, 0.0]), (2.7, [-0.1, 0.3, 2.0, -5.0])])
+def test_trajectory__energy_balance(preset, frequency, start):
+    gained, work = balance(preset, frequency, start, 3)
+    assert abs(gained - sum(work.values())) < 1e-8 * max(abs(w) for w in work.values())
+    # each part counts
+    assert work["drive"] > 0.1
+    assert work["friction"] < -0.1
+    assert abs(work["magnets"]) > 1e-3
+
+
+def test_trajectory__energy_balance_with_dipoles(dipoles):
+    gained, work = balance(dipoles, 2.2, [0.2, 0.2, 0.0, 0.0], 3)
+    assert abs(gained - sum(work.values())) < 1e-8 * max(abs(w) for w in work.values())
+    assert abs(work["magnets"]) > 1e-3
+
+
+def equilibrium(parameters, guess):
+    def residual(angles):
+        return accelerations(0.0, [*angles, 0.0, 0.0], parameters, 1.0)
+
+    found = root(residual, guess, tol=1e-13)
+    assert np.max(abs(residual(found.x))) < 1e-9
+    return np.array([*found.x, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("friction", [{}, {"T1": 0.0, "T2": 0.0, "mu": 0.0}])
+def test_jacobian__hanging_is_unstable_between_two_stable_wells(friction):
+    parameters = load_preset(q=0.0, **friction)
+    right, left = equilibrium(parameters, [0.1, 0.1]), equilibrium(parameters, [-0.1, -0.1])
+    assert 0.03 < right[0] < 0.3
+    assert left == pytest.approx(-right, abs=1e-12)
+    for well in (right, left):
+        assert np.linalg.eigvals(jacobian(0.0, well, parameters, 1.0)).real.max() < -1e-3
+    assert accelerations(0.0, HANGING, parameters, 1.0) == pytest.approx([0.0, 0.0], abs=1e-12)
+    growth = np.linalg.eigvals(jacobian(0.0, HANGING, parameters, 1.0))
+    assert np.sum(growth.real > 0.01) == 1
+
+
+def test_jacobian__hanging_is_stable_without_magnets():
+    parameters = load_preset(q=0.0, alpha1=0.0, alpha2=0.0)
+    assert np.linalg.eigvals(jacobian(0.0, HANGING, parameters, 1.0)).real.max() < 0.0
+
+
+def test_sections__fall_into_the_well_on_either_side():
+    parameters = load_preset(q=0.0, T1=1e-3, T2=1e-3, mu=0.0, c=0.02)
+    right = equilibrium(parameters, [0.1, 0.1])
+    start = np.array([0.02, 0.02, 0.0, 0.0])
+    result = sections(parameters, 1.0, [start, -start], n_transient=30, n_keep=1)
+    # the little dry friction left holds the links within a few thousandths of the well
+    assert result.section[:, 0] == pytest.approx(np.array([right, -right]), abs=5e-3)
+
+
+def mirrored(parameters, frequency, start, n_periods):
+    """Sections of an orbit, half a period later and mirrored; and those started from its mirror image.
+
+    If y(t) is a motion and the drive turns into its opposite after half a period T/2, then so is
+    -y(t + T/2): it starts from -y(T/2).
+    """
+    times = (0.5 + np.arange(n_periods + 1)) / frequency
+    y = trajectory(parameters, frequency, start, times, rtol=1e-11, atol=1e-11)
+    result = sections(parameters, frequency, [-y[0]], n_transient=0, n_keep=n_periods, rtol=1e-11, atol=1e-11)
+    return -y[1:], result.section[0]
+
+
+def test_sections__symmetric_drive_mirrors_after_half_a_period(preset):
+    start = [0.1, 0.2, 0.0, 0.0]
+    expected, found = mirrored(preset.replace(duty_cycle=0.5), 2.2, start, 4)
+    assert np.max(abs(found - expected)) < 1e-9
+    # the measured duty cycle breaks the symmetry
+    expected, found = mirrored(preset, 2.2, start, 4)
+    assert np.max(abs(found - expected)) > 1e-3
+
+
+def test_sections__full_turns_change_nothing_but_rounding(preset):
+    start = np.array([0.3, -0.4, 1.0, 2.0])
+    turned = start + 2.0 * np.pi * np.array([3, -2, 0, 0])
+    result = sections(preset, 2.6, [start, turned], n_transient=0, n_keep=3, rtol=1e-10, atol=1e-10)
+    assert np.max(abs(result.section[1] - result.section[0])) < 1e-10
+
+
+def test_sections__left_and_right_motions_coexist(preset, reference):
+    right, left = (np.array(orbit["section"]) for orbit in reference("orbits")[:2])
+    rng = np.random.default_rng(0)
+    starts = rng.uniform(-1.0, 1.0, (48, 4)) * [0.5, 0.5, 3.0, 3.0]
+    result = sections(preset, 2.2, starts, n_transient=600, n_keep=1, stop_when_closed=True)
+    ends = result.section[:, 0]
+    is_right, is_left = (np.max(abs(ends - orbit), axis=1) < 1e-4 for orbit in (right, left))
+    assert is_right.sum() >= 5
+    assert is_left.sum() >= 5
+    assert (result.orbit_period[is_right | is_left] == 1).all()
