@@ -257,6 +257,9 @@ def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
     """Put a lane's time at the start of a period; return the number of the segment's end edge."""
     w[base + ROWS.time + lane] = 0.0
     w[base + ROWS.attempts + lane] = 0.0
+    # the last slope belongs to time `period`, where the forcing can differ from that at time 0 by its
+    # rounding: a branch continued from here by a later call starts from the latter
+    w[base + ROWS.fresh + lane] = 1.0
     if NE > 0 and edge_table[0, 0] == 0.0:
         set_target(w, base, lane, 0.0, edge_table, 0)
         return begin_segment(w, base, lane, edge_table, 1)
