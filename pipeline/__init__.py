@@ -1,0 +1,22 @@
+"""From a specification to a cube and its figures: sweeps and continuations of the pendulum.
+
+`open_run` opens a run directory. It is imported when it is first used, so that
+the command line answers quickly.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipeline.reading import open_run
+
+__all__ = ["open_run"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "open_run":
+        from pipeline.reading import open_run
+
+        return open_run
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,158 @@
+"""From a specification to a plan: cells, tasks, chunks, bytes, time. Pure: nothing is created.
+
+A task computes a block of cells and owns whole chunks of every variable. The layout follows from the
+specification alone, never from the number of workers, so that a run can be resumed anywhere and its
+files are the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pipeline.cells import CellMap
+from pipeline.schema import VARIABLES, Variable, own_sizes
+from pipeline.spec import Spec
+
+MICROSECONDS_PER_PERIOD = 8.0
+"""Rule of thumb: one drive period of one trajectory on one core at rtol 1e-8."""
+
+RTOL_OF_RULE = 1e-8
+ORDER = 5
+
+LANES = 16
+"""Trajectories per task come in multiples of this, so that the kernel's lanes are full."""
+
+WANTED_TASKS = 32
+LEAST_SECONDS, MOST_SECONDS = 2.0, 20.0
+CHUNK_BYTES = 8_000_000
+TASK_BYTES = 64_000_000
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run will do.
+
+    Attributes
+    ----------
+    kind : str
+    dims, shape : tuple
+        Cell dims of the cube.
+    path : int or None
+        The dim that branches walk; None in a sweep.
+    block : tuple of int
+        Cells of a task, per dim.
+    n_keep : int
+    seconds_per_cell : float
+        Estimated time on one core [s].
+    """
+
+    kind: str
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    path: int | None
+    block: tuple[int, ...]
+    n_keep: int
+    seconds_per_cell: float
+
+    @property
+    def n_cells(self) -> int:
+        """Cells of the cube."""
+        return math.prod(self.shape)
+
+    @property
+    def n_points(self) -> int:
+        """Points per branch; 1 in a sweep."""
+        return 1 if self.path is None else self.shape[self.path]
+
+    @property
+    def n_tasks(self) -> int:
+        """Tasks of the run."""
+        return math.prod(self.task_grid)
+
+    @property
+    def task_grid(self) -> tuple[int, ...]:
+        """Tasks along each dim."""
+        return tuple(-(-n // b) for n, b in zip(self.shape, self.block, strict=True))
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the cube before compression [bytes]."""
+        return self.n_cells * sum(v.itemsize(own_sizes(self.n_keep)) for v in VARIABLES)
+
+    @property
+    def core_seconds(self) -> float:
+        """Estimated time on one core [s]."""
+        return self.n_cells * self.seconds_per_cell
+
+    def task(self, index: int) -> tuple[slice, ...]:
+        """Return the block of cells of a task."""
+        if not 0 <= index < self.n_tasks:
+            raise IndexError(f"task {index} does not exist; there are {self.n_tasks}.")
+        starts = []
+        for n_blocks in reversed(self.task_grid):
+            index, place = divmod(index, n_blocks)
+            starts.append(place)
+        places = zip(reversed(starts), self.block, self.shape, strict=True)
+        return tuple(slice(p * b, min((p + 1) * b, n)) for p, b, n in places)
+
+    def tasks(self) -> Iterator[tuple[slice, ...]]:
+        """Return the blocks of all tasks in order."""
+        return (self.task(i) for i in range(self.n_tasks))
+
+    def cells_in(self, index: int) -> int:
+        """Cells of a task."""
+        return math.prod(s.stop - s.start for s in self.task(index))
+
+    def chunks(self, variable: Variable) -> tuple[int, ...]:
+        """Chunk shape of a variable: the task's block, cut along the path where it is too large."""
+        sizes = own_sizes(self.n_keep)
+        chunk = list(self.block)
+        if self.path is not None:
+            per_point = math.prod(chunk) // chunk[self.path] * variable.itemsize(sizes)
+            n_chunks = math.ceil(chunk[self.path] * per_point / CHUNK_BYTES)
+            chunk[self.path] = math.ceil(chunk[self.path] / n_chunks)
+        return (*chunk, *(sizes[d] for d in variable.own_dims))
+
+
+def make_plan(spec: Spec) -> Plan:
+    """Lay out a run.
+
+    Tasks take a thirty-second part of the run each, but between 2 and 20 s of one core's time by
+    the rule of thumb, and at most 8 MB in a sweep; always whole multiples of 16 trajectories unless
+    ``execution.trajectories_per_task`` says otherwise.
+    """
+    cells = CellMap(spec)
+    seconds = _seconds_per_cell(spec)
+    n_points = 1 if cells.path is None else cells.shape[cells.path]
+    wanted = spec.execution.trajectories_per_task or _trajectories(spec, math.prod(cells.shape), n_points, seconds)
+    block = _block(cells.shape, cells.path, wanted)
+    return Plan(spec.kind, cells.dims, cells.shape, cells.path, block, spec.integration.n_keep, seconds)
+
+
+def _seconds_per_cell(spec: Spec) -> float:
+    integration = spec.integration
+    periods = integration.n_transient + integration.n_keep
+    return periods * MICROSECONDS_PER_PERIOD * 1e-6 * (RTOL_OF_RULE / integration.rtol) ** (1 / ORDER)
+
+
+def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:
+    """Trajectories per task."""
+    wanted_seconds = min(max(n_cells * seconds_per_cell / WANTED_TASKS, LEAST_SECONDS), MOST_SECONDS)
+    per_cell = sum(v.itemsize(own_sizes(spec.integration.n_keep)) for v in VARIABLES)
+    limit = CHUNK_BYTES if n_points == 1 else TASK_BYTES
+    n = min(wanted_seconds / (seconds_per_cell * n_points), limit / (per_cell * n_points))
+    return max(1, round(n / LANES)) * LANES
+
+
+def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, ...]:
+    """Fill a block from the last dim on; the path's dim is taken whole."""
+    block = [1] * len(shape)
+    for i in reversed(range(len(shape))):
+        if i == path:
+            block[i] = shape[i]
+        else:
+            block[i] = min(shape[i], max(wanted, 1))
+            wanted //= block[i]
+    return tuple(block)

@@ -1,0 +1,113 @@
+"""Turn what is wrong with a specification into sentences: key path, value, bound, remedy."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+_TAG = "("
+"""First character of the union tags in pydantic's locations, which are no part of the key path."""
+
+
+class SpecError(ValueError):
+    """A specification cannot be run.
+
+    Attributes
+    ----------
+    problems : list of str
+        A sentence for each problem: the dotted key path, the value, the bound and what to do.
+    """
+
+    def __init__(self, problems: Sequence[str]) -> None:
+        self.problems = list(problems)
+        super().__init__("\n".join(self.problems))
+
+
+def unknown_key(path: str, key: str, known: Iterable[str]) -> str:
+    """Sentence for a key that does not exist, with the nearest known ones."""
+    names = list(known)
+    near = difflib.get_close_matches(key, names, n=2, cutoff=0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"known keys: {', '.join(names)}."
+    return f"{path}: unknown key; {hint}"
+
+
+def unknown_choice(path: str, value: Any, choices: Sequence[str]) -> str:
+    """Sentence for a value that is none of the choices, with the nearest one."""
+    near = difflib.get_close_matches(str(value), choices, n=1, cutoff=0.5)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    return f"{path} = {value!r}: must be {' or '.join(repr(c) for c in choices)}.{hint}"
+
+
+def problems_of(error: ValidationError, model: type[BaseModel], prefix: str) -> list[str]:
+    """Sentences for all that pydantic found wrong.
+
+    Parameters
+    ----------
+    error
+        What pydantic raised.
+    model
+        The model it was validating; names the known keys.
+    prefix
+        Dotted path of the validated table.
+    """
+    return [_sentence(dict(item), model, prefix) for item in error.errors(include_url=False)]
+
+
+def _path(prefix: str, location: Sequence[int | str]) -> str:
+    path = prefix
+    for part in location:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif not part.startswith(_TAG):
+            path += f".{part}" if path else part
+    return path
+
+
+_BOUNDS = {
+    "greater_than": ("gt", "greater than"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "at most"),
+}
+_TYPES = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "a text in quotes",
+    "list_type": "a list in square brackets",
+    "tuple_type": "a list in square brackets",
+    "model_type": "a table such as {start = 2.0, stop = 3.0, num = 101}",
+    "dict_type": "a table",
+    "finite_number": "a finite number",
+}
+
+
+def _sentence(item: dict[str, Any], model: type[BaseModel], prefix: str) -> str:
+    location, kind, value = item["loc"], item["type"], item["input"]
+    path, context = _path(prefix, location), item.get("ctx", {})
+    if kind == "extra_forbidden":
+        return unknown_key(path, str(location[-1]), _known_keys(model, location))
+    if kind == "missing":
+        return f"{path}: missing; add it."
+    if kind == "literal_error":
+        choices = [c.strip(" '") for c in context["expected"].replace(" or ", ",").split(",")]
+        return unknown_choice(path, value, choices)
+    if kind in _BOUNDS:
+        name, words = _BOUNDS[kind]
+        return f"{path} = {value!r}: must be {words} {context[name]}."
+    if kind in _TYPES:
+        return f"{path} = {value!r}: must be {_TYPES[kind]}."
+    message = item["msg"].removeprefix("Value error, ")
+    return f"{path}: {message}"
+
+
+def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
+    """Keys of the table in which an unknown key lies: the model's own, or those of a nested model."""
+    if len([part for part in location if not str(part).startswith(_TAG)]) == 1:
+        return list(model.model_fields)
+    nested = getattr(model, "nested_model", None)
+    return list(nested.model_fields) if nested is not None else []

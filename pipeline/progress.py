@@ -1,0 +1,106 @@
+"""Show how a run goes: a bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
+
+LINE_EVERY_S = 10.0
+
+
+def duration(seconds: float) -> str:
+    """Return a short text such as ``3 min 20 s``."""
+    if seconds < 90:
+        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 90:
+        return f"{minutes} min {rest} s"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min"
+
+
+def size(n_bytes: float) -> str:
+    """Return a short text such as ``6.3 MB``."""
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if n_bytes < 1000:
+            return f"{n_bytes:.0f} {unit}" if unit == "bytes" else f"{n_bytes:.1f} {unit}"
+        n_bytes /= 1000
+    return f"{n_bytes:.1f} TB"
+
+
+class Progress:
+    """Counts cells; use as a context manager.
+
+    Parameters
+    ----------
+    total
+        Cells of the run.
+    done
+        Cells that were committed before.
+    terminal
+        Draw a bar instead of printing lines.
+    echo
+        Prints a line.
+    clock
+        Seconds that only ever grow.
+    """
+
+    def __init__(
+        self,
+        total: int,
+        done: int,
+        *,
+        terminal: bool,
+        echo: Callable[[str], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._total, self._before, self._done = total, done, done
+        self._echo, self._clock = echo, clock
+        self._started = self._last_line = clock()
+        self._bar: Any = _bar(total, done) if terminal else None
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def add(self, cells: int) -> None:
+        """Count finished cells."""
+        self._done += cells
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=self._done, rate=f"{self.rate():.0f} cells/s")
+        elif self._clock() - self._last_line >= LINE_EVERY_S or self._done == self._total:
+            self._last_line = self._clock()
+            self._echo(self.line())
+
+    def rate(self) -> float:
+        """Cells per second in this session."""
+        elapsed = self._clock() - self._started
+        return (self._done - self._before) / elapsed if elapsed > 0 else 0.0
+
+    def line(self) -> str:
+        """Return the plain line."""
+        rate = self.rate()
+        left = f", {duration((self._total - self._done) / rate)} left" if rate > 0 and self._done < self._total else ""
+        share = 100 * self._done / self._total
+        return f"{self._done}/{self._total} cells ({share:.0f} %), {rate:.0f} cells/s{left}"
+
+
+def _bar(total: int, done: int) -> Any:
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as RichProgress
+
+    bar = RichProgress(
+        TextColumn("computing"), BarColumn(), MofNCompleteColumn(), TextColumn("cells"),
+        TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), TextColumn("left"),
+    )  # fmt: skip
+    bar.add_task("cells", total=total, completed=done, rate="")
+    return bar

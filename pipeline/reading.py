@@ -1,0 +1,83 @@
+"""Open a run directory as a labelled dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline import store
+from pipeline.cells import DIRECTION_CODES
+from pipeline.plan import make_plan
+from pipeline.schema import LINKS, STATE_UNITS, STATES
+from pipeline.spec import parse_spec
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
+    """Open a run directory; nothing but coordinates is read until it is used.
+
+    Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. What is committed
+    later shows after opening again.
+
+    Parameters
+    ----------
+    path
+        Run directory.
+    chunks
+        As in `xarray.open_zarr`: None indexes lazily and loads what is selected; ``{}`` makes dask
+        arrays in the chunks of the store, for cubes larger than the memory.
+
+    Returns
+    -------
+    xarray.Dataset
+        With the specification, its TOML text and the versions that made it in the attributes.
+
+    Raises
+    ------
+    store.RefusedError
+        If there is no run in `path`.
+
+    Examples
+    --------
+    >>> ds = open_run("runs/quickstart")                                # doctest: +SKIP
+    >>> ds.section.sel(frequency=2.2, state="psi1", method="nearest")   # doctest: +SKIP
+    """
+    import xarray as xr
+
+    info = store.read_run(Path(path))
+    plan = make_plan(parse_spec(info.spec))
+    view: Any = store.committed_view(info, plan)
+    ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
+    ds = ds.assign_coords(_labels())
+    if "direction" in ds.coords:
+        ds = ds.assign_coords(direction=_words(ds.coords["direction"]))
+    attrs = {
+        "title": info.title,
+        "source": f"magpend {info.versions.get('magpend', '(not installed)')}, kernel {info.identity['kernel_version']}",
+        "kind": plan.kind,
+        "spec": info.spec_text,
+        "digest": info.digest,
+        **{f"parameter_{name}": value for name, value in info.identity["parameter_values"].items()},
+    }
+    if plan.path is not None:
+        attrs["path"] = plan.dims[plan.path]
+    return ds.assign_attrs(attrs)
+
+
+def _labels() -> dict[str, Any]:
+    """Return the names of states and links."""
+    return {
+        "state": ("state", list(STATES), {"long_name": "component of the state"}),
+        "state_units": ("state", list(STATE_UNITS), {"long_name": "unit of the component"}),
+        "link": ("link", list(LINKS), {"long_name": "link, by its angle"}),
+    }
+
+
+def _words(direction: xr.DataArray) -> Any:
+    words = {code: word for word, code in DIRECTION_CODES.items()}
+    values = np.array([words[int(code)] for code in direction.values])
+    return ("branch", values, {"long_name": direction.attrs["long_name"]})

@@ -1,0 +1,90 @@
+"""One task: a block of cells through the kernel into the store. The same function runs everywhere.
+
+A task is named by the run directory, the run's digest and its index; it reads the rest from
+``run.json``. Its result is a small dict; the numbers go straight to the store.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magpend_core import Status, kernel_version, run_branches
+from magpend_core.pendulum import system_of
+from pipeline.cells import CellMap
+from pipeline.identity import digest_of, identity_of
+from pipeline.plan import Plan, make_plan
+from pipeline.schema import VARIABLES
+from pipeline.spec import Spec, parse_spec
+from pipeline.store import RefusedError, RunInfo, read_run, write_task
+
+
+@lru_cache(maxsize=4)
+def _prepare(directory: str, digest: str) -> tuple[RunInfo, Spec, Plan, CellMap]:
+    """Read a run once per worker, and make sure that this installation would compute the same."""
+    info = read_run(Path(directory))
+    spec = parse_spec(info.spec)
+    plan = make_plan(spec)
+    if digest != info.digest or digest_of(identity_of(spec, plan, kernel_version())) != digest:
+        raise RefusedError(
+            f"{directory}: this worker's magpend would not compute the same run "
+            f"(kernel {kernel_version()} here, {info.identity['kernel_version']} in the directory); "
+            "install the same version everywhere."
+        )
+    return info, spec, plan, CellMap(spec)
+
+
+def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
+    """Return all variables of a block of cells, in the block's shape."""
+    inputs = cells.inputs(block)
+    integration = spec.integration.model_dump()
+    result = run_branches(
+        inputs.parameters, inputs.frequency_hz, inputs.initial_states,
+        system=system_of(spec.parameters.load()), **integration,
+    )  # fmt: skip
+    return {
+        v.name: cells.outputs(block, np.asarray(getattr(result, v.name), dtype=v.dtype)) for v in VARIABLES
+    }
+
+
+def run_task(directory: str, digest: str, index: int) -> dict[str, Any]:
+    """Compute a task and commit it.
+
+    Returns
+    -------
+    dict
+        Task, cells, cells by status, and the seconds taken by the kernel and by writing.
+    """
+    info, spec, plan, cells = _prepare(directory, digest)
+    started = time.perf_counter()
+    values = compute(spec, cells, plan.task(index))
+    computed = time.perf_counter()
+    codes, numbers = np.unique(values["status"], return_counts=True)
+    counts = {Status(int(c)).name.lower(): int(n) for c, n in zip(codes, numbers, strict=True)}
+    write_task(info, plan, index, values, counts)
+    return {
+        "task": index,
+        "cells": plan.cells_in(index),
+        "status": counts,
+        "kernel_s": round(computed - started, 4),
+        "write_s": round(time.perf_counter() - computed, 4),
+    }
+
+
+def warm_up(spec: Spec) -> float:
+    """Compile the kernel that the run needs into the compile cache and return the seconds it took.
+
+    One process compiles, so that workers find the machine code instead of each making it.
+    """
+    started = time.perf_counter()
+    packed = spec.parameters.load().pack()
+    options = {**spec.integration.model_dump(), "n_transient": 0, "n_keep": 1}
+    run_branches(
+        packed.reshape(1, 1, -1), np.full((1, 1), 2.0), np.zeros((1, 4)),
+        system=system_of(spec.parameters.load()), **options,
+    )  # fmt: skip
+    return time.perf_counter() - started
