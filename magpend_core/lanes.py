@@ -34,6 +34,7 @@ from magpend_core.simd import (
     load_rows,
     maximum,
     minimum,
+    multiply_add,
     sqrt,
     store,
     store_rows,
@@ -140,14 +141,14 @@ def choose_step(w: Any, base: int, slack: float) -> None:
         nearing = value * rate
         # the two bounds of the docstring over one common division
         towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
-        away = ratio * sqrt(value * value + half_width * half_width)
+        away = ratio * sqrt(multiply_add(value, value, half_width * half_width))
         length = where_less(nearing, 0.0, towards, away)
         h = minimum(length / (speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)), h)
     if NE > 0:
         passed = t - load(w, base + ROWS.start)
         width = load(w, base + ROWS.start_width)
         ratio = load(w, base + ROWS.start_ratio)
-        h = minimum(ratio * sqrt(passed * passed + width * width), h)
+        h = minimum(ratio * sqrt(multiply_add(passed, passed, width * width)), h)
         width = load(w, base + ROWS.target_width)
         ratio = load(w, base + ROWS.target_ratio)
         h = minimum(maximum(ratio / (1.0 + ratio) * remaining, ratio * width), h)

@@ -173,6 +173,15 @@ def absolute(x: Any) -> Any:
     return np.abs(x)
 
 
+def multiply_add(a: Any, b: Any, c: Any) -> Any:
+    """``a * b + c``, rounded once where the CPU can.
+
+    A sum of two products can be fused in two ways, and the compiler's choice depends on the CPU: this
+    says which product it is.
+    """
+    return a * b + c
+
+
 def copysign(x: Any, sign: Any) -> Any:
     """`x` with the sign of `sign`."""
     return np.copysign(x, sign)
@@ -264,6 +273,7 @@ def _emit_mantissa(builder: Any, numba_type: Any, x: Any) -> Any:
 
 _primitive(sqrt, _call("sqrt"))
 _primitive(absolute, _call("fabs"))
+_primitive(multiply_add, _call("fmuladd"))
 _primitive(copysign, _call("copysign"))
 _primitive(where_less, _emit_where_less)
 _primitive(minimum, _emit_minimum)
