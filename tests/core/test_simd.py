@@ -127,6 +127,18 @@ def test_primitives__mean_what_they_say():
     assert (simd.binary_exponent(8.0), simd.mantissa(8.0)) == (3.0, 1.0)
 
 
+def test_multiply_add__forms_agree_within_one_rounding():
+    rng = np.random.default_rng(1)
+    a, b, c = rng.normal(size=(3, 1000))
+    lanes, compiled = on_lanes(simd.multiply_add, 3)(a, b, c), on_numbers(simd.multiply_add, 3)(a, b, c)
+    assert same_bits(lanes, compiled)
+    # plain Python rounds twice
+    assert np.max(abs(lanes - simd.multiply_add(a, b, c)) / (abs(a * b) + abs(c))) < 2.3e-16
+    # exact products leave no room for a difference
+    whole = np.round(100.0 * a)
+    assert same_bits(on_lanes(simd.multiply_add, 3)(whole, whole, c), whole * whole + c)
+
+
 @njit(**OPTIONS)
 def _arithmetic(rows, out):
     a, b = load_rows(rows, 0, 2)
