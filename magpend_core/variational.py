@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -30,9 +31,12 @@ def _products(n: int, n_vectors: int) -> str:
     )
 
 
-def _compile(source: str, name: str, bindings: dict[str, Any]) -> Any:
-    """Compile a one-function source; numba cannot build a tuple of given length in a loop."""
-    scope: dict[str, Any] = {"__name__": __name__, **bindings}
+def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict[str, Any]) -> Any:
+    """Compile a one-function source; numba cannot build a tuple of given length in a loop.
+
+    It passes for a function of the module of `wrapped`, which it calls (see `jit.is_covered`).
+    """
+    scope: dict[str, Any] = {"__name__": wrapped.__module__, **bindings}
     exec(source, scope)
     return inline(scope[name])
 
@@ -69,11 +73,15 @@ def with_tangents(system: System, n_vectors: int) -> System:
         f"    dy = _rhs(base, u, c)\n"
         f"    return ({', '.join(f'dy[{i}]' for i in range(n))}, {_products(n, n_vectors)})\n",
         "rhs",
+        system.rhs,
         bindings,
     )
     rates = ", ".join(f"dy[{i}]" for i in range(n))
     layers = _compile(
-        f"def layers(y, dy, c):\n    return _layers(({_first(n)},), ({rates},), c)\n", "layers", bindings
+        f"def layers(y, dy, c):\n    return _layers(({_first(n)},), ({rates},), c)\n",
+        "layers",
+        system.layers,
+        bindings,
     )
     entries = n * n_vectors
     return dataclasses.replace(
