@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -109,7 +110,20 @@ def _local_cluster(n_workers: int) -> Iterator[Any]:
             silence_logs=50,
         ) as cluster,
     ):
-        yield cluster
+        try:
+            yield cluster
+        except BaseException:
+            _kill(cluster)
+            raise
+
+
+def _kill(cluster: Any) -> None:
+    """End the workers at once: what they are computing is given up, and may take long."""
+    for nanny in cluster.workers.values():
+        nanny.auto_restart = False
+        if nanny.pid:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(nanny.pid, signal.SIGKILL)
 
 
 def _window(client: Any, task: Task, indices: Sequence[int]) -> Iterator[dict[str, Any]]:

@@ -10,11 +10,13 @@ import numpy as np
 from pipeline import store
 from pipeline.cells import DIRECTION_CODES
 from pipeline.plan import make_plan
-from pipeline.schema import LINKS, STATE_UNITS, STATES
+from pipeline.schema import LINKS, STATE_UNITS, STATES, VARIABLES
 from pipeline.spec import parse_spec
 
 if TYPE_CHECKING:
     import xarray as xr
+
+_VARIABLES = frozenset(v.name for v in VARIABLES)
 
 
 def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
@@ -43,8 +45,8 @@ def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
 
     Examples
     --------
-    >>> ds = open_run("runs/quickstart")                                # doctest: +SKIP
-    >>> ds.section.sel(frequency=2.2, state="psi1", method="nearest")   # doctest: +SKIP
+    >>> ds = open_run("runs/quickstart")                                    # doctest: +SKIP
+    >>> ds.section.sel(state="psi1").sel(frequency=2.2, method="nearest")   # doctest: +SKIP
     """
     import xarray as xr
 
@@ -52,7 +54,8 @@ def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
     plan = make_plan(parse_spec(info.spec))
     view: Any = store.committed_view(info, plan)
     ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
-    ds = ds.assign_coords(_labels())
+    ds = ds.set_coords([name for name in ds.data_vars if name not in _VARIABLES])
+    ds = ds[[v.name for v in VARIABLES]].assign_coords(_labels())
     if "direction" in ds.coords:
         ds = ds.assign_coords(direction=_words(ds.coords["direction"]))
     attrs = {
@@ -61,7 +64,7 @@ def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
         "kind": plan.kind,
         "spec": info.spec_text,
         "digest": info.digest,
-        **{f"parameter_{name}": value for name, value in info.identity["parameter_values"].items()},
+        "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
     }
     if plan.path is not None:
         attrs["path"] = plan.dims[plan.path]

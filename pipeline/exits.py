@@ -1,0 +1,35 @@
+"""Exit codes of the command line, in one place."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Exit(IntEnum):
+    """What a command's exit code says."""
+
+    DONE = 0
+    BUG = 1
+    REFUSED = 2
+    LOCKED = 3
+    FAILED = 4
+    DAMAGED = 5
+    INTERRUPTED = 130
+    TERMINATED = 143
+
+    @property
+    def sentence(self) -> str:
+        """What the code means."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Exit.DONE: "done",
+    Exit.BUG: "an error that magpend did not expect",
+    Exit.REFUSED: "bad input, or refused; nothing was created or changed",
+    Exit.LOCKED: "another process is writing to the run directory",
+    Exit.FAILED: "a computation failed; what is committed stays, the same command goes on",
+    Exit.DAMAGED: "verify found damage",
+    Exit.INTERRUPTED: "stopped by Ctrl-C; what is committed stays, the same command goes on",
+    Exit.TERMINATED: "stopped by SIGTERM; likewise",
+}
