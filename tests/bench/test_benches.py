@@ -1,0 +1,59 @@
+"""Every benchmark once, in a tiny size, so that none of them rots."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+TINY = ["--trajectories", "8", "--periods", "1", "--rounds", "1"]
+TINY_PEERS = [*TINY, "--error-period", "1", "--eps-drive", "preset", "--scipy-trajectories", "1"]
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Import a benchmark by name."""
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    return importlib.import_module
+
+
+def test_scalar_twin__agrees_with_the_lanes(bench):
+    kernel = bench("kernel")
+    case = kernel.case_of(kernel.parse(["--trajectories", "32"]))
+    assert kernel.check_agreement(case) < kernel.AGREEMENT
+
+
+def test_kernel__prints_all_tables(bench, monkeypatch, capsys):
+    kernel = bench("kernel")
+    # children would compile everything again: their work is done here
+    monkeypatch.setattr(kernel, "run_in_child", lambda arguments, environment: kernel.main(arguments))
+    kernel.main([*TINY, "--tolerances", "1e-4", "1e-6"])
+    printed = capsys.readouterr().out
+    for name in (*kernel.VARIANTS, "lanes, tolerance 1e-04", "first run_branches"):
+        assert name in printed
+
+
+def test_kernel__limiter_is_back_after_the_run_without(bench):
+    kernel = bench("kernel")
+    module = importlib.import_module("magpend_core.sections")
+    before = module.SLACK
+    with kernel.no_limiter():
+        assert before < module.SLACK
+    assert before == module.SLACK
+
+
+def test_peers__models_are_the_same(bench):
+    line = bench("peers").check_models(bench("magpend_core").load_preset(), seed=1)
+    assert "scalar model" in line
+
+
+def test_work_precision__draws_and_prints(bench, monkeypatch, tmp_path, capsys):
+    # without numbalsoda, which compiles the model once more, scipy gives the reference; heyoka
+    # compiles for minutes, and its model is checked above
+    monkeypatch.setitem(sys.modules, "numbalsoda", None)
+    out = tmp_path / "work_precision.png"
+    bench("work_precision").main([*TINY_PEERS, "--peers", "magpend", "numbalsoda", "--out", str(out)])
+    printed = capsys.readouterr().out
+    assert out.stat().st_size > 0
+    assert "us per period" in printed
+    assert "numbalsoda is left out" in printed
