@@ -1,0 +1,169 @@
+"""Small specifications, runs without the kernel, and subprocesses for the pipeline's tests."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+SWEEP = """
+kind = "sweep"
+title = "small sweep"
+[axes]
+frequency_hz = { start = 2.0, stop = 3.0, num = 5 }
+q = { values = [1.5, 1.6] }
+[initial_conditions]
+kind = "grid"
+psi1_deg = { start = -30, stop = 30, num = 3 }
+psi2_deg = { start = -20, stop = 20, num = 4 }
+psi1_dot = 0.1
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 2
+n_keep = 3
+[execution]
+trajectories_per_task = 24
+"""
+
+WALK = """
+kind = "continuation"
+title = "small continuation"
+[axes]
+frequency_hz = { start = 2.0, stop = 2.5, num = 6 }
+[initial_conditions]
+kind = "random"
+n = 5
+seed = 3
+psi1_deg = [-40, 40]
+psi2_deg = [-40, 40]
+[continuation]
+direction = "both"
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 4
+n_keep = 3
+[execution]
+trajectories_per_task = 2
+"""
+
+
+@pytest.fixture
+def sweep_text() -> str:
+    return SWEEP
+
+
+@pytest.fixture
+def walk_text() -> str:
+    return WALK
+
+
+@pytest.fixture
+def write_spec(tmp_path):
+    """Write a specification and return its path."""
+
+    def write(text: str, name: str = "spec.toml") -> Path:
+        path = tmp_path / name
+        path.write_text(text, "utf-8")
+        return path
+
+    return write
+
+
+def _bytes_of(directory: Path) -> dict[str, bytes]:
+    folders = [directory / "cube.zarr", directory / "commits"]
+    files = [f for folder in folders for f in folder.rglob("*") if f.is_file()]
+    return {f.relative_to(directory).as_posix(): f.read_bytes() for f in files}
+
+
+@pytest.fixture
+def bytes_of():
+    """All files of a run that must not depend on how it was run."""
+    return _bytes_of
+
+
+@pytest.fixture
+def made(tmp_path, write_spec):
+    """A run directory set up from the small sweep, with made-up numbers to commit."""
+    from pipeline import store
+    from pipeline.identity import identity_of
+    from pipeline.plan import make_plan
+    from pipeline.spec import load_spec
+
+    path = write_spec(SWEEP)
+    spec = load_spec(path)
+    plan = make_plan(spec)
+    identity = identity_of(spec, plan, "test-kernel")
+    info = store.create(tmp_path / "run", spec, plan, identity, SWEEP)
+
+    def values(index: int) -> dict[str, np.ndarray]:
+        from pipeline.schema import VARIABLES, own_sizes
+
+        shape = tuple(s.stop - s.start for s in plan.task(index))
+        sizes = own_sizes(plan.n_keep)
+        rng = np.random.default_rng(index)
+        made_up = {}
+        for v in VARIABLES:
+            numbers = rng.uniform(1, 5, (*shape, *(sizes[d] for d in v.own_dims)))
+            made_up[v.name] = numbers.astype(v.dtype)
+        made_up["status"][...] = 2
+        made_up["orbit_period"][...] = 0  # the fill value: must be written all the same
+        return made_up
+
+    def commit(index: int) -> None:
+        store.write_task(info, plan, index, values(index), {"bounded": plan.cells_in(index)})
+
+    return SimpleNamespace(info=info, plan=plan, spec=spec, identity=identity, values=values, commit=commit)
+
+
+@pytest.fixture
+def environment(tmp_path):
+    """Environment of subprocesses: this source tree, and temporary files that go with the test."""
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    return {**os.environ, "PYTHONPATH": path, "TMPDIR": str(scratch)}
+
+
+@pytest.fixture
+def magpend(tmp_path, environment):
+    """Run the command line in a process of its own."""
+
+    def call(*arguments, **options):
+        return subprocess.run(
+            [sys.executable, "-m", "pipeline.cli", *map(str, arguments)],
+            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240, check=False, **options,
+        )  # fmt: skip
+
+    return call
+
+
+@pytest.fixture
+def start(tmp_path, environment):
+    """Start the command line in a session of its own; whatever is left at the end is killed."""
+    import signal
+
+    running = []
+
+    def begin(*arguments):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pipeline.cli", *map(str, arguments)],
+            cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            start_new_session=True,
+        )  # fmt: skip
+        running.append(process)
+        return process
+
+    yield begin
+    for process in running:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
