@@ -134,16 +134,17 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     t = load(w, base + ROWS.time)
     remaining = load(w, base + ROWS.target) - t
     h = load(w, base + ROWS.wish)
-    for value, rate, half_width, per_strength in layers(y, dy, c):
-        speed = absolute(rate)
-        ratio = step_ratio(slack * speed * per_strength)
-        distance = absolute(value)
-        nearing = value * rate
-        # the two bounds of the docstring over one common division
-        towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
-        away = ratio * sqrt(multiply_add(value, value, half_width * half_width))
-        length = where_less(nearing, 0.0, towards, away)
-        h = minimum(length / (speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)), h)
+    if HAS_LAYERS:  # numba cannot loop over an empty tuple
+        for value, rate, half_width, per_strength in layers(y, dy, c):
+            speed = absolute(rate)
+            ratio = step_ratio(slack * speed * per_strength)
+            distance = absolute(value)
+            nearing = value * rate
+            # the two bounds of the docstring over one common division
+            towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
+            away = ratio * sqrt(multiply_add(value, value, half_width * half_width))
+            length = where_less(nearing, 0.0, towards, away)
+            h = minimum(length / (speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)), h)
     if NE > 0:
         passed = t - load(w, base + ROWS.start)
         width = load(w, base + ROWS.start_width)
@@ -530,6 +531,7 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
         "N_CONTROLLED": system.controlled,
         "NC": system.n_constants,
         "NE": system.n_edges,
+        "HAS_LAYERS": system.has_layers,
         "IS_ANGLE": system.is_angle,
         "SCALES": system.scales,
         "ESCAPE": system.escape,

@@ -47,14 +47,15 @@ class System:
         ``layers(y, dy, c)``: a tuple of ``(value, rate, half_width, per_strength)``. Where `value`,
         which moves at `rate`, passes zero, the right-hand side changes quickly, and has its nearest
         complex singularity at an imaginary part `half_width` of `value`. `per_strength` is
-        1/(half_width * jump), with the change of the right-hand side across the layer. An empty
-        tuple if there are none.
+        1/(half_width * jump), with the change of the right-hand side across the layer.
     jacobian : callable
         ``jacobian(y, u, c)``: derivatives of `rhs` by the states, as one flat tuple, row by row.
     escape : tuple of float
         Bound on the absolute value of each state at a section; beyond it a trajectory has diverged.
     n_controlled : int or None
         How many of the states, from the first, enter the error control; None for all.
+    has_layers : bool
+        False if there are none; then `layers` is never called.
     """
 
     name: str
@@ -72,6 +73,7 @@ class System:
     jacobian: Callable[..., Any]
     escape: tuple[float, ...]
     n_controlled: int | None = None
+    has_layers: bool = True
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
