@@ -113,6 +113,7 @@ def oscillator():
         layers=_no_layers,
         jacobian=_oscillator_jacobian,
         escape=(1e3, 1e3, 1e6, 1e6, 1e6, 1e6),
+        has_layers=False,
     )
 
 
