@@ -1,0 +1,125 @@
+"""The main job on real input: the shipped quickstart, its cube, its figure."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipeline
+from magpend_core import Status
+from pipeline.analysis.sides import Side, side
+
+# see tests/core/data/README.md for where these points come from
+ORBITS = json.loads((Path(__file__).parent / "core" / "data" / "orbits.json").read_text("utf-8"))
+
+
+def magpend(*arguments, **environment):
+    """Run the command as a user does, in a process of its own."""
+    code = "import sys; from pipeline.cli import main; sys.argv[0] = 'magpend'; main()"
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        capture_output=True, text=True, check=False, timeout=900, env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("quickstart") / "run"
+    done = magpend("run", "quickstart", "--out", folder, "--plot")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ds(directory):
+    with pipeline.open_run(directory) as opened:
+        yield opened.load()
+
+
+def test_quickstart__complete(directory, ds):
+    assert (directory / "figures" / "bifurcation_psi1.png").stat().st_size > 20_000
+    assert set(np.unique(ds.status)) <= {Status.PERIODIC, Status.BOUNDED}
+    assert ds.sizes["branch"] >= 2 * 8
+    assert set(ds.direction.values) == {"up", "down"}
+
+
+@pytest.mark.parametrize("orbit", [o for o in ORBITS if o["frequency_hz"] == 2.2])
+def test_quickstart__orbits_at_2p2_hz(ds, orbit):
+    """Some branch lies on each of the two orbits; what is left of its transient is below 1e-6."""
+    here = ds.sel(frequency=2.2, method="nearest")
+    last = here.section.isel(period_index=-1)
+    distance = np.abs(last - np.array(orbit["section"])).max("state")
+    on_orbit = distance < 1e-5
+    assert on_orbit.any()
+    assert (here.orbit_period.where(on_orbit, drop=True) == 1).all()
+
+
+@pytest.mark.parametrize("frequency", [2.2, 2.3])
+def test_quickstart__both_sides(ds, frequency):
+    here = ds.sel(frequency=[frequency], method="nearest")
+    closed = (here.orbit_period == 1).values.ravel()
+    sides = side(here).values.ravel()[closed]
+    assert {int(Side.LEFT), int(Side.RIGHT)} == set(sides.tolist())
+
+
+def test_quickstart__period_1_band(ds):
+    """Between chaotic bands, period 1 in all branches over 0.2 Hz and more."""
+    all_closed = (ds.orbit_period == 1).all("branch").values
+    frequency = ds.frequency.values
+    band = frequency[all_closed & (frequency > 2.03) & (frequency < 2.42)]
+    assert band.max() - band.min() > 0.2
+    inside = (frequency >= band.min()) & (frequency <= band.max())
+    assert all_closed[inside].all()
+
+
+@pytest.mark.parametrize("frequency", [2.03, 2.40])
+def test_quickstart__chaos(ds, frequency):
+    closed = ds.orbit_period.sel(frequency=frequency, method="nearest") > 0
+    assert closed.mean() < 0.5
+
+
+def test_quickstart__period_2_and_period_1(ds):
+    most = 0.5
+    assert (ds.orbit_period.sel(frequency=2.48, method="nearest") == 2).mean() > most
+    window = ds.orbit_period.sel(frequency=slice(2.599, 2.951))
+    assert ((window == 1).mean("branch") > most).all()
+
+
+def test_quickstart__run_again_does_nothing(directory):
+    before = {p: p.stat().st_mtime_ns for p in (directory / "cube.zarr").rglob("*") if p.is_file()}
+    done = magpend("run", "quickstart", "--out", directory)
+    assert done.returncode == 0
+    assert "nothing to do" in done.stdout
+    assert before == {p: p.stat().st_mtime_ns for p in (directory / "cube.zarr").rglob("*") if p.is_file()}
+
+
+def test_plot__without_kernel(directory, tmp_path):
+    """The figure comes from the cube alone: with a kernel that raises, it is the same file."""
+    plotted = tmp_path / "again.png"
+    code = (
+        "import sys, magpend_core.sections as s, magpend_core.lanes as l\n"
+        "def broken(*a, **k): raise AssertionError('the kernel was called')\n"
+        "s.run_branches = s.engine_of = l.engine_of = broken\n"
+        "from pipeline.cli import main\n"
+        f"sys.argv = ['magpend', 'plot', 'bifurcation', {str(directory)!r}, '--out', {str(plotted)!r}]\n"
+        "main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert plotted.read_bytes() == (directory / "figures" / "bifurcation_psi1.png").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["quickstart", "fig12", "fig13", "fig14"])
+def test_workflow__smoke(name, tmp_path):
+    done = magpend("run", name, "--smoke", "--out", tmp_path / name, "--workers", "0")
+    assert done.returncode == 0, done.stderr
+    with pipeline.open_run(tmp_path / name) as opened:
+        assert (opened.status != Status.PENDING).all()
