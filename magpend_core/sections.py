@@ -266,9 +266,10 @@ def sections(
     frequency = np.asarray(frequency_hz, np.float64)
     if frequency.ndim == 0:
         frequency = np.full(len(initial), float(frequency))
-    packed = np.broadcast_to(parameters.pack(), (len(initial), 1, len(parameters.names)))
+    frequency = check_frequency(frequency, 1)[:, None]
+    packed = np.broadcast_to(parameters.pack(), (len(frequency), 1, len(parameters.names)))
     result = run_branches(
-        packed, check_frequency(frequency, 1)[:, None], initial, n_transient=n_transient, n_keep=n_keep,
+        packed, frequency, initial, n_transient=n_transient, n_keep=n_keep,
         rtol=rtol, atol=atol, system=system_of(parameters), **options,
     )  # fmt: skip
     per_cell = ("section", "turns", "status", "orbit_period", "n_periods", "n_steps", "n_rejected")
