@@ -1,0 +1,186 @@
+"""Stroboscopic sections against independent integrations; early stops; messages."""
+
+import numpy as np
+import pytest
+
+from magpend_core import Status, run_branches, sections
+
+TIGHT = {"rtol": 1e-11, "atol": 1e-11}
+
+
+def distance(a, b):
+    """Largest difference of states, angles on the circle and rates in units of 10 rad/s."""
+    d = np.abs(np.asarray(a) - np.asarray(b))
+    d[..., :2] = np.minimum(d[..., :2], np.abs(2.0 * np.pi - d[..., :2]))
+    d[..., 2:] /= 10.0
+    return d.max(axis=-1)
+
+
+@pytest.mark.parametrize("k", range(4))
+def test_sections__agree_with_dop853_and_radau(preset, reference, k):
+    row = reference("trajectories")[k]
+    expected = np.array(row["sections"])
+    n = len(expected)
+    found = sections(preset, row["frequency_hz"], [row["y0"]], n_transient=0, n_keep=n, **TIGHT)
+    difference = found.section[0] - expected
+    difference[:, :2] -= 2.0 * np.pi * np.round(difference[:, :2] / (2.0 * np.pi))
+    assert np.max(abs(difference)) < 1e-8
+
+
+def test_sections__settle_on_the_orbits(preset, reference):
+    # multipliers of modulus 0.96: 800 periods take 0.01 far below the tolerance
+    orbits = reference("orbits")
+    points = np.array([orbit["section"] for orbit in orbits])
+    frequencies = [orbit["frequency_hz"] for orbit in orbits]
+    found = sections(preset, frequencies, points + 0.01, n_transient=800, n_keep=2, **TIGHT)
+    assert np.max(abs(found.section - points[:, None])) < 1e-9
+    assert (found.orbit_period == 1).all()
+    assert (found.status == Status.PERIODIC).all()
+    assert (found.turns == 0).all()
+
+
+@pytest.mark.parametrize("k", range(3))
+def test_sections__multipliers_of_the_orbits(preset, reference, k):
+    orbit = reference("orbits")[k]
+    point = np.array(orbit["section"])
+    # the friction's layers bend the map within 1e-3 rad/s: small steps, tight tolerances
+    h = 1e-5 * np.array([1.0, 1.0, 10.0, 10.0])
+    starts = np.concatenate([point + np.diag(h), point - np.diag(h)])
+    ends = sections(preset, orbit["frequency_hz"], starts, n_transient=0, n_keep=1, rtol=1e-12, atol=1e-12)
+    ends = ends.section[:, 0]
+    derivative = ((ends[:4] - ends[4:]) / (2.0 * h[:, None])).T
+    expected = np.array([complex(*z) for z in orbit["multipliers"]])
+    assert np.linalg.det(derivative) == pytest.approx(np.prod(expected).real, rel=1e-4)
+    found = np.sort_complex(np.linalg.eigvals(derivative))
+    assert found == pytest.approx(np.sort_complex(expected), abs=1e-4)
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8])
+def test_sections__stop_when_closed_is_within_the_tolerance_of_the_orbit(preset, reference, tolerance):
+    orbits = reference("orbits")
+    points = np.array([orbit["section"] for orbit in orbits])
+    frequencies = [orbit["frequency_hz"] for orbit in orbits]
+    found = sections(
+        preset, frequencies, points + 0.01, n_transient=2000, n_keep=3, rtol=1e-10, atol=1e-10,
+        stop_when_closed=True, closure_tolerance=tolerance,
+    )  # fmt: skip
+    # slow spirals, of moduli 0.93 to 0.96
+    assert (distance(found.section, points[:, None]) <= tolerance).all()
+    assert (found.orbit_period == 1).all()
+    assert (found.status == Status.PERIODIC).all()
+    assert (found.n_periods < 600).all()
+    # it is the early part of the straight run, taken sooner
+    n = int(found.n_periods[0])
+    straight = sections(
+        preset, frequencies[:1], points[:1] + 0.01, n_transient=n - 3, n_keep=3, rtol=1e-10, atol=1e-10
+    )
+    assert straight.section.tobytes() == found.section[:1].tobytes()
+
+
+def closed_at(preset, frequency, **options):
+    starts = np.random.default_rng(0).uniform(-0.4, 0.4, (12, 4))
+    settings = {"n_transient": 700, "n_keep": 4, "stop_when_closed": True, **options}
+    return sections(preset, frequency, starts, **settings)
+
+
+def test_sections__period_2_at_2_48_hz(preset):
+    found = closed_at(preset, 2.48)
+    assert (found.orbit_period == 2).sum() >= 10
+    assert np.isin(found.orbit_period, [0, 2]).all()
+    two = found.section[found.orbit_period == 2]
+    assert (distance(two[:, :2], two[:, 2:]) < 1e-5).all()
+    assert (distance(two[:, 0], two[:, 1]) > 1e-2).all()
+    # an orbit twice as long as looked for is not closed
+    assert (closed_at(preset, 2.48, max_orbit_period=1).orbit_period == 0).all()
+
+
+@pytest.mark.parametrize("frequency", [2.03, 2.40])
+def test_sections__chaos_does_not_close(preset, frequency):
+    found = closed_at(preset, frequency)
+    assert (found.orbit_period == 0).all()
+    assert (found.status == Status.BOUNDED).all()
+    # the whole transient, then the kept periods
+    assert (found.n_periods == 704).all()
+    assert np.ptp(found.section[..., 0]) > 0.05
+
+
+def test_sections__stop_when_closed_changes_nothing_where_nothing_closes(preset):
+    early, late = closed_at(preset, 2.03), closed_at(preset, 2.03, stop_when_closed=False)
+    assert early.section.tobytes() == late.section.tobytes()
+
+
+def test_sections__one_frequency_serves_all(preset):
+    starts = np.array([[0.1, 0.1, 0.0, 0.0], [0.3, -0.2, 1.0, 2.0]])
+    one = sections(preset, 2.2, starts, n_transient=1, n_keep=2)
+    many = sections(preset, [2.2, 2.2], starts, n_transient=1, n_keep=2)
+    assert one.section.tobytes() == many.section.tobytes()
+    assert one.section.shape == (2, 2, 4)
+    assert one.turns.shape == (2, 2)
+    assert one.final_state.shape == (2, 4)
+    for name in ("status", "orbit_period", "n_periods", "n_steps", "n_rejected", "step_size"):
+        assert getattr(one, name).shape == (2,), name
+    assert (one.section[:, -1] == one.final_state).all()
+
+
+def test_sections__takes_dipoles(dipoles, preset):
+    start = [[0.2, 0.2, 0.0, 0.0]]
+    a = sections(dipoles, 2.2, start, n_transient=0, n_keep=1).section
+    b = sections(preset, 2.2, start, n_transient=0, n_keep=1).section
+    assert np.isfinite(a).all()
+    assert np.max(abs(a - b)) > 1e-3
+
+
+GOOD = {"frequency_hz": [2.2], "initial_states": [[0.1, 0.1, 0.0, 0.0]], "n_transient": 0, "n_keep": 1}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frequency_hz": [2.2, 2.3]}, "initial_states has 1 rows; frequency_hz has 2 branches"),
+        ({"frequency_hz": [[2.2]]}, "frequency_hz has 2 dimensions"),
+        ({"frequency_hz": [-2.2]}, "frequency_hz = -2.2 is out of bounds: it must be greater than 0"),
+        ({"frequency_hz": [0.0]}, "frequency_hz = 0"),
+        ({"frequency_hz": [np.nan]}, r"frequency_hz\[0\] = nan is not finite"),
+        ({"frequency_hz": np.inf}, "frequency_hz.* = inf is not finite"),
+        ({"initial_states": [0.1, 0.1, 0.0, 0.0]}, r"initial_states has 1 dimensions \(shape \(4,\)\)"),
+        ({"initial_states": [[0.1, 0.1, 0.0]]}, "initial_states has 3 numbers per state"),
+        ({"initial_states": [[0.1, np.nan, 0.0, 0.0]]}, r"initial_states\[0, 1\] = nan is not finite"),
+        ({"n_transient": -1}, "n_transient = -1 is out of bounds: it must be 0 or more"),
+        ({"n_keep": 0}, "n_keep = 0 is out of bounds: it must be 1 or more"),
+        ({"n_keep": True}, "n_keep = True is not a whole number"),
+        ({"n_keep": 2.0}, "n_keep = 2.0 is not a whole number"),
+        ({"n_transient": "3"}, "n_transient = '3' is not a whole number"),
+        ({"rtol": 1e-14}, "rtol = 1e-14 is out of bounds: it must be at least 1e-13"),
+        ({"rtol": 1.0}, "rtol = 1 is out of bounds"),
+        ({"rtol": np.nan}, "rtol = nan is not finite"),
+        ({"atol": 0.0}, "atol = 0 is out of bounds: it must be greater than 0 and less than 1"),
+        ({"atol": -1e-8}, "atol = -1e-08 is out of bounds"),
+        ({"closure_tolerance": 0.0}, "closure_tolerance = 0 is out of bounds"),
+        ({"max_orbit_period": 0}, "max_orbit_period = 0 is out of bounds"),
+        ({"max_steps_per_period": 0}, "max_steps_per_period = 0 is out of bounds"),
+        ({"n_lanes": 0}, "n_lanes = 0 is out of bounds"),
+        ({"n_lanes": 1.5}, "n_lanes = 1.5 is not a whole number"),
+        ({"step_size": [1e-3, 1e-3]}, "step_size has 2 rows; frequency_hz has 1 branches"),
+        ({"step_size": [np.nan]}, r"step_size\[0\] = nan"),
+    ],
+)
+def test_sections__name_the_bad_argument(preset, change, message):
+    with pytest.raises(ValueError, match=message):
+        sections(preset, **(GOOD | change))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "frequency", "message"),
+    [
+        (np.ones((1, 1, 33)), [[2.2]], r"parameters has shape \(1, 1, 33\).*ask for \(1, 1, 34\)"),
+        (np.ones((2, 1, 34)), [[2.2]], r"parameters has shape \(2, 1, 34\).*ask for \(1, 1, 34\)"),
+        (np.ones((1, 34)), [[2.2]], "parameters has 2 dimensions"),
+        (np.full((1, 1, 34), np.nan), [[2.2]], r"parameters\[0, 0, 0\] = nan"),
+        (np.ones((1, 1, 34)), [2.2], "frequency_hz has 1 dimensions"),
+    ],
+)
+def test_run_branches__names_the_bad_array(parameters, frequency, message):
+    with pytest.raises(ValueError, match=message):
+        run_branches(
+            parameters, frequency, [[0.1, 0.1, 0.0, 0.0]], n_transient=0, n_keep=1, rtol=1e-8, atol=1e-8
+        )
