@@ -50,7 +50,7 @@ def read_labels(
     Parameters
     ----------
     labels
-        Integers, any shape; a lazy array is loaded.
+        Integers, one dim or more; a lazy array is loaded.
     unfinished
         Codes of cells whose outcome is not known.
     ids
@@ -61,7 +61,7 @@ def read_labels(
     TypeError
         If the labels are not integers: a NaN has no meaning that could be counted.
     ValueError
-        If there is no cell, or a code in `ids` is also in `unfinished`.
+        If there is no axis or no cell, or a code in `ids` is also in `unfinished`.
     """
     values = np.asarray(labels)
     if values.dtype.kind not in "biu":
@@ -69,8 +69,8 @@ def read_labels(
             f"labels are of dtype {values.dtype}, not integers: give each outcome an integer code, NaN "
             "the code of an unfinished cell, and convert with astype"
         )
-    if values.size == 0:
-        raise ValueError(f"labels of shape {values.shape} hold no cell: give at least one")
+    if values.ndim == 0 or values.size == 0:
+        raise ValueError(f"labels of shape {values.shape} are no cells along an axis: give at least one")
     if both := sorted(set(ids) & set(unfinished)):
         raise ValueError(f"{both} in ids are also in unfinished: a code is an outcome or it is not; drop one")
     found, inverse = np.unique(values, return_inverse=True)

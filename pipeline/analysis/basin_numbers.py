@@ -1,8 +1,8 @@
 """Numbers on basins of attraction, each with its error.
 
-Basin fractions and tipping probabilities are here; what describes the boundary between basins, their
-entropy, uncertainty exponent and the Wada test, is in `basin_boundaries` and can be imported from here
-too. All take labels: an integer per cell that names its outcome (see `basin_labels`).
+Basin fractions and tipping probabilities are here; basin entropy and uncertainty exponent are in
+`basin_boundaries`, the Wada test in `basin_wada`, and all can be imported from here. They take labels:
+an integer per cell that names its outcome (see `basin_labels`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import numpy.typing as npt
 import xarray as xr
 from scipy import special
 
-from pipeline.analysis.basin_boundaries import basin_entropy, uncertainty_exponent, wada_merge_test
+from pipeline.analysis.basin_boundaries import basin_entropy, uncertainty_exponent
 from pipeline.analysis.basin_labels import UNFINISHED, Floats, LabelGrid, check_confidence, read_labels
+from pipeline.analysis.basin_wada import wada_merge_test
 
 __all__ = [
     "basin_entropy",

@@ -173,8 +173,9 @@ def test_basin_fractions__along_a_sweep():
 def test_basin_fractions__refuses():
     with pytest.raises(TypeError, match=r"float64.*integer code"):
         basin_fractions([0.0, 1.0])
-    with pytest.raises(ValueError, match="no cell"):
-        basin_fractions(np.zeros((0, 3), dtype=int))
+    for nothing in (np.zeros((0, 3), dtype=int), 4):
+        with pytest.raises(ValueError, match="no cells"):
+            basin_fractions(nothing)
     with pytest.raises(ValueError, match="confidence is 95"):
         basin_fractions([0, 1], confidence=95)
     with pytest.raises(ValueError, match="'wald'"):
@@ -396,6 +397,15 @@ def test_uncertainty_exponent__entropy_of_a_straight_boundary():
     np.testing.assert_allclose(ds["uncertain"] * 400 / ds["epsilon"], np.log(2), rtol=0.02)
 
 
+def test_uncertainty_exponent__boxes_that_see_nothing_are_no_part_of_the_fit():
+    labels = np.repeat([0, 1], 1200)  # sides of 4, 5 and 6 meet the boundary with an edge
+    ds = uncertainty_exponent(labels, method="boxes", epsilons=[4, 5, 6, 7, 11, 16, 17])
+    assert ds["used"].values.tolist() == [False, False, False, True, True, False, True]
+    np.testing.assert_allclose(ds["uncertain"].values[[3, 4, 6]], [1 / 342, 1 / 218, 1 / 141])
+    slope = np.polyfit(np.log([7, 11, 17]), np.log([1 / 342, 1 / 218, 1 / 141]), 1)[0]
+    assert ds["exponent"].item() == pytest.approx(slope)
+
+
 def test_uncertainty_exponent__random_labels_have_none():
     labels = np.random.default_rng(1).integers(3, size=(100, 100))
     ds = uncertainty_exponent(labels)
@@ -509,6 +519,7 @@ def test_wada_merge_test__hidden_boundary():
     assert np.isinf(ds["hausdorff_distance"].item())
     assert not ds["wada"].item()
     assert ds["n_boundary"].values.tolist() == [16, 16, 0]
+    assert ds["beyond"].item() == 0.1
     assert ds["fraction_unfinished"].item() == 0.25
 
 
