@@ -14,7 +14,9 @@ from pipeline.schema import STATE_UNITS, STATES
 from pipeline.spec import FREQUENCY, GridStarts, ListStarts, RandomStarts, Range, Spec, Starts
 
 DIRECTION_CODES = {"up": 1, "down": -1}
-STATE_NAMES = dict(zip(STATES, ("angle of link 1", "angle of link 2", "rate of link 1", "rate of link 2"), strict=True))
+STATE_NAMES = dict(
+    zip(STATES, ("angle of link 1", "angle of link 2", "rate of link 1", "rate of link 2"), strict=True)
+)
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,8 @@ def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
     """
     parameters = describe(spec.parameters.load())
     found = [
-        Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, parameters)) for a in parameter_axes(spec)
+        Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, parameters))
+        for a in parameter_axes(spec)
     ]
     if FREQUENCY not in spec.axes:
         value = np.array(spec.parameters.frequency_hz, dtype=np.float64)
@@ -242,7 +245,9 @@ class CellMap:
             if name != FREQUENCY:
                 parameters[..., self._names.index(name)] = value
         fixed = np.full(shape, np.nan if self._fixed_hz is None else self._fixed_hz)
-        return Inputs(parameters, values.get(FREQUENCY, fixed), self._states.at(self._start_of(index[:, :, 0])))
+        return Inputs(
+            parameters, values.get(FREQUENCY, fixed), self._states.at(self._start_of(index[:, :, 0]))
+        )
 
     def _start_of(self, index: np.ndarray) -> np.ndarray:
         """Flat index of the initial state of each branch."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import sys
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,7 +29,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-plot_app = typer.Typer(help="Draw figures from a stored cube; nothing is computed again.", no_args_is_help=True)
+plot_app = typer.Typer(
+    help="Draw figures from a stored cube; nothing is computed again.", no_args_is_help=True
+)
 app.add_typer(plot_app, name="plot")
 
 
@@ -77,17 +81,26 @@ def _main(
 
 @app.command(epilog=_EXIT_HELP)
 def run(
-    spec: Annotated[str, typer.Argument(metavar="SPEC", help="A TOML file, or the name of a shipped workflow.")],
+    spec: Annotated[
+        str, typer.Argument(metavar="SPEC", help="A TOML file, or the name of a shipped workflow.")
+    ],
     out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
     workers: Annotated[
-        int | None, typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores.")
+        int | None,
+        typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores."),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="Address of a dask scheduler, or 'none'. Default: $DASK_SCHEDULER_ADDRESS, or own workers."),
+        typer.Option(
+            help="Address of a dask scheduler, or 'none'. Default: $DASK_SCHEDULER_ADDRESS, or own workers."
+        ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")] = False,
-    smoke: Annotated[bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")
+    ] = False,
+    smoke: Annotated[
+        bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")
+    ] = False,
     plot: Annotated[bool, typer.Option("--plot", help="Draw the bifurcation diagram at the end.")] = False,
 ) -> None:
     """Compute what a specification asks for, or what is missing of it.
@@ -121,7 +134,8 @@ def status(directory: Directory) -> None:
 def verify(
     directory: Directory,
     repair: Annotated[
-        bool, typer.Option("--repair", help="Withdraw damaged tasks, so that the next run computes them again.")
+        bool,
+        typer.Option("--repair", help="Withdraw damaged tasks, so that the next run computes them again."),
     ] = False,
 ) -> None:
     """Check every committed byte against the commit records."""
@@ -144,7 +158,9 @@ def simulate(
     psi1_dot: Annotated[float, typer.Option(help="Initial rate of link 1 [rad/s].")] = 0.0,
     psi2_dot: Annotated[float, typer.Option(help="Initial rate of link 2 [rad/s].")] = 0.0,
     preset: Annotated[str, typer.Option(help="Parameter preset.")] = "wojna2018",
-    settings: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")
+    ] = None,
     transient: Annotated[int, typer.Option(help="Drive periods before the series begins.")] = 0,
     periods: Annotated[int, typer.Option(help="Drive periods of the series.")] = 10,
     samples: Annotated[int, typer.Option(help="Samples per period.")] = 200,
@@ -206,8 +222,12 @@ def bifurcation(
     state: Annotated[State, typer.Option(help="What is drawn over the parameter.")] = State.PSI1,
     out: Annotated[Path | None, typer.Option(help="Figure file; by default in DIR/figures.")] = None,
     degrees: Annotated[bool, typer.Option("--degrees", help="Degrees instead of radians.")] = False,
-    layout: Annotated[Layout, typer.Option(help="Both directions in one panel, or a panel each.")] = Layout.OVERLAY,
-    file_format: Annotated[Format | None, typer.Option("--format", help="File format; by default png, or that of --out.")] = None,
+    layout: Annotated[
+        Layout, typer.Option(help="Both directions in one panel, or a panel each.")
+    ] = Layout.OVERLAY,
+    file_format: Annotated[
+        Format | None, typer.Option("--format", help="File format; by default png, or that of --out.")
+    ] = None,
 ) -> None:
     """Draw a bifurcation diagram: left, right and straddling motions over the swept parameter."""
     path = _bifurcation(directory, state.value, out, degrees, layout.value, file_format)
@@ -232,10 +252,27 @@ def _bifurcation(
         target = out.with_name(out.name + suffix) if file_format and out.suffix.lower() != suffix else out
         _check_figure_path(target)
     ds: xr.Dataset = open_run(directory)
-    figure = plot_bifurcation(ds, state=state, degrees=degrees, layout=layout)
+    with _refusals(directory):
+        figure = plot_bifurcation(ds, state=state, degrees=degrees, layout=layout)
     if out is None:
         target.parent.mkdir(exist_ok=True)
     return _save(figure, target)
+
+
+@contextlib.contextmanager
+def _refusals(directory: Path) -> Iterator[None]:
+    """Say what is wrong with a cube or an option instead of failing with a trace."""
+    from pipeline.problems import SpecError
+    from pipeline.store import DamagedError
+
+    try:
+        yield
+    except ValueError as error:
+        if "checksum" in str(error).lower():
+            raise DamagedError(
+                f"{directory}: a chunk is damaged; look with: magpend verify {directory}"
+            ) from None
+        raise SpecError([f"{directory}: {error}"]) from None
 
 
 def _save(figure: Figure, target: Path) -> Path:
@@ -271,7 +308,7 @@ def _overrides(settings: list[str]) -> dict[str, float]:
 
     found, problems = {}, []
     for text in settings:
-        name, equals, value = text.partition("=")
+        name, _, value = text.partition("=")
         try:
             found[name.strip()] = float(value)
         except ValueError:
@@ -286,10 +323,11 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     from magpend_core.parameters import ParameterError
     from pipeline.execute import TaskFailedError
     from pipeline.problems import SpecError
-    from pipeline.store import LockedError, StoreError
+    from pipeline.store import DamagedError, LockedError, StoreError
 
     return [
         ((LockedError,), Exit.LOCKED),
+        ((DamagedError,), Exit.DAMAGED),
         ((SpecError, ParameterError, StoreError), Exit.REFUSED),
         ((TaskFailedError, ArithmeticError, OSError), Exit.FAILED),
     ]

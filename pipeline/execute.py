@@ -89,7 +89,7 @@ def _client(address: str | None, n_workers: int) -> Iterator[Any]:
         stack.enter_context(dask.config.set(settings))
         if address is None:
             address = stack.enter_context(_local_cluster(n_workers))
-        yield stack.enter_context(Client(address, set_as_default=False))
+        yield stack.enter_context(Client(address, set_as_default=False))  # type: ignore[no-untyped-call]
 
 
 @contextlib.contextmanager
@@ -99,13 +99,14 @@ def _local_cluster(n_workers: int) -> Iterator[Any]:
 
     with (
         tempfile.TemporaryDirectory(prefix="magpend-", ignore_cleanup_errors=True) as scratch,
-        LocalCluster(
+        LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=n_workers,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=None,
-            worker_dashboard_address=None,
+            # The scheduler serves HTTP even without a dashboard: by default at port 8787, with a
+            # warning if another run is there.
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             local_directory=scratch,
             silence_logs=50,
         ) as cluster,
@@ -140,8 +141,8 @@ def _window(client: Any, task: Task, indices: Sequence[int]) -> Iterator[dict[st
         names.update({f.key: i for f, i in zip(futures, chosen, strict=True)})
         return list(futures)
 
-    pending = as_completed(submit(WINDOW * threads), loop=client.loop)
-    for batch in pending.batches():
+    pending = as_completed(submit(WINDOW * threads), loop=client.loop)  # type: ignore[no-untyped-call]
+    for batch in pending.batches():  # type: ignore[no-untyped-call]
         for future in batch:
             index = names.pop(future.key)
             if future.status != "finished":
@@ -149,4 +150,4 @@ def _window(client: Any, task: Task, indices: Sequence[int]) -> Iterator[dict[st
                 raise TaskFailedError(f"task {index}: {type(error).__name__}: {error}") from error
             yield future.result()
         for future in submit(len(batch)):
-            pending.add(future)
+            pending.add(future)  # type: ignore[no-untyped-call]

@@ -29,7 +29,7 @@ _SENTENCES = {
     Exit.REFUSED: "bad input, or refused; nothing was created or changed",
     Exit.LOCKED: "another process is writing to the run directory",
     Exit.FAILED: "a computation failed; what is committed stays, the same command goes on",
-    Exit.DAMAGED: "verify found damage",
+    Exit.DAMAGED: "stored data are damaged",
     Exit.INTERRUPTED: "stopped by Ctrl-C; what is committed stays, the same command goes on",
     Exit.TERMINATED: "stopped by SIGTERM; likewise",
 }

@@ -130,7 +130,9 @@ def make_plan(spec: Spec) -> Plan:
     cells = CellMap(spec)
     seconds = _seconds_per_cell(spec)
     n_points = 1 if cells.path is None else cells.shape[cells.path]
-    wanted = spec.execution.trajectories_per_task or _trajectories(spec, math.prod(cells.shape), n_points, seconds)
+    wanted = spec.execution.trajectories_per_task or _trajectories(
+        spec, math.prod(cells.shape), n_points, seconds
+    )
     block = _block(cells.shape, cells.path, wanted)
     return Plan(spec.kind, cells.dims, cells.shape, cells.path, block, spec.integration.n_keep, seconds)
 

@@ -89,7 +89,11 @@ class Progress:
     def line(self) -> str:
         """Return the plain line."""
         rate = self.rate()
-        left = f", {duration((self._total - self._done) / rate)} left" if rate > 0 and self._done < self._total else ""
+        left = (
+            f", {duration((self._total - self._done) / rate)} left"
+            if rate > 0 and self._done < self._total
+            else ""
+        )
         share = 100 * self._done / self._total
         return f"{self._done}/{self._total} cells ({share:.0f} %), {rate:.0f} cells/s{left}"
 

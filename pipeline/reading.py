@@ -58,9 +58,10 @@ def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
     ds = ds[[v.name for v in VARIABLES]].assign_coords(_labels())
     if "direction" in ds.coords:
         ds = ds.assign_coords(direction=_words(ds.coords["direction"]))
+    version = info.versions.get("magpend", "(not installed)")
     attrs = {
         "title": info.title,
-        "source": f"magpend {info.versions.get('magpend', '(not installed)')}, kernel {info.identity['kernel_version']}",
+        "source": f"magpend {version}, kernel {info.identity['kernel_version']}",
         "kind": plan.kind,
         "spec": info.spec_text,
         "digest": info.digest,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import store
-from pipeline.identity import digest_of, identity_of
+from pipeline.identity import identity_of
 from pipeline.plan import Plan, make_plan
 from pipeline.problems import SpecError
 from pipeline.progress import Progress, duration, size
@@ -177,7 +177,9 @@ def _complete(
         echo(f"{info.directory} is complete; nothing to do.")
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
-    echo(f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else ""))
+    echo(
+        f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
+    )
     seconds = task.warm_up(spec)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
@@ -247,8 +249,9 @@ def describe_plan(
         f"{parsed.kind}: {plan.n_cells} cells ({dims or 'one cell'})",
         f"tasks: {plan.n_tasks} of {' x '.join(map(str, plan.block)) or '1'} cells, {len(done)} done",
         f"cube: {size(plan.n_bytes)} before compression",
-        f"time: about {duration(plan.core_seconds)} of one core, {duration(plan.core_seconds / cores)} on {cores} "
-        "(a rule of thumb; orbits that close early end sooner)",
+        f"time: about {duration(plan.core_seconds)} of one core, "
+        f"{duration(plan.core_seconds / cores)} on {cores} (a rule of thumb; "
+        "orbits that close early end sooner)",
         f"directory: {directory}" + ("" if info else " (not created)"),
     ]
 

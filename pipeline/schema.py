@@ -74,7 +74,7 @@ VARIABLES = (
     ),
     Variable("turns", ("link",), "int32", 0, "1", "full turns of the link over the kept periods"),
     Variable("status", (), "int8", int(Status.PENDING), "1", "what became of the cell", _status_attrs()),
-    Variable("orbit_period", (), "int16", 0, "1", "period of the closed orbit in drive periods, 0 if not closed"),
+    Variable("orbit_period", (), "int16", 0, "1", "period of the closed orbit [drive periods]; 0: none"),
     Variable("n_periods", (), "int32", 0, "1", "drive periods integrated in all"),
     Variable("n_steps", (), "int32", 0, "1", "accepted integration steps"),
     Variable("n_rejected", (), "int32", 0, "1", "rejected integration steps"),

@@ -79,7 +79,8 @@ def simulate(
     series = trajectory(parameters, frequency_hz, state, time, rtol=rtol, atol=atol)
     drive = torques(time, series, parameters, frequency_hz).drive
     variables: dict[str, Any] = {
-        name: ("time", series[:, i], {"units": STATE_UNITS[i], "long_name": _NAMES[i]}) for i, name in enumerate(STATES)
+        name: ("time", series[:, i], {"units": STATE_UNITS[i], "long_name": _NAMES[i]})
+        for i, name in enumerate(STATES)
     }
     variables["torque"] = ("time", np.asarray(drive), {"units": "N m", "long_name": "driving torque"})
     axis = ("time", time, {"units": "s", "long_name": "time since the first rising edge of the drive"})
@@ -97,7 +98,13 @@ def simulate(
 
 
 def _problems(
-    frequency_hz: float, state: Sequence[float], n_transient: int, n_periods: int, samples: int, rtol: float, atol: float
+    frequency_hz: float,
+    state: Sequence[float],
+    n_transient: int,
+    n_periods: int,
+    samples: int,
+    rtol: float,
+    atol: float,
 ) -> list[str]:
     found = []
     for name, value in {"frequency_hz": frequency_hz, "rtol": rtol, "atol": atol}.items():
@@ -106,7 +113,9 @@ def _problems(
     if 0 < rtol < 1e-13:
         found.append(f"rtol = {rtol!r}: must be at least 1e-13.")
     found += [
-        f"{n} = {v!r}: must be a finite number." for n, v in zip(STATES, state, strict=True) if not math.isfinite(v)
+        f"{n} = {v!r}: must be a finite number."
+        for n, v in zip(STATES, state, strict=True)
+        if not math.isfinite(v)
     ]
     for name, number, least in (
         ("n_transient", n_transient, 0), ("n_periods", n_periods, 1), ("samples_per_period", samples, 1),
@@ -114,7 +123,9 @@ def _problems(
         if number < least:
             found.append(f"{name} = {number!r}: must be at least {least}.")
     if n_periods * samples > MAX_SAMPLES:
-        found.append(f"n_periods * samples_per_period = {n_periods * samples}: must be at most {MAX_SAMPLES}.")
+        found.append(
+            f"n_periods * samples_per_period = {n_periods * samples}: must be at most {MAX_SAMPLES}."
+        )
     return found
 
 

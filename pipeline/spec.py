@@ -49,7 +49,9 @@ class Range(Table):
         forms = [{"start", "stop", "num"}, {"start", "stop", "step"}, {"values"}]
         if given not in forms:
             have = ", ".join(sorted(given)) or "nothing"
-            raise ValueError(f"give start, stop and num, or start, stop and step, or values alone (given: {have}).")
+            raise ValueError(
+                f"give start, stop and num, or start, stop and step, or values alone (given: {have})."
+            )
         if self.values is not None:
             if any(b <= a for a, b in itertools.pairwise(self.values)):
                 raise ValueError("values must rise strictly; sort them and drop repeated ones.")
@@ -240,7 +242,9 @@ class Spec:
             table = getattr(self, name)
             if table is not None:
                 tables[name] = table.model_dump(mode="json", exclude_none=True)
-        tables["axes"] = {name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()}
+        tables["axes"] = {
+            name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()
+        }
         return tables
 
 
@@ -250,7 +254,16 @@ _TABLES: dict[str, type[Table]] = {
     "integration": Integration,
     "execution": Execution,
 }
-_KEYS = ("kind", "title", "parameters", "axes", "initial_conditions", "continuation", "integration", "execution")
+_KEYS = (
+    "kind",
+    "title",
+    "parameters",
+    "axes",
+    "initial_conditions",
+    "continuation",
+    "integration",
+    "execution",
+)
 
 
 def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
@@ -355,7 +368,9 @@ def parse_spec(data: Mapping[str, Any]) -> Spec:
     if problems:
         raise SpecError(problems)
     assert starts is not None
-    return Spec(kind, title, tables["parameters"], axes, starts, walk, tables["integration"], tables["execution"])
+    return Spec(
+        kind, title, tables["parameters"], axes, starts, walk, tables["integration"], tables["execution"]
+    )
 
 
 def _declared(data: Mapping[str, Any]) -> tuple[str, ...]:
@@ -376,7 +391,7 @@ def _valid_keys(model: type[ParametersTable], table: Any) -> ParametersTable:
 def _kind(data: Mapping[str, Any], problems: list[str]) -> str:
     kind = data.get("kind")
     if kind is None:
-        problems.append("kind: missing; add kind = \"sweep\" or kind = \"continuation\".")
+        problems.append('kind: missing; add kind = "sweep" or kind = "continuation".')
     elif kind not in KINDS:
         problems.append(unknown_choice("kind", kind, KINDS))
     return str(kind)
@@ -421,7 +436,7 @@ def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
 
 def _starts(data: Mapping[str, Any], problems: list[str]) -> Starts | None:
     if "initial_conditions" not in data:
-        problems.append("initial_conditions: missing; add this table with kind = \"grid\", \"list\" or \"random\".")
+        problems.append('initial_conditions: missing; add this table with kind = "grid", "list" or "random".')
         return None
     if not _is_table(data, "initial_conditions", problems):
         return None
@@ -430,7 +445,7 @@ def _starts(data: Mapping[str, Any], problems: list[str]) -> Starts | None:
     if kind not in _STARTS:
         choices = list(_STARTS)
         problems.append(
-            "initial_conditions.kind: missing; set it to \"grid\", \"list\" or \"random\"."
+            'initial_conditions.kind: missing; set it to "grid", "list" or "random".'
             if kind is None
             else unknown_choice("initial_conditions.kind", kind, choices)
         )
@@ -445,13 +460,14 @@ def _walk(
     """Check ``[continuation]`` against the kind and the axes."""
     if kind != "continuation":
         if kind == "sweep" and "continuation" in data:
-            problems.append("continuation: a sweep has none; set kind = \"continuation\" or drop the table.")
+            problems.append('continuation: a sweep has none; set kind = "continuation" or drop the table.')
         return None
     declared = _declared(data)
     if walk is not None and walk.path not in declared:
         known = ", ".join(declared) or "none yet"
         problems.append(
-            f"continuation.path = {walk.path!r}: must be an axis (axes: {known}); add it to [axes] or set the path."
+            f"continuation.path = {walk.path!r}: must be an axis (axes: {known}); "
+            "add it to [axes] or set the path."
         )
     return walk
 

@@ -58,6 +58,10 @@ class RefusedError(StoreError):
     """The directory holds another run, or is no run directory."""
 
 
+class DamagedError(StoreError):
+    """Committed data are not what was written."""
+
+
 class LockedError(StoreError):
     """Another process is writing to the run directory."""
 
@@ -216,7 +220,14 @@ def _write_coordinate(group: zarr.Group, coordinate: Coordinate) -> None:
     fill = np.nan if values.dtype.kind == "f" else 0
     chunks = tuple(max(n, 1) for n in values.shape)
     array = _create_array(
-        group, coordinate.name, coordinate.dims, values.shape, chunks, str(values.dtype), fill, coordinate.attrs
+        group,
+        coordinate.name,
+        coordinate.dims,
+        values.shape,
+        chunks,
+        str(values.dtype),
+        fill,
+        coordinate.attrs,
     )
     array[...] = values
 
@@ -259,7 +270,8 @@ def check(directory: Path, identity: dict[str, Any]) -> RunInfo | None:
         lines = differences(info.identity, identity)
         if lines:
             raise RefusedError(
-                f"{directory}: holds another run. Give another --out, or remove it. What differs:\n  " + "\n  ".join(lines)
+                f"{directory}: holds another run. Give another --out, or remove it. What differs:\n  "
+                + "\n  ".join(lines)
             )
         return info
     if directory.exists() and not directory.is_dir():
@@ -307,7 +319,9 @@ def writer_lock(directory: Path) -> Iterator[None]:
 # ---- tasks -------------------------------------------------------------------------------------
 
 
-def write_task(info: RunInfo, plan: Plan, index: int, values: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> None:
+def write_task(
+    info: RunInfo, plan: Plan, index: int, values: Mapping[str, np.ndarray], counts: Mapping[str, int]
+) -> None:
     """Write a task's cells and commit them.
 
     Parameters
@@ -345,7 +359,9 @@ def _write_block(cube: Path, plan: Plan, index: int, name: str, values: np.ndarr
     region = (*block, *(slice(0, n) for n in own))
     expected = tuple(s.stop - s.start for s in region)
     if values.shape != expected or values.dtype != array.dtype:
-        raise ValueError(f"{name}: {values.dtype} {values.shape} where the store has {array.dtype} {expected}.")
+        raise ValueError(
+            f"{name}: {values.dtype} {values.shape} where the store has {array.dtype} {expected}."
+        )
     keys = _chunk_keys(name, region, array.chunks, array.shape)
     array[region] = values
     return keys
@@ -392,7 +408,9 @@ def read_commits(info: RunInfo, plan: Plan) -> dict[int, Commit]:
 
 def _sizes(cube: Path) -> dict[str, int]:
     """Size of every file of the cube by key."""
-    return {f"{a.name}/{f.name}": f.stat().st_size for a in os.scandir(cube) if a.is_dir() for f in os.scandir(a)}
+    return {
+        f"{a.name}/{f.name}": f.stat().st_size for a in os.scandir(cube) if a.is_dir() for f in os.scandir(a)
+    }
 
 
 def _read_marker(path: Path, info: RunInfo, plan: Plan) -> Commit | None:
@@ -400,7 +418,9 @@ def _read_marker(path: Path, info: RunInfo, plan: Plan) -> Commit | None:
     try:
         data = json.loads(path.read_bytes())
         commit = Commit(int(data["task"]), dict(data["status"]), dict(data["objects"]))
-        complete = all(isinstance(e["size"], int) and isinstance(e["sha256"], str) for e in commit.objects.values())
+        complete = all(
+            isinstance(e["size"], int) and isinstance(e["sha256"], str) for e in commit.objects.values()
+        )
         right = data["digest"] == info.digest and 0 <= commit.task < plan.n_tasks
         named = path.name == marker_path(info.directory, commit.task).name
     except (OSError, ValueError, KeyError, TypeError):
@@ -459,7 +479,9 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
     for path in paths:
         commit = _read_marker(path, info, plan)
         if commit is None:
-            damaged[int(path.stem) if path.stem.isdigit() else -1] = f"{path.name}: no valid marker of this run"
+            damaged[int(path.stem) if path.stem.isdigit() else -1] = (
+                f"{path.name}: no valid marker of this run"
+            )
             continue
         vouched.update(commit.objects)
         problems = _object_problems(cube, commit.objects)
@@ -521,14 +543,17 @@ class CommittedStore(WrapperStore[Store]):
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
+        """As in zarr, without what is not committed."""
         return await self._store.get(key, prototype, byte_range) if self._shows(key) else None
 
     async def exists(self, key: str) -> bool:
+        """As in zarr, without what is not committed."""
         return self._shows(key) and await self._store.exists(key)
 
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
+        """As in zarr, without what is not committed."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     async def _get_many(

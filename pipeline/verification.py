@@ -46,7 +46,9 @@ def describe(found: store.Verification, directory: str | Path, *, repaired: bool
     if found.skeleton:
         lines.append("Metadata or coordinates are damaged: remove the directory and run again.")
     elif found.damaged and repaired:
-        lines.append(f"{len(found.damaged)} markers withdrawn: run the specification again to compute these tasks.")
+        lines.append(
+            f"{len(found.damaged)} markers withdrawn: run the specification again to compute these tasks."
+        )
     elif found.damaged:
         lines.append("Withdraw them with --repair, then run the specification again to compute these tasks.")
     return lines

@@ -140,7 +140,8 @@ def magpend(tmp_path, environment):
     def call(*arguments, **options):
         return subprocess.run(
             [sys.executable, "-m", "pipeline.cli", *map(str, arguments)],
-            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240, check=False, **options,
+            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240, check=False,
+            **options,
         )  # fmt: skip
 
     return call

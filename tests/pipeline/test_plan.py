@@ -65,7 +65,9 @@ def test_make_plan__multiples_of_lanes_and_sizes():
     plan = make_plan(parse_spec(tomllib.loads(text)))
     assert plan.n_cells == 101 * 400 * 400
     cells = plan.cells_in(0)
-    assert 1e6 < cells * sum(v.itemsize({"period_index": 60, "state": 4, "link": 2}) for v in VARIABLES) <= 8.1e6
+    assert (
+        1e6 < cells * sum(v.itemsize({"period_index": 60, "state": 4, "link": 2}) for v in VARIABLES) <= 8.1e6
+    )
     assert plan.n_tasks < 20_000
 
 
@@ -87,7 +89,8 @@ def test_task__out_of_range(sweep_text):
 
 @pytest.mark.parametrize("module", ["pipeline.plan", "pipeline.schema", "pipeline.spec", "pipeline.identity"])
 def test_import__pure(module):
-    code = f"import sys, {module}; print([m for m in ('dask', 'zarr', 'xarray', 'matplotlib') if m in sys.modules])"
+    heavy = "('dask', 'zarr', 'xarray', 'matplotlib')"
+    code = f"import sys, {module}; print([m for m in {heavy} if m in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 
@@ -101,7 +104,12 @@ def test_identity__what_counts(sweep_text):
     assert digest(sweep_text.replace("small sweep", "another title")) == same
     assert digest(sweep_text.replace("stop = 30", "stop = 30.0")) == same
     assert digest(sweep_text + "\n", "other kernel") != same
-    for old, new in [("n_keep = 3", "n_keep = 4"), ("1.6]", "1.7]"), ("= 24", "= 12"), ("rtol = 1e-6", "rtol = 1e-7")]:
+    for old, new in [
+        ("n_keep = 3", "n_keep = 4"),
+        ("1.6]", "1.7]"),
+        ("= 24", "= 12"),
+        ("rtol = 1e-6", "rtol = 1e-7"),
+    ]:
         assert digest(sweep_text.replace(old, new)) != same
 
 

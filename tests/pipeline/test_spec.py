@@ -88,7 +88,11 @@ def test_parse_spec__all_errors_at_once():
         (("[axes]", "[parameters]\noverrides = { q = 1.0 }\n[axes]"), "axes.q", "keep one"),
         (("[axes]", "[continuation]\n[axes]"), "continuation", "a sweep has none"),
         (("start = 2.0, stop = 3.0", "start = 0.0, stop = 3.0"), "axes.frequency_hz", "greater than 0 Hz"),
-        (("start = 2.0, stop = 3.0", "start = 3.0, stop = 2.0"), "axes.frequency_hz", "must be greater than start"),
+        (
+            ("start = 2.0, stop = 3.0", "start = 3.0, stop = 2.0"),
+            "axes.frequency_hz",
+            "must be greater than start",
+        ),
         (("[1.5, 1.6]", "[1.6, 1.5]"), "axes.q", "rise strictly"),
         (("[1.5, 1.6]", "[]"), "axes.q.values", "at least 1"),
         (('kind = "grid"', 'kind = "gird"'), "initial_conditions.kind", "Did you mean 'grid'"),
@@ -121,7 +125,8 @@ def test_parse_spec__path_must_be_an_axis(walk_text):
 
 @pytest.mark.parametrize("rows", ["[[0.1]]", "[[0.1, 0.2, 0.3]]", "[]", "[0.1, 0.2]", "[[0.1, nan]]"])
 def test_parse_spec__bad_rows(rows):
-    text = f'kind = "sweep"\n[parameters]\nfrequency_hz = 2\n[initial_conditions]\nkind = "list"\npoints = {rows}'
+    head = 'kind = "sweep"\n[parameters]\nfrequency_hz = 2\n[initial_conditions]\nkind = "list"'
+    text = f"{head}\npoints = {rows}"
     assert problems_of(text)[0].startswith("initial_conditions")
 
 
