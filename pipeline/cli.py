@@ -150,13 +150,13 @@ def verify(
 
 @app.command(epilog=_EXIT_HELP)
 def simulate(
-    frequency_hz: Annotated[float, typer.Option(help="Drive frequency [Hz].")] = 2.2,
-    psi1: Annotated[float | None, typer.Option(help="Initial angle of link 1 [rad].")] = None,
-    psi2: Annotated[float | None, typer.Option(help="Initial angle of link 2 [rad].")] = None,
+    frequency_hz: Annotated[float, typer.Option(help="Drive frequency \\[Hz].")] = 2.2,
+    psi1: Annotated[float | None, typer.Option(help="Initial angle of link 1 \\[rad].")] = None,
+    psi2: Annotated[float | None, typer.Option(help="Initial angle of link 2 \\[rad].")] = None,
     psi1_deg: Annotated[float | None, typer.Option(help="The same in degrees.")] = None,
     psi2_deg: Annotated[float | None, typer.Option(help="The same in degrees.")] = None,
-    psi1_dot: Annotated[float, typer.Option(help="Initial rate of link 1 [rad/s].")] = 0.0,
-    psi2_dot: Annotated[float, typer.Option(help="Initial rate of link 2 [rad/s].")] = 0.0,
+    psi1_dot: Annotated[float, typer.Option(help="Initial rate of link 1 \\[rad/s].")] = 0.0,
+    psi2_dot: Annotated[float, typer.Option(help="Initial rate of link 2 \\[rad/s].")] = 0.0,
     preset: Annotated[str, typer.Option(help="Parameter preset.")] = "wojna2018",
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")
