@@ -28,9 +28,7 @@ def preset():
 def dipoles(preset):
     """The preset with point dipoles that are about as strong as the fitted magnets."""
     magnet = DipoleMagnet(pole1=120.0, pole2=120.0, l2=preset.magnet.l2, h=preset.magnet.h)
-    return Parameters(
-        pendulum=preset.pendulum, friction=preset.friction, drive=preset.drive, magnet=magnet
-    )
+    return Parameters(pendulum=preset.pendulum, friction=preset.friction, drive=preset.drive, magnet=magnet)
 
 
 @pytest.fixture(scope="session")
