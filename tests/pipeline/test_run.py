@@ -122,6 +122,12 @@ def test_run__failed_task_then_only_the_rest(write_spec, sweep_text, tmp_path, m
         with pytest.raises(TaskFailedError, match="task 2: RuntimeError: out of luck"):
             run(path, tmp_path / "run", workers=0, echo=silent)
     assert state(tmp_path / "run").done == {0, 1}
+    for leftover in (
+        "cube.zarr/section/c.4.0.0.0.0.abc.partial",
+        "cube.zarr/status/c.4.0.0.0",
+        "commits/.3.tmp",
+    ):
+        (tmp_path / "run" / leftover).write_bytes(b"left by a crash")
     calls = counted(monkeypatch)
     run(path, tmp_path / "run", workers=0, echo=silent)
     assert len(calls) == n_tasks - 2
