@@ -1,5 +1,6 @@
 """The engine: its tableau, order, statuses, restarts, and bits that depend on nothing but the lane."""
 
+import dataclasses
 import hashlib
 import itertools
 
@@ -10,7 +11,7 @@ from numba import njit
 from scipy.integrate import solve_ivp
 
 from magpend_core import Status, load_preset, run_branches, sections, trajectory
-from magpend_core.jit import OPTIONS
+from magpend_core.jit import OPTIONS, inline
 from magpend_core.lanes import ERROR, N_STAGES, NODES, STAGES, engine_bindings, rows_of
 from magpend_core.observers import RECORD_LAST
 from magpend_core.simd import WIDTH, store
@@ -164,6 +165,72 @@ def test_engine__few_attempts_are_rejected(preset, rtol):
     found = sections(preset, frequencies, starts, n_transient=9, n_keep=1, rtol=rtol, atol=rtol)
     assert found.n_rejected.sum() < 0.1 * found.n_steps.sum()
     assert found.n_periods.tolist() == [10] * 32
+
+
+@inline
+def _one_layer(y, dy, c):
+    # the value is x, the half-width 0.01, the strength that of a jump of 50
+    return ((y[0], dy[0], 0.0 * y[0] + 0.01, 0.0 * y[0] + 1.0 / (0.01 * 50.0)),)
+
+
+def step_of(rows, w, name):
+    row = getattr(rows, name)
+    return w[row : row + WIDTH]
+
+
+def limits(slack, x, rate, passed, remaining, widths, ratios):
+    """Bounds of the docstring of `choose_step`, one row each: the layer, the edge behind, the edge ahead."""
+    c = (slack * abs(rate) / (0.01 * 50.0)) ** (1.0 / 6.0)
+    away, width = abs(x / rate), abs(0.01 / rate)
+    towards = np.maximum(c * away / (1.0 + c), c * width)
+    layer = np.where(x * rate < 0.0, towards, c * np.hypot(away, width))
+    behind = ratios[0] * np.hypot(passed, widths[0])
+    ahead = np.maximum(ratios[1] * remaining / (1.0 + ratios[1]), ratios[1] * widths[1])
+    return np.array([layer, behind, ahead])
+
+
+def test_choose_step__keeps_the_distance_from_layers_and_edges(oscillator):
+    system = dataclasses.replace(oscillator, n_edges=2, has_layers=True, layers=_one_layer)
+    choose_step, rows = engine_bindings(system, RECORD_LAST)["choose_step"], rows_of(system)
+    rng = np.random.default_rng(5)
+    slack, tightest = 1e-3, np.zeros(4, int)
+    for _ in range(50):
+        w = np.zeros(rows.size)
+        x, rate = rng.uniform(-0.1, 0.1, WIDTH), rng.uniform(-3.0, 3.0, WIDTH)
+        passed, remaining = 10.0 ** rng.uniform(-5.0, 0.0, (2, WIDTH))
+        widths, ratios = 10.0 ** rng.uniform(-4.0, -2.0, (2, WIDTH)), rng.uniform(0.2, 2.0, (2, WIDTH))
+        wish = 10.0 ** rng.uniform(-4.0, 0.0, WIDTH)
+        fresh = rng.integers(0, 8, WIDTH) == 0
+        for name, values in {
+            "state": x, "slopes": rate, "time": 1.0 + passed, "start": 1.0, "wish": wish,
+            "target": 1.0 + passed + remaining, "start_width": widths[0], "target_width": widths[1],
+            "start_ratio": ratios[0], "target_ratio": ratios[1], "fresh": fresh,
+        }.items():  # fmt: skip
+            step_of(rows, w, name)[:] = values
+        choose_step(w, 0, slack)
+        bounds = np.vstack([limits(slack, x, rate, passed, remaining, widths, ratios), wish])
+        tightest += np.bincount(np.argmin(bounds, axis=0), minlength=4)
+        share = bounds.min(axis=0) / remaining
+        # the last two steps before the end share the rest; the last one ends there
+        h = np.where(share >= 1.0, 1.0, np.where(share > 0.5, 0.5, share)) * remaining
+        # the layer's bound is a rough power, good to a thousandth; next to a threshold either will do
+        near = (abs(share - 1.0) < 3e-3) | (abs(share - 0.5) < 3e-3)
+        good = np.isclose(step_of(rows, w, "step"), np.where(fresh, 0.0, h), rtol=2e-3, atol=0.0)
+        assert (good | near).all()
+        assert near.sum() < 3
+        # times are sums of some units
+        assert (step_of(rows, w, "step") <= remaining * (1.0 + 1e-9)).all()
+    # each of the four was the tightest often
+    assert tightest.min() > 50
+
+
+@pytest.mark.parametrize("eps_drive", [1e3, 1e6])
+def test_engine__steps_end_at_the_drives_edges(preset, eps_drive):
+    # edges of a microsecond; at a wrong instant each would cost a dozen rejections
+    sharp = preset.replace(eps_drive=eps_drive)
+    found = sections(sharp, 2.2, [[0.1, 0.2, 0.0, 0.0]], n_transient=0, n_keep=20, rtol=1e-6, atol=1e-6)
+    assert found.n_rejected[0] < 0.06 * found.n_steps[0]
+    assert found.n_steps[0] < 20 * 200
 
 
 def many(n=96):
