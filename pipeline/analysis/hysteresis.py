@@ -1,0 +1,164 @@
+"""Hysteresis: attractors that a continuation meets in one direction only, and where its branches jump.
+
+Reads ids, integrates nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+
+def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
+    """Where a continuation finds other attractors going up than going down.
+
+    Parameters
+    ----------
+    ds
+        Cube of a continuation in both directions; names the axis that the branches walk (attribute
+        ``path``, else its only parameter dim).
+    ids
+        Result of `match` for it.
+
+    Returns
+    -------
+    Dataset
+        ``present`` (parameter dims, direction, attractor): whether a branch of that direction is on
+        the attractor. ``differs`` (parameter dims): whether the sets of ids of both directions
+        differ, where both have any. Loops, runs of neighbouring points of the path that differ, one per
+        `loop`: ``loop_from``, ``loop_to`` (first and last value of the path), ``loop_points`` (their
+        number), ``only_up`` and ``only_down`` (loop, attractor: at how many of its points the
+        attractor is met in that direction only), and the values of the other parameters under their
+        names with the prefix ``loop_at_``. Jumps, changes of a branch's id between neighbouring points of
+        the path as it walks, one row per kind in `jump`: ``jump_from``, ``jump_to`` (values of the path),
+        ``jump_direction`` (1 up, -1 down), ``jump_from_id``, ``jump_to_id``, ``jump_count`` (branches);
+        points where a branch has no id are passed over.
+
+    Raises
+    ------
+    ValueError
+        If the cube has no branches in both directions.
+    """
+    if "branch" not in ds["status"].dims or set(ds["direction"].values) != {"up", "down"}:
+        raise ValueError('hysteresis needs a continuation with direction = "both".')
+    cells = ids["attractor_id"]
+    dims = [str(d) for d in cells.dims if d != "branch"]
+    path = str(ds.attrs.get("path", dims[0] if len(dims) == 1 else ""))
+    if path not in dims:
+        raise ValueError(f"path = {path!r} must be one of the dims {', '.join(dims)}; set ds.attrs['path'].")
+    order = [*(d for d in dims if d != path), path]
+    values = cells.transpose(*order, "branch").values
+    direction = ds["direction"].values
+    present = np.stack(
+        [_presence(values[..., direction == d], ids.sizes["attractor"]) for d in ("up", "down")], axis=-2
+    )
+    differs = (present[..., 0, :] != present[..., 1, :]).any(axis=-1) & present.any(axis=-1).all(axis=-1)
+    result = xr.Dataset(
+        {
+            "present": (
+                (*order, "direction", "attractor"),
+                present,
+                {"units": "1", "long_name": "met by a branch"},
+            ),
+            "differs": (
+                tuple(order),
+                differs,
+                {"units": "1", "long_name": "up and down meet other attractors"},
+            ),
+        },
+        coords={
+            **{d: ids[d] for d in order if d in ids.coords},
+            "direction": ["up", "down"],
+            "attractor": ids["attractor"],
+        },
+    )
+    along = ids[path].values if path in ids.coords else np.arange(ids.sizes[path])
+    return (
+        result.assign(_loops(present, differs, along, order, ids))
+        .assign(_jumps(values, direction, along))
+        .transpose(*dims, ...)
+    )
+
+
+def _presence(values: np.ndarray, n_ids: int) -> np.ndarray:
+    return (
+        np.stack([(values == i).any(axis=-1) for i in range(n_ids)], axis=-1)
+        if n_ids
+        else np.zeros((*values.shape[:-1], 0), bool)
+    )
+
+
+def _loops(
+    present: np.ndarray, differs: np.ndarray, along: np.ndarray, order: list[str], ids: xr.Dataset
+) -> dict[str, Any]:
+    rows: list[tuple[tuple[int, ...], int, int]] = []
+    for index in np.ndindex(*differs.shape[:-1]):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], differs[index], [False]]).astype(np.int8)))
+        rows += [(index, int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    up, down = present[..., 0, :], present[..., 1, :]
+    n = present.shape[-1]
+
+    def counts(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.array([(a[i][s:e] & ~b[i][s:e]).sum(axis=0) for i, s, e in rows], np.int64).reshape(-1, n)
+
+    units = {"units": ids[order[-1]].attrs.get("units", "1")} if order[-1] in ids.coords else {"units": "1"}
+    loops: dict[str, Any] = {
+        "loop_from": (
+            "loop",
+            np.array([along[s] for _, s, _ in rows]),
+            {**units, "long_name": "first value of the path"},
+        ),
+        "loop_to": (
+            "loop",
+            np.array([along[e - 1] for _, _, e in rows]),
+            {**units, "long_name": "last value of the path"},
+        ),
+        "loop_points": (
+            "loop",
+            np.array([e - s for _, s, e in rows], np.int64),
+            {"units": "1", "long_name": "points"},
+        ),
+        "only_up": (
+            ("loop", "attractor"),
+            counts(up, down),
+            {"units": "1", "long_name": "points at which only up meets it"},
+        ),
+        "only_down": (
+            ("loop", "attractor"),
+            counts(down, up),
+            {"units": "1", "long_name": "points at which only down meets it"},
+        ),
+    }
+    for k, name in enumerate(order[:-1]):
+        values = [ids[name].values[i[k]] for i, _, _ in rows]
+        loops[f"loop_at_{name}"] = ("loop", np.array(values), dict(ids[name].attrs))
+    return loops
+
+
+def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray) -> dict[str, Any]:
+    found: dict[tuple[int, int, int, int, int], int] = {}
+    for index in np.ndindex(*values.shape[:-2]):
+        for branch, word in enumerate(direction):
+            sign = 1 if word == "up" else -1
+            line = values[index][::sign, branch]
+            at = np.flatnonzero(line >= 0)
+            for a, b in itertools.pairwise(at.tolist()):
+                if line[a] != line[b]:
+                    before, after = (a, b) if sign > 0 else (len(line) - 1 - a, len(line) - 1 - b)
+                    key = (-sign, before, after, int(line[a]), int(line[b]))
+                    found[key] = found.get(key, 0) + 1
+    kinds = sorted(found)
+    rows = np.array(kinds, np.int64).reshape(-1, 5)
+    counts = np.array([found[kind] for kind in kinds], np.int64)
+    texts = {
+        "jump_from": (along[rows[:, 1]], "value of the path before"),
+        "jump_to": (along[rows[:, 2]], "value of the path after"),
+        "jump_direction": ((-rows[:, 0]).astype(np.int8), "direction of the walk, 1 up, -1 down"),
+        "jump_from_id": (rows[:, 3].astype(np.int32), "attractor before"),
+        "jump_to_id": (rows[:, 4].astype(np.int32), "attractor after"),
+        "jump_count": (counts, "branches"),
+    }
+    return {name: ("jump", data, {"units": "1", "long_name": text}) for name, (data, text) in texts.items()}
