@@ -213,7 +213,8 @@ def _dataset(
         decisions,
         {"units": "1", "long_name": "how the cell was decided", **_flags(_DECISIONS)},
     )
-    result["status"] = ds["status"].transpose(*cell_dims).reset_coords(drop=True).variable.load()
+    about = {"units": "1", "long_name": "what became of the cell", **ds["status"].attrs}
+    result["status"] = (cell_dims, ds["status"].transpose(*cell_dims).values, about)
     keep = {k: v for k, v in ds.coords.items() if set(v.dims) <= set(cell_dims) | {"state", "link"}}
     result = result.assign_coords(keep).assign_coords(
         attractor=("attractor", np.arange(n, dtype=np.int32), {"units": "1", "long_name": "attractor"})
