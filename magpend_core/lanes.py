@@ -524,7 +524,7 @@ _CALLED = (
 
 def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
     """Names that the templates of this module use, bound to a system and an observer."""
-    name = f"{system.name}_{observer.name}"
+    name = f"{system.label}_{observer.name}"
     bindings: dict[str, Any] = {
         "ROWS": rows_of(system),
         "N": system.n_states,
@@ -557,4 +557,4 @@ def engine_of(system: System, observer: Observer) -> Callable[..., None]:
     """Compile `advance` for a system and an observer."""
     bindings = engine_bindings(system, observer)
     cached = is_covered(*system.functions, observer.observe, observer.memory_size)
-    return kernel(specialise(advance, f"{system.name}_{observer.name}", **bindings), cached)
+    return kernel(specialise(advance, f"{system.label}_{observer.name}", **bindings), cached)

@@ -127,7 +127,7 @@ def _evaluator(system: System, name: str) -> Any:
         "constants": system.constants,
         "moments": _fitted_moments if system is PENDULUM_FITTED else _dipole_moments,
     }
-    label = f"{system.name}_{name}"
+    label = f"{system.label}_{name}"
     bindings["quantity"] = inline(specialise(_QUANTITIES[name][0], label, **bindings))
     return kernel(specialise(_evaluate, label, **bindings))
 

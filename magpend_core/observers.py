@@ -83,8 +83,9 @@ def closed_period(ring: Any, last: int, settings: Settings) -> int:
     20 times that between successive sections.
 
     What this does not exclude: a trajectory that passes an unstable orbit at a distance far below
-    the tolerance; a decay that becomes slower later on; and, by a factor below ten, an approach of
-    modulus above 0.99 along a stretched spiral that turns by less than 0.05 rad per period.
+    the tolerance; a decay that becomes slower later on; and an approach along a stretched spiral that
+    turns by less than 0.05 rad per period, where the distance can exceed the tolerance twofold at
+    moduli of 0.96 to 0.99 and eightfold above.
     """
     n = min(last, settings.window)
     for p in range(1, min(settings.max_orbit_period, n // 4) + 1):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +19,7 @@ class System:
     Attributes
     ----------
     name : str
-        Also names the compiled code: one name, one set of functions.
+        One name, one set of functions: it names the compiled code.
     state_names : tuple of str
     is_angle : tuple of bool
         Which states live on a circle of 2 pi. They are brought back to (-pi, pi] at every section,
@@ -79,6 +80,15 @@ class System:
     def functions(self) -> tuple[Callable[..., Any], ...]:
         """All compiled functions."""
         return self.constants, self.forcing, self.rhs, self.edges, self.layers, self.jacobian
+
+    @property
+    def label(self) -> str:
+        """Name of the compiled code: `name`, and a digest of the data that goes into the code."""
+        data = (
+            self.state_names, self.is_angle, self.scales, self.parameter_names, self.n_constants,
+            self.n_edges, self.has_layers, self.escape, self.controlled,
+        )  # fmt: skip
+        return f"{self.name}_{hashlib.sha256(repr(data).encode()).hexdigest()[:8]}"
 
     @property
     def controlled(self) -> int:

@@ -47,17 +47,6 @@ DENSE = np.array(
 )
 
 
-def interpolate(w: Any, y0: Any, k0: Any, x: float, h: float, out: Any) -> None:
-    """Write the state at the fraction `x` of lane 0's last accepted step to `out`."""
-    for i in range(N):
-        total = 0.0
-        for s in range(N_STAGES):
-            slope = k0[i] if s == 0 else w[ROWS.slopes + (s * N + i) * WIDTH]
-            p = ((DENSE[s, 3] * x + DENSE[s, 2]) * x + DENSE[s, 1]) * x + DENSE[s, 0]
-            total += slope * p * x
-        out[i] = y0[i] + h * total
-
-
 def prepare(frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any) -> Any:
     """Return the rows of one group: the trajectory in lane 0, copies that stand still beside it."""
     w = np.zeros(ROWS.size)
@@ -129,8 +118,8 @@ def follow(
 def _follower(system: System) -> Callable[..., int]:
     bindings = engine_bindings(system, RECORD_LAST)
     for template in (prepare, fill):
-        bindings[template.__name__] = njit(**OPTIONS)(specialise(template, system.name, **bindings))
-    return kernel(specialise(follow, system.name, **bindings))
+        bindings[template.__name__] = njit(**OPTIONS)(specialise(template, system.label, **bindings))
+    return kernel(specialise(follow, system.label, **bindings))
 
 
 def trajectory(
