@@ -82,7 +82,7 @@ def test_identify__features_of_the_reference_orbits(found):
     # over the full period, not at the sections alone
     assert (high[right, :2] - low[right, :2]).min() > 0.2
     assert (found["energy_max"] > found["energy_min"]).values[[right, left]].all()
-    modulus = np.hypot(*ORBITS[0]["multipliers"][0])
+    modulus = max(np.hypot(*m) for m in ORBITS[0]["multipliers"])
     assert found["lyapunov_max"].values[right] == pytest.approx(np.log(modulus) * FREQUENCY, rel=1e-5)
 
 
