@@ -20,9 +20,11 @@ def test_progress__rate_and_time_left_count_this_session_only():
     assert lines[-1].startswith("1000/1000 cells (100 %)")
 
 
-def test_progress__bar():
+def test_progress__bar(capsys):
     with Progress(10, 0, terminal=True, echo=print) as progress:
         progress.add(10)
+    shown = capsys.readouterr()
+    assert "10/10" in shown.out + shown.err
 
 
 @pytest.mark.parametrize(
