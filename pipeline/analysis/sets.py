@@ -121,12 +121,6 @@ def nearest_distances(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> np.nd
     return np.asarray(geometry.tree(b).query(geometry.scaled(a), p=np.inf)[0])
 
 
-def hausdorff_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
-    """Largest distance of a state of one set from the other set."""
-    there, back = nearest_distances(a, b, geometry), nearest_distances(b, a, geometry)
-    return float(max(there.max(), back.max()))
-
-
 def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
     """Mean distance of the states of one set from the other set, the larger of both directions.
 
