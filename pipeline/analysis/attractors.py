@@ -83,18 +83,18 @@ __all__ = ["Rule", "hysteresis", "identify", "match", "parameters_of"]
 
 
 def parameters_of(ds: xr.Dataset) -> Parameters:
-    """Parameters that a run's attributes tell.
+    """Parameters that a run's attribute ``parameters`` tells, a line ``name = value`` for each.
 
     Raises
     ------
     ValueError
-        If they are not there.
+        If it is not there.
     """
-    prefix = "parameter_"
-    values = {k.removeprefix(prefix): float(v) for k, v in ds.attrs.items() if str(k).startswith(prefix)}
+    lines = str(ds.attrs.get("parameters", "")).splitlines()
+    values = {name.strip(): float(value) for name, _, value in (line.partition("=") for line in lines)}
     if not values:
         raise ValueError(
-            "The dataset has no attributes parameter_...; give parameters, or set polish to False."
+            "The dataset has no attribute 'parameters'; give parameters, or set polish to False."
         )
     return load_preset().replace(**values)
 
