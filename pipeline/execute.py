@@ -7,6 +7,7 @@ is; their results are small dicts. Nothing here knows what a task computes.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
 import tempfile
@@ -119,7 +120,13 @@ def _local_cluster(n_workers: int) -> Iterator[Any]:
 
 
 def _kill(cluster: Any) -> None:
-    """End the workers at once: what they are computing is given up, and may take long."""
+    """End the workers at once: what they are computing is given up, and may take long.
+
+    dask then logs each connection that it misses, some after the cluster has closed; the exception that
+    led here says what happened.
+    """
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     for nanny in cluster.workers.values():
         nanny.auto_restart = False
         if nanny.pid:
