@@ -1,5 +1,6 @@
 """The compile cache: named by the sources, switched off by the environment; and without the compiler."""
 
+import dataclasses
 import re
 import shutil
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import magpend_core
 from magpend_core import accelerations, sections
 from magpend_core.jit import is_covered, source_digest, specialise
+from magpend_core.pendulum import PENDULUM_FITTED
 
 PACKAGE = Path(magpend_core.__file__).parent
 SCRIPT = """
@@ -124,3 +126,12 @@ def test_plain_python__gives_the_same_numbers(run_python, preset):
     section = np.array(lines[1].split(), dtype=float)
     assert section[:4] == pytest.approx(compiled.section.ravel(), abs=1e-9)
     assert section[4] == compiled.n_steps[0]
+
+
+@pytest.mark.parametrize("changes", [{"escape": (1.0, 1.0, 1.0, 1.0)}, {"scales": (1.0, 1.0, 5.0, 5.0)}])
+def test_label__follows_the_data(changes):
+    """Data of a system go into its compiled code, so they must go into the name under which it is kept."""
+    changed = dataclasses.replace(PENDULUM_FITTED, **changes)
+    assert changed.name == PENDULUM_FITTED.name
+    assert changed.label != PENDULUM_FITTED.label
+    assert dataclasses.replace(PENDULUM_FITTED).label == PENDULUM_FITTED.label
