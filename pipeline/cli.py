@@ -2,64 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
 import signal
 import sys
-from collections.abc import Iterator
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from pipeline.cli_common import EXIT_HELP, Directory
+from pipeline.cli_plot import check_figure_path, draw_bifurcation, plot_app
 from pipeline.exits import Exit
-
-if TYPE_CHECKING:
-    import xarray as xr
-    from matplotlib.figure import Figure
-
-_EXIT_HELP = "Exit codes: " + "; ".join(f"{int(code)} {code.sentence}" for code in Exit) + "."
 
 app = typer.Typer(
     name="magpend",
     help="Sweeps, continuations and bifurcation diagrams of a forced double pendulum with magnets.",
-    epilog=_EXIT_HELP,
+    epilog=EXIT_HELP,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-plot_app = typer.Typer(
-    help="Draw figures from a stored cube; nothing is computed again.", no_args_is_help=True
-)
 app.add_typer(plot_app, name="plot")
-
-
-class State(StrEnum):
-    """States that can be drawn."""
-
-    PSI1 = "psi1"
-    PSI2 = "psi2"
-    PSI1_DOT = "psi1_dot"
-    PSI2_DOT = "psi2_dot"
-
-
-class Layout(StrEnum):
-    """How directions share a figure."""
-
-    OVERLAY = "overlay"
-    SIDE = "side"
-
-
-class Format(StrEnum):
-    """File formats of figures."""
-
-    PNG = "png"
-    PDF = "pdf"
-    SVG = "svg"
-
-
-Directory = Annotated[Path, typer.Argument(metavar="DIR", help="Run directory.")]
 
 
 def _version(wanted: bool) -> None:
@@ -79,7 +42,7 @@ def _main(
     pass
 
 
-@app.command(epilog=_EXIT_HELP)
+@app.command(epilog=EXIT_HELP)
 def run(
     spec: Annotated[
         str, typer.Argument(metavar="SPEC", help="A TOML file, or the name of a shipped workflow.")
@@ -116,12 +79,12 @@ def run(
     state = runs.run(spec, out, workers=workers, scheduler=scheduler, smoke=smoke, echo=typer.echo)
     typer.echo(f"cube: {state.directory / 'cube.zarr'}")
     if plot:
-        typer.echo(f"figure: {_bifurcation(state.directory)}")
+        typer.echo(f"figure: {draw_bifurcation(state.directory)}")
     else:
         typer.echo(f"plot it with: magpend plot bifurcation {state.directory}")
 
 
-@app.command(epilog=_EXIT_HELP)
+@app.command(epilog=EXIT_HELP)
 def status(directory: Directory) -> None:
     """Say how much of a run is committed and what became of its cells."""
     from pipeline import run as runs
@@ -130,7 +93,7 @@ def status(directory: Directory) -> None:
         typer.echo(line)
 
 
-@app.command(epilog=_EXIT_HELP)
+@app.command(epilog=EXIT_HELP)
 def verify(
     directory: Directory,
     repair: Annotated[
@@ -148,7 +111,7 @@ def verify(
         raise typer.Exit(Exit.DAMAGED)
 
 
-@app.command(epilog=_EXIT_HELP)
+@app.command(epilog=EXIT_HELP)
 def simulate(
     frequency_hz: Annotated[float, typer.Option(help="Drive frequency \\[Hz].")] = 2.2,
     psi1: Annotated[float | None, typer.Option(help="Initial angle of link 1 \\[rad].")] = None,
@@ -181,7 +144,7 @@ def simulate(
     simulation.check_output(out)
     target = figure or out.with_suffix(".png")
     if not no_figure:
-        _check_figure_path(target)
+        check_figure_path(target)
     state = (_angle("psi1", psi1, psi1_deg), _angle("psi2", psi2, psi2_deg), psi1_dot, psi2_dot)
     ds = simulation.simulate(
         frequency_hz, state, preset=preset, overrides=_overrides(settings or []), n_transient=transient,
@@ -189,12 +152,12 @@ def simulate(
     )  # fmt: skip
     typer.echo(f"series: {simulation.write_series(ds, out)}")
     if not no_figure:
-        from pipeline.plots import plot_trajectory
+        from pipeline.plots import plot_trajectory, save_figure
 
-        typer.echo(f"figure: {_save(plot_trajectory(ds), target)}")
+        typer.echo(f"figure: {save_figure(plot_trajectory(ds), target)}")
 
 
-@app.command(epilog=_EXIT_HELP)
+@app.command(epilog=EXIT_HELP)
 def presets(
     name: Annotated[str | None, typer.Argument(help="Show this preset alone.")] = None,
 ) -> None:
@@ -214,82 +177,6 @@ def presets(
         for key, value in parameters.as_dict().items():
             table.add_row(key, f"{value:g}", about[key]["unit"], about[key]["meaning"], origin.get(key, ""))
         console.print(table)
-
-
-@plot_app.command(epilog=_EXIT_HELP)
-def bifurcation(
-    directory: Directory,
-    state: Annotated[State, typer.Option(help="What is drawn over the parameter.")] = State.PSI1,
-    out: Annotated[Path | None, typer.Option(help="Figure file; by default in DIR/figures.")] = None,
-    degrees: Annotated[bool, typer.Option("--degrees", help="Degrees instead of radians.")] = False,
-    layout: Annotated[
-        Layout, typer.Option(help="Both directions in one panel, or a panel each.")
-    ] = Layout.OVERLAY,
-    file_format: Annotated[
-        Format | None, typer.Option("--format", help="File format; by default png, or that of --out.")
-    ] = None,
-) -> None:
-    """Draw a bifurcation diagram: left, right and straddling motions over the swept parameter."""
-    path = _bifurcation(directory, state.value, out, degrees, layout.value, file_format)
-    typer.echo(f"figure: {path}")
-
-
-def _bifurcation(
-    directory: Path,
-    state: str = "psi1",
-    out: Path | None = None,
-    degrees: bool = False,
-    layout: str = "overlay",
-    file_format: Format | None = None,
-) -> Path:
-    from pipeline import open_run
-    from pipeline.plots import plot_bifurcation
-
-    suffix = f".{(file_format or Format.PNG).value}"
-    if out is None:
-        target = directory / "figures" / f"bifurcation_{state}{suffix}"
-    else:
-        target = out.with_name(out.name + suffix) if file_format and out.suffix.lower() != suffix else out
-        _check_figure_path(target)
-    ds: xr.Dataset = open_run(directory)
-    with _refusals(directory):
-        figure = plot_bifurcation(ds, state=state, degrees=degrees, layout=layout)
-    if out is None:
-        target.parent.mkdir(exist_ok=True)
-    return _save(figure, target)
-
-
-@contextlib.contextmanager
-def _refusals(directory: Path) -> Iterator[None]:
-    """Say what is wrong with a cube or an option instead of failing with a trace."""
-    from pipeline.problems import SpecError
-    from pipeline.store import DamagedError
-
-    try:
-        yield
-    except ValueError as error:
-        if "checksum" in str(error).lower():
-            raise DamagedError(
-                f"{directory}: a chunk is damaged; look with: magpend verify {directory}"
-            ) from None
-        raise SpecError([f"{directory}: {error}"]) from None
-
-
-def _save(figure: Figure, target: Path) -> Path:
-    from pipeline.plots import save_figure
-
-    return save_figure(figure, target)
-
-
-def _check_figure_path(path: Path) -> None:
-    """Refuse a path that cannot be written to, before anything is computed."""
-    from pipeline.problems import SpecError
-
-    suffixes = [f".{f.value}" for f in Format]
-    if path.suffix.lower() not in suffixes:
-        raise SpecError([f"{path}: the suffix must be one of {', '.join(suffixes)}."])
-    if not path.parent.is_dir():
-        raise SpecError([f"{path.parent}: no such folder; make it first."])
 
 
 def _angle(name: str, radians: float | None, degrees: float | None) -> float:

@@ -1,0 +1,32 @@
+"""What the commands share: options, the list of exit codes, and how bad input is reported."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.exits import Exit
+
+EXIT_HELP = "Exit codes: " + "; ".join(f"{int(code)} {code.sentence}" for code in Exit) + "."
+
+Directory = Annotated[Path, typer.Argument(metavar="DIR", help="Run directory.")]
+
+
+@contextlib.contextmanager
+def refusals(directory: Path) -> Iterator[None]:
+    """Say what is wrong with a cube or an option instead of failing with a trace."""
+    from pipeline.problems import SpecError
+    from pipeline.store import DamagedError
+
+    try:
+        yield
+    except ValueError as error:
+        if "checksum" in str(error).lower():
+            raise DamagedError(
+                f"{directory}: a chunk is damaged; look with: magpend verify {directory}"
+            ) from None
+        raise SpecError([f"{directory}: {error}"]) from None
