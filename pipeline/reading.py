@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from pipeline import store
 from pipeline.cells import DIRECTION_CODES
-from pipeline.plan import make_plan
+from pipeline.plan import Plan, make_plan
 from pipeline.schema import LINKS, STATE_UNITS, STATES, VARIABLES
 from pipeline.spec import parse_spec
 
@@ -48,11 +49,21 @@ def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
     >>> ds = open_run("runs/quickstart")                                    # doctest: +SKIP
     >>> ds.section.sel(state="psi1").sel(frequency=2.2, method="nearest")   # doctest: +SKIP
     """
+    info = store.read_run(Path(path))
+    return open_committed(info, make_plan(parse_spec(info.spec)), chunks=chunks)
+
+
+def open_committed(
+    info: store.RunInfo,
+    plan: Plan,
+    commits: Mapping[int, store.Commit] | None = None,
+    *,
+    chunks: Any = None,
+) -> xr.Dataset:
+    """As `open_run`, showing what `commits` vouch for; by default all that is committed now."""
     import xarray as xr
 
-    info = store.read_run(Path(path))
-    plan = make_plan(parse_spec(info.spec))
-    view: Any = store.committed_view(info, plan)
+    view: Any = store.committed_view(info, plan, commits)
     ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
     ds = ds.set_coords([name for name in ds.data_vars if name not in _VARIABLES])
     ds = ds[[v.name for v in VARIABLES]].assign_coords(_labels())
