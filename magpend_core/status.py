@@ -15,6 +15,7 @@ class Status(IntEnum):
     STEP_LIMIT = 4
     STEP_UNDERFLOW = 5
     UNREACHED = 6
+    INFERRED = 7
 
     @property
     def sentence(self) -> str:
@@ -31,4 +32,6 @@ _SENTENCES = {
     Status.STEP_LIMIT: "one period needed more steps than max_steps_per_period; raise it, or loosen rtol",
     Status.STEP_UNDERFLOW: "the step size fell below the resolution of time; loosen rtol and atol",
     Status.UNREACHED: "the branch ended at an earlier point of its path, so this point was not computed",
+    Status.INFERRED: "not integrated: in a refined grid all integrated cells around it closed on one orbit, "
+    "and it carries the section, orbit_period and turns of one of them",
 }

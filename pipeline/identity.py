@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pipeline.plan import Plan
-from pipeline.schema import FORMAT, VARIABLES
+from pipeline.schema import FORMAT, REFINEMENT, VARIABLES
 from pipeline.spec import Spec
 
 
@@ -19,6 +19,7 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
     """
     tables = {k: v for k, v in spec.as_dict().items() if k not in ("title", "execution")}
     return {
+        **({} if spec.refine is None else {"refinement": REFINEMENT}),
         "format": FORMAT,
         "kernel_version": kernel_version,
         "spec": tables,

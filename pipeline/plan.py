@@ -25,6 +25,9 @@ RTOL_OF_RULE = 1e-8
 ROOT = 6
 """The time grows with the sixth root of 1/rtol."""
 
+LEAST_LATTICE = 16
+"""Tiles of a refined grid have at least this many cells of the first lattice, where the grid has them."""
+
 LANES = 16
 """Trajectories per task come in multiples of this, so that the kernel's lanes are full."""
 
@@ -125,7 +128,8 @@ def make_plan(spec: Spec) -> Plan:
 
     Tasks take a thirty-second part of the run each, but between 2 and 20 s of one core's time by
     the rule of thumb, and at most 8 MB in a sweep; always whole multiples of 16 trajectories unless
-    ``execution.trajectories_per_task`` says otherwise.
+    ``execution.trajectories_per_task`` says otherwise. In a refined grid they are tiles: one parameter
+    point, about as many cells along each grid dim, multiples of the stride.
     """
     cells = CellMap(spec)
     seconds = _seconds_per_cell(spec)
@@ -133,7 +137,13 @@ def make_plan(spec: Spec) -> Plan:
     wanted = spec.execution.trajectories_per_task or _trajectories(
         spec, math.prod(cells.shape), n_points, seconds
     )
-    block = _block(cells.shape, cells.path, wanted)
+    if spec.refine is None:
+        block = _block(cells.shape, cells.path, wanted)
+    else:
+        grid = cells.shape[len(spec.axes) :]
+        if spec.execution.trajectories_per_task is None:
+            wanted = max(wanted, LEAST_LATTICE * spec.refine ** len(grid))
+        block = (*(1 for _ in spec.axes), *_tile(grid, spec.refine, wanted))
     return Plan(spec.kind, cells.dims, cells.shape, cells.path, block, spec.integration.n_keep, seconds)
 
 
@@ -166,3 +176,19 @@ def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, 
             block[i] = min(shape[i], max(wanted, 1))
             wanted //= block[i]
     return tuple(block)
+
+
+def _tile(shape: tuple[int, ...], stride: int, wanted: int) -> tuple[int, ...]:
+    """Sides of a tile of at most `wanted` cells, if that is possible: multiples of the stride or whole axes.
+
+    The least side that can grows first; then the tiles along an axis are made about equal.
+    """
+    sides = [min(stride, n) for n in shape]
+    while growing := [i for i, n in enumerate(shape) if sides[i] < n]:
+        least = min(growing, key=sides.__getitem__)
+        larger = min(sides[least] + stride, shape[least])
+        if math.prod(sides) // sides[least] * larger > wanted:
+            break
+        sides[least] = larger
+    n_tiles = [max(1, (n + side // 2) // side) for n, side in zip(shape, sides, strict=True)]
+    return tuple(min(n, -(-n // (k * stride)) * stride) for n, k in zip(shape, n_tiles, strict=True))

@@ -249,7 +249,7 @@ def describe_plan(
         f"{parsed.kind}: {plan.n_cells} cells ({dims or 'one cell'})",
         f"tasks: {plan.n_tasks} of {' x '.join(map(str, plan.block)) or '1'} cells, {len(done)} done",
         f"cube: {size(plan.n_bytes)} before compression",
-        f"time: about {duration(plan.core_seconds)} of one core, "
+        f"time: {'about' if parsed.refine is None else 'at most'} {duration(plan.core_seconds)} of one core, "
         f"{duration(plan.core_seconds / cores)} on {cores} (a rule of thumb; "
         "orbits that close early end sooner)",
         f"directory: {directory}" + ("" if info else " (not created)"),

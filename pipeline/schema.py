@@ -18,6 +18,9 @@ from magpend_core.status import Status
 FORMAT = 1
 """Version of the run directory's layout."""
 
+REFINEMENT = 1
+"""Version of what is inferred in refined grids (`pipeline.refinement`); part of such a run's identity."""
+
 STATES = ("psi1", "psi2", "psi1_dot", "psi2_dot")
 STATE_UNITS = ("rad", "rad", "rad/s", "rad/s")
 LINKS = ("psi1", "psi2")

@@ -16,7 +16,16 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from magpend_core.parameters import ParameterError, Parameters, load_preset, unknown_name_problem
 from pipeline.problems import SpecError, problems_of, unknown_choice, unknown_key
@@ -25,6 +34,9 @@ FREQUENCY = "frequency_hz"
 STATES = ("psi1", "psi2", "psi1_dot", "psi2_dot")
 KINDS = ("sweep", "continuation")
 MAX_POINTS = 10_000_000
+STRIDES = (2, 4, 8, 16, 32, 64)
+MAX_TILE_BYTES = 256_000_000
+"""Largest sections of the smallest tile that a refined grid can be cut into [bytes]."""
 
 
 class Table(BaseModel):
@@ -126,12 +138,22 @@ class _PerState(Table):
         return self
 
 
+def _power_of_two(stride: int) -> int:
+    if stride not in STRIDES:
+        raise ValueError(f"{stride} is not among {', '.join(map(str, STRIDES))}; take one of these.")
+    return stride
+
+
 class GridStarts(_PerState):
-    """``[initial_conditions] kind = "grid"``: ranges span the grid, numbers are fixed, the rest is 0."""
+    """``[initial_conditions] kind = "grid"``: ranges span the grid, numbers are fixed, the rest is 0.
+
+    With `refine` a sweep computes every `refine`-th cell first; see `pipeline.refinement`.
+    """
 
     nested_model: ClassVar[type[BaseModel] | None] = Range
 
     kind: Literal["grid"]
+    refine: Annotated[int, AfterValidator(_power_of_two)] | None = None
     psi1: Extent | None = None
     psi1_deg: Extent | None = None
     psi2: Extent | None = None
@@ -140,6 +162,11 @@ class GridStarts(_PerState):
     psi1_dot_deg: Extent | None = None
     psi2_dot: Extent | None = None
     psi2_dot_deg: Extent | None = None
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """What spans the grid, by key."""
+        return {key: value for key, value in self if isinstance(value, Range)}
 
 
 class ListStarts(Table):
@@ -234,6 +261,12 @@ class Spec:
     continuation: Continuation | None
     integration: Integration
     execution: Execution
+
+    @property
+    def refine(self) -> int | None:
+        """Stride of a refined grid; None for a full one and for other starts."""
+        starts = self.initial_conditions
+        return starts.refine if isinstance(starts, GridStarts) else None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data with all defaults filled in; `parse_spec` reads it back."""
@@ -361,6 +394,7 @@ def parse_spec(data: Mapping[str, Any]) -> Spec:
     tables = {name: _table(data, name, model, problems) for name, model in _TABLES.items()}
     axes = _axes(data, problems)
     starts = _starts(data, problems)
+    problems += _refine_problems(kind, starts, tables["integration"])
     walk = _walk(kind, data, tables["continuation"], axes, problems)
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
     complete = not any(p.startswith(("axes", "parameters")) for p in problems)
@@ -450,8 +484,39 @@ def _starts(data: Mapping[str, Any], problems: list[str]) -> Starts | None:
             else unknown_choice("initial_conditions.kind", kind, choices)
         )
         return None
+    if kind != "grid" and "refine" in table:
+        problems.append(
+            f'initial_conditions.refine: only a grid can be refined; drop the key, or set kind = "grid" '
+            f"instead of {kind!r}."
+        )
+        table = {key: value for key, value in table.items() if key != "refine"}
     starts: Starts | None = _validate(_STARTS[kind], table, "initial_conditions", problems)
     return starts
+
+
+def _refine_problems(kind: str, starts: Starts | None, integration: Integration | None) -> list[str]:
+    """Problems with a grid's `refine`."""
+    if not isinstance(starts, GridStarts) or starts.refine is None:
+        return []
+    stride, key = starts.refine, f"initial_conditions.refine = {starts.refine}"
+    if kind == "continuation":
+        return [f"{key}: branches are not refined; drop the key, or make it a sweep."]
+    lengths = {name: len(axis.array()) for name, axis in starts.ranges.items()}
+    if not lengths:
+        return [f"{key}: there is no range to refine; give a state a range, or drop the key."]
+    shortest = min(lengths, key=lengths.__getitem__)
+    if lengths[shortest] < stride:
+        return [
+            f"{key}: must be at most {lengths[shortest]}, the points of {shortest}; lower it, or add points."
+        ]
+    if integration is not None:
+        n_bytes = stride ** len(lengths) * integration.n_keep * len(STATES) * 8
+        if n_bytes > MAX_TILE_BYTES:
+            return [
+                f"{key}: over {len(lengths)} ranges a task would hold {n_bytes / 1e6:.0f} MB of sections, "
+                f"more than {MAX_TILE_BYTES / 1e6:.0f} MB; lower refine or integration.n_keep."
+            ]
+    return []
 
 
 def _walk(

@@ -18,6 +18,7 @@ from magpend_core.pendulum import system_of
 from pipeline.cells import CellMap
 from pipeline.identity import digest_of, identity_of
 from pipeline.plan import Plan, make_plan
+from pipeline.refinement import infer
 from pipeline.schema import VARIABLES
 from pipeline.spec import Spec, parse_spec
 from pipeline.store import RefusedError, RunInfo, read_run, write_task
@@ -41,14 +42,26 @@ def _prepare(directory: str, digest: str) -> tuple[RunInfo, Spec, Plan, CellMap]
 def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
     """Return all variables of a block of cells, in the block's shape."""
     inputs = cells.inputs(block)
+    system = system_of(spec.parameters.load())
     integration = spec.integration.model_dump()
-    result = run_branches(
-        inputs.parameters, inputs.frequency_hz, inputs.initial_states,
-        system=system_of(spec.parameters.load()), **integration,
-    )  # fmt: skip
-    return {
-        v.name: cells.outputs(block, np.asarray(getattr(result, v.name), dtype=v.dtype)) for v in VARIABLES
-    }
+
+    def integrate(branches: Any) -> dict[str, np.ndarray]:
+        result = run_branches(
+            inputs.parameters[branches], inputs.frequency_hz[branches], inputs.initial_states[branches],
+            system=system, **integration,
+        )  # fmt: skip
+        return {v.name: np.asarray(getattr(result, v.name), dtype=v.dtype) for v in VARIABLES}
+
+    if spec.refine is None:
+        values = integrate(slice(None))
+    else:
+        tile = tuple(s.stop - s.start for s in block[len(spec.axes) :])
+        values = infer(
+            tile, spec.refine, lambda branches: {k: v[:, 0] for k, v in integrate(branches).items()},
+            closure_tolerance=spec.integration.closure_tolerance, system=system,
+        )  # fmt: skip
+        values = {name: array[:, None] for name, array in values.items()}
+    return {name: cells.outputs(block, array) for name, array in values.items()}
 
 
 def run_task(directory: str, digest: str, index: int) -> dict[str, Any]:

@@ -93,6 +93,7 @@ def basin_fractions(
     dims: Sequence[str] | None = None,
     ids: Collection[int] = (),
     unfinished: Collection[int] = UNFINISHED,
+    inferred: npt.ArrayLike | xr.DataArray | None = None,
     confidence: float = 0.95,
     method: Interval = "wilson",
 ) -> xr.Dataset:
@@ -114,6 +115,9 @@ def basin_fractions(
         Labels to list though no cell may show them.
     unfinished
         Codes of cells whose outcome is not known; ``()`` if every code is an outcome.
+    inferred
+        Which cells were not integrated but inferred (status ``INFERRED`` of a refined grid), in the shape
+        or on the dims of the labels. They are area like all others and count in full.
     confidence
         Two-sided level of the intervals, one-sided level of the `unseen` bounds.
     method
@@ -127,12 +131,14 @@ def basin_fractions(
         `low_if_none` and `high_if_all`, the interval around both. On the kept dims: `n_cells`,
         `n_unfinished`, `fraction_unfinished`, `unseen_high`, and `unseen_high_if_all`, the bound if all
         unfinished cells went to one attractor that was not seen. NaN fractions where nothing finished.
+        With `inferred`, on the kept dims and `label`: `n_inferred`, how many of `count` were inferred.
 
     Notes
     -----
     The intervals hold for cells drawn independently from the region, each label by itself, not for all
     labels at once. Cells of a regular grid are not independent: there the error comes from the cells
-    along the boundary and is smaller, so the intervals are too wide rather than too narrow. Whether
+    along the boundary and is smaller, so the intervals are too wide rather than too narrow. What a refined
+    grid overlooked (`pipeline.refinement`) is not in them. Whether
     the cells were drawn at random is not validated, nor whether they cover the region evenly.
 
     Raises
@@ -140,10 +146,13 @@ def basin_fractions(
     TypeError
         If the labels are not integers.
     ValueError
-        If there is no cell, `dims` are not dims of a DataArray, or level or method are unknown.
+        If there is no cell, `dims` are not dims of a DataArray, `inferred` is not on the cells of the
+        labels, or level or method are unknown.
     """
     kept, over = _kept_dims(labels, dims)
     if isinstance(labels, xr.DataArray):
+        if isinstance(inferred, xr.DataArray):
+            inferred = _same_cells(labels, inferred).transpose(*kept, *over)
         coords = {name: c for name, c in labels.coords.items() if set(c.dims) <= set(kept)}
         labels = labels.transpose(*kept, *over)
     else:
@@ -161,6 +170,8 @@ def basin_fractions(
         unseen_high=(kept, _unseen_bound(np.zeros_like(n_cells), n_cells - n_unfinished, confidence)),
         unseen_high_if_all=(kept, _unseen_bound(n_unfinished, n_cells, confidence)),
     )
+    if inferred is not None:
+        ds["n_inferred"] = ((*kept, "label"), _count_inferred(grid, np.asarray(inferred), shape))
     ds["fraction"].attrs = {"long_name": "basin fraction among the finished cells", "units": "1"}
     return ds.assign_attrs(_provenance(unfinished, confidence, method))
 
@@ -262,6 +273,18 @@ def _count_rows(
     codes += width * np.arange(n_rows)[:, None]
     table = np.bincount(codes.ravel(), minlength=n_rows * width).reshape(*shape, width)
     return table[..., 1:], table[..., 0]
+
+
+def _count_inferred(
+    grid: LabelGrid, inferred: npt.NDArray[np.generic], shape: tuple[int, ...]
+) -> npt.NDArray[np.int64]:
+    """Inferred cells per label."""
+    if inferred.dtype != bool or inferred.shape != grid.codes.shape:
+        raise ValueError(
+            f"inferred is {inferred.dtype} of shape {inferred.shape}, the labels are of shape "
+            f"{grid.codes.shape}: give true or false per cell, such as ds.status == Status.INFERRED"
+        )
+    return _count_rows(LabelGrid(np.where(inferred, grid.codes, np.int32(-1)), grid.ids), shape)[0]
 
 
 def _with_intervals(

@@ -54,8 +54,9 @@ class Block:
 
     @property
     def is_closed(self) -> np.ndarray:
-        """Cells whose sections close."""
-        return np.asarray((self.status == Status.PERIODIC) & (self.orbit_period > 0) & self._finite)
+        """Cells whose sections close, or that were inferred to lie among such cells."""
+        closed = np.isin(self.status, (Status.PERIODIC, Status.INFERRED))
+        return np.asarray(closed & (self.orbit_period > 0) & self._finite)
 
     @property
     def is_bounded(self) -> np.ndarray:

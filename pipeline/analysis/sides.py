@@ -58,7 +58,7 @@ ARM_LENGTHS = (0.174, 0.1788)
 SLOWEST_HZ = 0.926
 """Slower small-angle mode [Hz] of the preset without magnets: its period is the time of a full swing."""
 
-_COMPUTED = (1, 2)  # PERIODIC, BOUNDED of magpend_core.status
+_COMPUTED = (1, 2, 7)  # PERIODIC, BOUNDED, INFERRED of magpend_core.status
 
 
 class Side(IntEnum):

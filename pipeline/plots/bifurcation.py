@@ -33,7 +33,7 @@ MARKER_LIMIT = 200_000
 LAYOUTS = ("overlay", "side")
 
 # Codes of magpend_core.status, which is not imported: it would bring the compiler with it.
-_DRAWN = (1, 2)
+_DRAWN = (1, 2, 7)
 _ABSENT = {"pending": (0,), "failed": (3, 4, 5), "not reached": (6,)}
 
 _SIDE_COLOURS = {

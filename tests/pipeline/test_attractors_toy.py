@@ -85,6 +85,16 @@ def test_identify__known_labels():
     assert not found["decision"].values[failed].any()
 
 
+def test_identify__inferred_cells_are_their_orbits():
+    rng = np.random.default_rng(0)
+    computed = [on(A, noise=1e-7, rng=rng), on(B, noise=1e-7, rng=rng)]
+    inferred = [(section.copy(), 7, period, turns) for section, _, period, turns in computed]
+    found = identify(cube([*computed, *inferred, inferred[0]]), polish=False)
+    assert found["attractor_id"].values.tolist() == [1, 0, 1, 0, 1]
+    assert found["n_cells"].values.tolist() == [2, 3]
+    assert found["status"].values.tolist() == [1, 1, 7, 7, 7]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_identify__shuffled_cells_keep_their_ids(seed):
     rng = np.random.default_rng(0)

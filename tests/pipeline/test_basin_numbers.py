@@ -170,6 +170,23 @@ def test_basin_fractions__along_a_sweep():
     assert set(ds.coords) == {"frequency", "drive", "label"}
 
 
+def test_basin_fractions__inferred_cells_count_and_are_told():
+    rng = np.random.default_rng(5)
+    labels = xr.DataArray(rng.integers(-1, 3, (2, 30, 20)), dims=["frequency", "x", "y"])
+    inferred = xr.DataArray(rng.random((2, 30, 20)) < 0.4, dims=["frequency", "x", "y"])
+    ds = basin_fractions(labels, dims=["x", "y"], inferred=inferred.transpose("y", "frequency", "x"))
+    plain = basin_fractions(labels, dims=["x", "y"])
+    assert ds.drop_vars("n_inferred").identical(plain)
+    assert ds["n_inferred"].dims == ("frequency", "label")
+    for f in range(2):
+        for i, label in enumerate(ds["label"].values):
+            assert ds["n_inferred"][f, i] == ((labels[f] == label) & inferred[f]).sum()
+    assert basin_fractions([0, 1, 1], inferred=[True, True, False])["n_inferred"].values.tolist() == [1, 1]
+    for wrong in ([True, False], [0, 1, 7]):
+        with pytest.raises(ValueError, match="inferred is"):
+            basin_fractions([0, 1, 1], inferred=wrong)
+
+
 def test_basin_fractions__refuses():
     with pytest.raises(TypeError, match=r"float64.*integer code"):
         basin_fractions([0.0, 1.0])

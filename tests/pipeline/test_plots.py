@@ -83,7 +83,7 @@ def gids(fig):
 def test_status_codes_are_those_of_the_kernel():
     from magpend_core.status import Status
 
-    assert {Status.PERIODIC, Status.BOUNDED} == set(bifurcation._DRAWN)
+    assert {Status.PERIODIC, Status.BOUNDED, Status.INFERRED} == set(bifurcation._DRAWN)
     absent = [code for codes in bifurcation._ABSENT.values() for code in codes]
     assert sorted([*bifurcation._DRAWN, *absent]) == sorted(Status)
     assert bifurcation._ABSENT["pending"] == (Status.PENDING,)

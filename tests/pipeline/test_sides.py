@@ -63,6 +63,11 @@ def test_side__nothing_to_judge(status):
     assert side(cells([[[0.1, 0.1]]], status=status)).item() == Side.UNKNOWN
 
 
+def test_side__inferred_cell_is_judged_like_the_one_it_stands_for():
+    for section in ([0.1, 0.1], [-0.1, -0.1]):
+        assert side(cells([[section]], status=7)).item() == side(cells([[section]])).item() != Side.UNKNOWN
+
+
 def test_side__nan_section_is_unknown():
     assert side(cells([[[0.1, 0.1], [np.nan, 0.1]]])).item() == Side.UNKNOWN
 
