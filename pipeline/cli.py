@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli_common import EXIT_HELP, Directory
+from pipeline.cli_common import EXIT_HELP, Directory, read_pairs
 from pipeline.cli_plot import check_figure_path, draw_bifurcation, plot_app
 from pipeline.exits import Exit
 
@@ -147,7 +147,7 @@ def simulate(
         check_figure_path(target)
     state = (_angle("psi1", psi1, psi1_deg), _angle("psi2", psi2, psi2_deg), psi1_dot, psi2_dot)
     ds = simulation.simulate(
-        frequency_hz, state, preset=preset, overrides=_overrides(settings or []), n_transient=transient,
+        frequency_hz, state, preset=preset, overrides=read_pairs("--set", settings or [], "q=1.5"), n_transient=transient,
         n_periods=periods, samples_per_period=samples, rtol=rtol, atol=atol,
     )  # fmt: skip
     typer.echo(f"series: {simulation.write_series(ds, out)}")
@@ -187,22 +187,6 @@ def _angle(name: str, radians: float | None, degrees: float | None) -> float:
     if radians is not None and degrees is not None:
         raise SpecError([f"--{name} and --{name}-deg are both given; keep one."])
     return math.radians(degrees) if degrees is not None else (radians or 0.0)
-
-
-def _overrides(settings: list[str]) -> dict[str, float]:
-    """Read ``NAME=VALUE`` pairs."""
-    from pipeline.problems import SpecError
-
-    found, problems = {}, []
-    for text in settings:
-        name, _, value = text.partition("=")
-        try:
-            found[name.strip()] = float(value)
-        except ValueError:
-            problems.append(f"--set {text}: must be NAME=VALUE with a number, such as q=1.5.")
-    if problems:
-        raise SpecError(problems)
-    return found
 
 
 def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:

@@ -30,3 +30,19 @@ def refusals(directory: Path) -> Iterator[None]:
                 f"{directory}: a chunk is damaged; look with: magpend verify {directory}"
             ) from None
         raise SpecError([f"{directory}: {error}"]) from None
+
+
+def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
+    """Read ``NAME=VALUE`` pairs with numbers; raises `SpecError` naming all that are none."""
+    from pipeline.problems import SpecError
+
+    found, problems = {}, []
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            found[name.strip()] = float(value)
+        except ValueError:
+            problems.append(f"{option} {text}: must be NAME=VALUE with a number, such as {example}.")
+    if problems:
+        raise SpecError(problems)
+    return found

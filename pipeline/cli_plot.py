@@ -1,17 +1,23 @@
-"""``magpend plot``: figures from stored products; nothing is computed again."""
+"""``magpend plot``: figures of a run's cube and of what is derived from it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli_common import EXIT_HELP, Directory, refusals
+from pipeline.cli_common import EXIT_HELP, Directory, read_pairs, refusals
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from pipeline.plots.style import DataFigure
 
 plot_app = typer.Typer(
-    help="Draw figures from a stored cube; nothing is computed again.", no_args_is_help=True
+    help="Draw figures from a stored cube; no cell is computed again.", no_args_is_help=True
 )
 
 
@@ -75,6 +81,80 @@ def draw_bifurcation(
         figure = plot_bifurcation(ds, state=state, degrees=degrees, layout=layout)
     target.parent.mkdir(exist_ok=True)
     return save_figure(figure, target)
+
+
+At = Annotated[
+    list[str] | None,
+    typer.Option("--at", metavar="AXIS=VALUE", help="Value of an axis that the figure has no room for."),
+]
+Out = Annotated[Path | None, typer.Option(help="Figure file; by default in DIR/figures.")]
+Degrees = Annotated[bool, typer.Option("--degrees", help="Degrees instead of radians.")]
+FileFormat = Annotated[
+    Format | None, typer.Option("--format", help="File format; by default png, or that of --out.")
+]
+
+
+@plot_app.command(epilog=EXIT_HELP)
+def basins(
+    directory: Directory,
+    at: At = None,
+    shade: Annotated[bool, typer.Option("--shade", help="Darken what took longer to converge.")] = False,
+    degrees: Degrees = False,
+    out: Out = None,
+    file_format: FileFormat = None,
+) -> None:
+    """Draw basins of attraction: which attractor each initial state of a grid ends on."""
+
+    def draw(found: xr.Dataset) -> DataFigure:
+        from pipeline import open_run
+        from pipeline.plots import plot_basins
+
+        periods = open_run(directory)["n_periods"] if shade else None
+        return plot_basins(found, at=_positions(at, degrees), degrees=degrees, n_periods=periods)
+
+    _draw_attractors(directory, "basins", draw, out, file_format)
+
+
+@plot_app.command(epilog=EXIT_HELP)
+def fractions(
+    directory: Directory, at: At = None, out: Out = None, file_format: FileFormat = None
+) -> None:
+    """Draw basin fractions over the swept parameter, as stacked bands."""
+
+    def draw(found: xr.Dataset) -> DataFigure:
+        from pipeline.plots import plot_fractions
+
+        return plot_fractions(found, at=_positions(at))
+
+    _draw_attractors(directory, "fractions", draw, out, file_format)
+
+
+def _draw_attractors(
+    directory: Path,
+    name: str,
+    draw: Callable[[xr.Dataset], DataFigure],
+    out: Path | None,
+    file_format: Format | None,
+) -> None:
+    """Draw a figure of a run's attractors, finding them first if that was not done, and write its data."""
+    target = figure_target(directory, name, out, file_format)
+    from pipeline import derived
+    from pipeline.plots import save_data, save_figure
+
+    with refusals(directory):
+        figure = draw(derived.attractors(directory, echo=typer.echo))
+    target.parent.mkdir(exist_ok=True)
+    typer.echo(f"figure: {save_figure(figure, target)}")
+    typer.echo(f"data: {save_data(figure, target)}")
+
+
+def _positions(at: list[str] | None, degrees: bool = False) -> dict[str, float]:
+    """Read ``AXIS=VALUE`` pairs; initial states are given in the unit of the figure."""
+    import math
+
+    found = read_pairs("--at", at or [], "frequency=2.2")
+    turned = {name for name in found if degrees and name.startswith("psi")}
+    return {name: math.radians(value) if name in turned else value for name, value in found.items()}
 
 
 def figure_target(directory: Path, name: str, out: Path | None, file_format: Format | None) -> Path:

@@ -4,8 +4,10 @@ Nothing here integrates, opens a store or touches pyplot: figures are plain obje
 in any thread and without a display.
 """
 
+from pipeline.plots.basins import plot_basins
 from pipeline.plots.bifurcation import plot_bifurcation
-from pipeline.plots.style import save_figure
+from pipeline.plots.fractions import plot_fractions
+from pipeline.plots.style import save_data, save_figure
 from pipeline.plots.trajectory import plot_trajectory
 
-__all__ = ["plot_bifurcation", "plot_trajectory", "save_figure"]
+__all__ = ["plot_basins", "plot_bifurcation", "plot_fractions", "plot_trajectory", "save_data", "save_figure"]

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -321,7 +320,7 @@ def _panels(fig: Figure, view: _View, survey: _Survey, layout: str) -> list[Pane
 
 def _outer_labels(view: _View, ax: Axes, strip: Axes | None, column: int, titled: bool) -> None:
     lowest = ax if strip is None else strip
-    lowest.set_xlabel(_parameter_label(view.ds[view.parameter]), fontsize=style.LABEL_PT)
+    lowest.set_xlabel(style.parameter_label(view.ds[view.parameter]), fontsize=style.LABEL_PT)
     if strip is not None:
         ax.tick_params(labelbottom=False)
     if column == 0:
@@ -334,14 +333,6 @@ def _outer_labels(view: _View, ax: Axes, strip: Axes | None, column: int, titled
         ax.text(
             0.045, 0.955, view.directions[column], transform=ax.transAxes, va="top", fontsize=style.LABEL_PT
         )
-
-
-def _parameter_label(coordinate: xr.DataArray) -> str:
-    if coordinate.name == "frequency":
-        return "drive frequency [Hz]"
-    name = str(coordinate.attrs.get("long_name", coordinate.name))
-    unit = coordinate.attrs.get("units", "")
-    return f"{name} [{unit}]" if unit else name
 
 
 def _y_limits(view: _View, survey: _Survey) -> tuple[float, float]:
@@ -357,7 +348,7 @@ def _y_limits(view: _View, survey: _Survey) -> tuple[float, float]:
 
 
 def _dress(ax: Axes, view: _View, limits: tuple[float, float]) -> None:
-    edges = _edges(view.x)
+    edges = style.edges(view.x)
     ax.set_xlim(float(edges.min()), float(edges.max()))
     ax.set_ylim(*limits)
     if style.is_angle(view.state):
@@ -366,21 +357,12 @@ def _dress(ax: Axes, view: _View, limits: tuple[float, float]) -> None:
     ax.yaxis.set_minor_locator(AutoMinorLocator(2))
 
 
-def _edges(x: np.ndarray) -> np.ndarray:
-    """Limits between neighbouring values of the parameter."""
-    if x.size == 1:
-        width = 0.05 * abs(float(x[0])) or 0.5
-        return np.array([x[0] - width, x[0] + width])
-    middle = 0.5 * (x[1:] + x[:-1])
-    return np.concatenate([[1.5 * x[0] - 0.5 * x[1]], middle, [1.5 * x[-1] - 0.5 * x[-2]]])
-
-
 # ---------------------------------------------------------------- absent cells
 
 
 def _draw_absent(ax: Axes, strip: Axes, view: _View, survey: _Survey, chosen: tuple[int, ...]) -> None:
     """Share of absent cells in the strip; shading in the diagram where no cell is left."""
-    edges = _edges(view.x)
+    edges = style.edges(view.x)
     cells = survey.cells[list(chosen)].sum(0)
     floor = np.zeros(cells.size)
     for name, counts in survey.absent.items():
@@ -388,7 +370,7 @@ def _draw_absent(ax: Axes, strip: Axes, view: _View, survey: _Survey, chosen: tu
         if not share.any():
             continue
         looks = _ABSENT_LOOKS[name]
-        _fill(strip, edges, floor, floor + share, looks, f"absent:{name}")
+        style.fill_columns(strip, edges, floor, floor + share, looks, f"absent:{name}")
         floor = floor + share
     strip.set_ylim(0.0, 1.0)
     strip.set_yticks([0.5], ["absent"])
@@ -397,23 +379,8 @@ def _draw_absent(ax: Axes, strip: Axes, view: _View, survey: _Survey, chosen: tu
     blank = (floor >= 1.0 - 1e-12).astype(float)
     if blank.any():
         looks = {"facecolor": "0.955", "linewidth": 0.0, "zorder": 1.5}
-        area = _fill(ax, edges, np.zeros(blank.size), blank, looks, "blank")
+        area = style.fill_columns(ax, edges, np.zeros(blank.size), blank, looks, "blank")
         area.set_transform(ax.get_xaxis_transform())
-
-
-def _fill(
-    ax: Axes, edges: np.ndarray, low: np.ndarray, high: np.ndarray, looks: Mapping[str, Any], gid: str
-) -> PolyCollection:
-    """Fill columns from `low` to `high`: one rectangle for each run of equal columns."""
-    levels = np.column_stack([low, high])
-    starts = np.flatnonzero(np.r_[True, (np.diff(levels, axis=0) != 0).any(1)])
-    ends = np.r_[starts[1:], len(levels)]
-    kept = high[starts] > low[starts]
-    corners = zip(edges[starts[kept]], edges[ends[kept]], *levels[starts[kept]].T, strict=True)
-    boxes = [[(x0, y0), (x1, y0), (x1, y1), (x0, y1)] for x0, x1, y0, y1 in corners]
-    area = PolyCollection(boxes, gid=gid, **looks)
-    ax.add_collection(area, autolim=False)
-    return area
 
 
 def _say_empty(ax: Axes, survey: _Survey) -> None:
@@ -538,7 +505,7 @@ def _count(
     view: _View, limits: tuple[float, float], height: int, width: int
 ) -> dict[tuple[int, Side], np.ndarray]:
     """Count points on pixels, for each direction and side that occurs."""
-    edges = _edges(view.x)
+    edges = style.edges(view.x)
     left, right = float(edges.min()), float(edges.max())
     column = np.clip(((view.x - left) / (right - left) * width).astype(np.int64), 0, width - 1)
     counts: dict[tuple[int, Side], np.ndarray] = {}

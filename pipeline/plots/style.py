@@ -9,12 +9,15 @@ import difflib
 import io
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import Formatter, FuncFormatter, MultipleLocator
@@ -50,9 +53,28 @@ _METADATA: dict[str, dict[str, Any]] = {
 _svg_lock = threading.Lock()
 
 
+class DataFigure(Figure):
+    """Figure that carries what it shows.
+
+    Attributes
+    ----------
+    data : Dataset
+        The numbers drawn, after every selection.
+    """
+
+    data: xr.Dataset
+
+
 def new_figure(height_in: float) -> Figure:
     """Make an empty figure of the common width and resolution."""
     return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, facecolor="white")
+
+
+def new_data_figure(height_in: float, data: xr.Dataset) -> DataFigure:
+    """Make an empty figure that carries the data to be drawn in it."""
+    fig = DataFigure(figsize=(WIDTH_IN, height_in), dpi=DPI, facecolor="white")
+    fig.data = data
+    return fig
 
 
 def style_axes(ax: Axes) -> None:
@@ -141,6 +163,39 @@ def pi_fraction(value: float, _position: int | None = None) -> str:
     return f"{sign}{factor}π" + ("" if denominator == 1 else f"/{denominator}")
 
 
+def parameter_label(coordinate: xr.DataArray) -> str:
+    """Axis label of a parameter: what it is, and its unit."""
+    if coordinate.name == "frequency":
+        return "drive frequency [Hz]"
+    name = str(coordinate.attrs.get("long_name", coordinate.name))
+    unit = coordinate.attrs.get("units", "")
+    return f"{name} [{unit}]" if unit else name
+
+
+def edges(x: np.ndarray) -> np.ndarray:
+    """Limits between neighbouring values of the parameter."""
+    if x.size == 1:
+        width = 0.05 * abs(float(x[0])) or 0.5
+        return np.array([x[0] - width, x[0] + width])
+    middle = 0.5 * (x[1:] + x[:-1])
+    return np.concatenate([[1.5 * x[0] - 0.5 * x[1]], middle, [1.5 * x[-1] - 0.5 * x[-2]]])
+
+
+def fill_columns(
+    ax: Axes, edges: np.ndarray, low: np.ndarray, high: np.ndarray, looks: Mapping[str, Any], gid: str
+) -> PolyCollection:
+    """Fill columns from `low` to `high`: one rectangle for each run of equal columns."""
+    levels = np.column_stack([low, high])
+    starts = np.flatnonzero(np.r_[True, (np.diff(levels, axis=0) != 0).any(1)])
+    ends = np.r_[starts[1:], len(levels)]
+    kept = high[starts] > low[starts]
+    corners = zip(edges[starts[kept]], edges[ends[kept]], *levels[starts[kept]].T, strict=True)
+    boxes = [[(x0, y0), (x1, y0), (x1, y1), (x0, y1)] for x0, x1, y0, y1 in corners]
+    area = PolyCollection(boxes, gid=gid, **looks)
+    ax.add_collection(area, autolim=False)
+    return area
+
+
 def save_figure(fig: Figure, path: str | Path) -> Path:
     """Write a figure as PNG, PDF or SVG, by the suffix of the path.
 
@@ -184,6 +239,13 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
         fig.savefig(buffer, **options)
     path.write_bytes(buffer.getvalue())
     return path
+
+
+def save_data(fig: DataFigure, path: str | Path) -> Path:
+    """Write the data of a figure as NetCDF beside it: the same path with the suffix ``.nc``."""
+    target = Path(path).with_suffix(".nc")
+    fig.data.to_netcdf(target, engine="scipy", format="NETCDF3_64BIT")
+    return target
 
 
 def _save_svg(fig: Figure, buffer: io.BytesIO, options: dict[str, Any]) -> None:

@@ -1,0 +1,261 @@
+"""Basins of attraction: which attractor each initial state of a grid ends on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import AutoMinorLocator, LogLocator, NullLocator, ScalarFormatter
+from scipy.ndimage import distance_transform_edt
+
+from pipeline.plots import palette, style
+
+START_AXES = ("psi1_0", "psi2_0", "psi1_dot_0", "psi2_dot_0")
+
+_SIDE_IN = 3.9
+_LEFT_IN, _BOTTOM_IN, _TOP_IN = 0.68, 0.52, 0.3
+_DARKEST = 0.62
+_OTHERS = -1
+_FIRST_GREY = -2
+_CLOSED_ORBIT = 1  # kind in pipeline.analysis.attractors
+
+
+def plot_basins(
+    attractors: xr.Dataset,
+    *,
+    at: Mapping[str, float] | None = None,
+    degrees: bool = False,
+    n_periods: xr.DataArray | None = None,
+) -> style.DataFigure:
+    """Draw the basins of attraction on a plane of initial states, a colour per attractor.
+
+    Parameters
+    ----------
+    attractors
+        Result of `pipeline.analysis.attractors.match` for a sweep over a grid of initial states.
+    at
+        Values of all other axes, such as ``{"frequency": 2.2}`` [units of the axis, rad]; the nearest
+        ones are drawn.
+    degrees
+        Degrees instead of radians.
+    n_periods
+        Drive periods that each cell took, of the same cube; if given, cells that took longer to close are darker,
+        on a logarithmic scale from the 1st to the 99th percentile.
+
+    Returns
+    -------
+    DataFigure
+        7 in wide. Cells without an attractor are grey. The legend gives each basin's share of the
+        cells drawn. Its `data` hold ``attractor_id`` and ``status`` of these, and ``n_periods`` if drawn.
+
+    Raises
+    ------
+    ValueError
+        If the cells are not on a grid of two initial states or more, or an axis is left over that `at`
+        does not settle.
+    """
+    axes = _axes(attractors, at)
+    part = palette.choose(attractors, at, axes, f"an image of basins has the axes {' and '.join(axes)}")
+    data = part[["attractor_id", "status"]].transpose(*reversed(axes))
+    if n_periods is not None:
+        data["n_periods"] = palette.choose(
+            n_periods.to_dataset(name="attractor_id"), at, axes, "an image of basins has two axes"
+        )["attractor_id"].transpose(*reversed(axes))
+    cast = palette.cast_of(attractors, part)
+    codes, counts = _codes(data, cast)
+    fig = style.new_data_figure(_SIDE_IN + _BOTTOM_IN + _TOP_IN, _stored(data, part, cast))
+    ax = _square(fig)
+    scale = _scale(data, part)
+    image = ax.imshow(
+        _painted(codes, data, part, cast, scale), origin="lower", extent=_extent(data, axes, degrees),
+        aspect="equal" if _is_square(data, axes) else "auto", interpolation="nearest",
+    )  # fmt: skip
+    image.set_gid("basins")
+    _dress(ax, axes, degrees)
+    _write_letters(ax, codes, image.get_extent(), cast)
+    entries = _entries(cast, counts, codes.size)
+    left = _LEFT_IN + _SIDE_IN + 0.18
+    palette.legend_column(fig, entries, left, _TOP_IN)
+    if scale is not None:
+        _draw_scale(fig, scale, left)
+    ax.text(0.0, 1.015, palette.caption(part), transform=ax.transAxes, fontsize=style.LEGEND_PT)
+    style.style_text(fig)
+    return fig
+
+
+def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, str]:
+    """Names of the two axes of the image: horizontal, vertical."""
+    grid = [d for d in START_AXES if d in attractors["attractor_id"].dims]
+    if len(grid) < 2:
+        have = ", ".join(palette.start_dims(attractors)) or "none"
+        raise ValueError(
+            f"an image of basins needs a grid over two initial states, and the initial states lie along: "
+            f'{have}; run a sweep with initial_conditions kind = "grid"'
+        )
+    left = [d for d in grid if d not in (at or {})]
+    long = [d for d in left if attractors.sizes[d] > 1]
+    chosen = long if len(long) >= 2 else left
+    if len(chosen) != 2:
+        raise ValueError(
+            f"an image of basins has two axes, and {len(chosen)} of the initial states are left: "
+            f"{', '.join(chosen) or 'none'}; choose values of the others of {', '.join(grid)}, "
+            f"such as {grid[-1]}={float(attractors[grid[-1]].values[0]):g}"
+        )
+    return chosen[0], chosen[1]
+
+
+def _codes(data: xr.Dataset, cast: palette.Cast) -> tuple[np.ndarray, dict[int, int]]:
+    """Code of each cell (id, or `_OTHERS`, or a grey from `_FIRST_GREY` down), and cells of each code."""
+    ids, status = data["attractor_id"].values, data["status"].values
+    table = np.full(len(cast.names) + 1, _OTHERS, np.int32)
+    table[list(cast.main)] = cast.main
+    codes = table[ids]
+    for k, chosen in enumerate(palette.UNASSIGNED.values()):
+        codes[(ids < 0) & np.isin(status, chosen)] = _FIRST_GREY - k
+    found, counts = np.unique(codes, return_counts=True)
+    return codes, dict(zip(found.tolist(), counts.tolist(), strict=True))
+
+
+def _colour_table(cast: palette.Cast) -> np.ndarray:
+    """RGB by code, shape (codes, 3): ids first, so that negative codes index from the end."""
+    greys = [palette.GREYS[name] for name in reversed(palette.UNASSIGNED)]
+    colours = [*(cast.colours[i] for i in range(len(cast.names))), *greys, palette.OTHERS]
+    return np.array([to_rgb(c) for c in colours], dtype=np.float32)
+
+
+def _painted(
+    codes: np.ndarray, data: xr.Dataset, part: xr.Dataset, cast: palette.Cast, scale: LogNorm | None
+) -> np.ndarray:
+    table = np.round(255.0 * _colour_table(cast)).astype(np.uint8)
+    picture = table[codes]
+    if scale is not None:
+        decided = _closed(data, part)
+        dark = np.clip(scale(data["n_periods"].values[decided].astype(np.float32)), 0.0, 1.0)
+        factor = (1.0 - _DARKEST * np.asarray(dark, np.float32))[:, None]
+        picture[decided] = np.round(picture[decided] * factor).astype(np.uint8)
+    return np.asarray(picture)
+
+
+def _closed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
+    """Cells on closed orbits: the time that others took is no time to converge."""
+    return np.append(part["kind"].values == _CLOSED_ORBIT, False)[data["attractor_id"].values]
+
+
+def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
+    """Scale of the shading, from the times of the cells on closed orbits, without the extremes."""
+    if "n_periods" not in data:
+        return None
+    times = data["n_periods"].values[_closed(data, part)]
+    if not times.size:
+        return None
+    low, high = (max(float(x), 1.0) for x in np.percentile(times, [1.0, 99.0]))
+    return LogNorm(low, high if high > low else low + 1.0)
+
+
+def _extent(data: xr.Dataset, axes: tuple[str, str], degrees: bool) -> tuple[float, float, float, float]:
+    """Limits of the image: the outer edges of the outer cells."""
+    unit = 180.0 / math.pi if degrees else 1.0
+    x, y = (style.edges(data[d].values.astype(np.float64)) * unit for d in axes)
+    return float(x[0]), float(x[-1]), float(y[0]), float(y[-1])
+
+
+def _is_square(data: xr.Dataset, axes: tuple[str, str]) -> bool:
+    """Whether both axes are angles in the same range, or both rates."""
+    left, right, bottom, top = _extent(data, axes, False)
+    alike = style.is_angle(axes[0].removesuffix("_0")) == style.is_angle(axes[1].removesuffix("_0"))
+    return alike and math.isclose(right - left, top - bottom, rel_tol=0.02)
+
+
+def _square(fig: Figure) -> Axes:
+    width, height = fig.get_size_inches()
+    ax = fig.add_axes((_LEFT_IN / width, _BOTTOM_IN / height, _SIDE_IN / width, _SIDE_IN / height))
+    style.style_axes(ax)
+    # ticks inside would lie on the image
+    ax.tick_params(which="both", direction="out", top=False, right=False)
+    return ax
+
+
+def _dress(ax: Axes, axes: tuple[str, str], degrees: bool) -> None:
+    for axis, name in zip(("x", "y"), axes, strict=True):
+        state = name.removesuffix("_0")
+        label = style.state_label(state, degrees).replace("$ [", "(0)$ [", 1)
+        (ax.set_xlabel if axis == "x" else ax.set_ylabel)(label, fontsize=style.LABEL_PT, labelpad=2.0)
+        target = ax.xaxis if axis == "x" else ax.yaxis
+        target.set_minor_locator(AutoMinorLocator(2))
+        if style.is_angle(state):
+            low, high = ax.get_xlim() if axis == "x" else ax.get_ylim()
+            style.set_angle_ticks(ax, low, high, degrees=degrees, axis=axis)
+
+
+def _write_letters(
+    ax: Axes, codes: np.ndarray, extent: tuple[float, float, float, float], cast: palette.Cast
+) -> None:
+    """Write each attractor's letter into the widest place of its basin, if one is wide enough."""
+    stride = max(1, max(codes.shape) // 400)
+    small = codes[::stride, ::stride]
+    padded = np.pad(small, 1, constant_values=np.iinfo(np.int32).min)
+    least = 0.025 * max(small.shape)
+    left, right, bottom, top = extent
+    for number in cast.main:
+        depth = distance_transform_edt(padded == number)[1:-1, 1:-1]
+        row, column = np.unravel_index(int(depth.argmax()), depth.shape)
+        if depth[row, column] < least:
+            continue
+        x = left + (right - left) * (column * stride + 0.5) / codes.shape[1]
+        y = bottom + (top - bottom) * (row * stride + 0.5) / codes.shape[0]
+        ax.text(
+            x, y, palette.letter(number), ha="center", va="center", fontsize=style.LABEL_PT, color="black",
+            path_effects=[withStroke(linewidth=2.0, foreground="white")],
+        )  # fmt: skip
+
+
+def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[tuple[str, str]]:
+    """Legend: attractors by falling share, then the others, then what has no attractor."""
+    own = sorted((i for i in counts if i >= 0), key=lambda i: (-counts[i], i))
+    entries = [(f"{cast.names[i]}, {_percent(counts[i], total)}", cast.colours[i]) for i in own]
+    if _OTHERS in counts:
+        n = len(cast.names) - len(cast.main)
+        entries.append((f"{n} others, {_percent(counts[_OTHERS], total)}", palette.OTHERS))
+    for k, name in enumerate(palette.UNASSIGNED):
+        if (code := _FIRST_GREY - k) in counts:
+            entries.append((f"{name}, {_percent(counts[code], total)}", palette.GREYS[name]))
+    return entries
+
+
+def _percent(count: int, total: int) -> str:
+    share = 100.0 * count / total
+    return f"{share:.1f} %" if share >= 0.05 else "< 0.1 %"
+
+
+def _draw_scale(fig: Figure, scale: LogNorm, left_in: float) -> None:
+    width, height = fig.get_size_inches()
+    box = fig.add_axes((left_in / width, (_BOTTOM_IN + 0.08) / height, 1.9 / width, 0.11 / height))
+    ramp = LinearSegmentedColormap.from_list("time", [(0.85,) * 3, (0.85 * (1.0 - _DARKEST),) * 3])
+    bar = fig.colorbar(ScalarMappable(scale, ramp), cax=box, orientation="horizontal")
+    bar.outline.set_linewidth(style.LINE_PT)  # type: ignore[operator]
+    box.set_gid("time")
+    bar.set_label("drive periods to converge", fontsize=style.LEGEND_PT, labelpad=4.0)
+    box.xaxis.set_label_position("top")
+    box.tick_params(labelsize=style.TICK_PT, width=style.LINE_PT, length=2.5, pad=1.5)
+    box.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 3.0, 5.0, 7.0), numticks=12))
+    box.xaxis.set_major_formatter(ScalarFormatter())
+    box.xaxis.set_minor_locator(NullLocator())
+
+
+def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Dataset:
+    """What is kept beside the figure: the cells drawn, and the names of the attractors."""
+    stored = data.reset_coords(drop=True).assign(share=part["share"].variable)
+    stored = stored.assign_coords(
+        attractor=part["attractor"].variable, name=("attractor", list(cast.names.values()))
+    )
+    scalars = {k: v for k, v in part.coords.items() if v.ndim == 0 and v.dtype.kind == "f"}
+    stored = stored.assign_coords(scalars)
+    stored.attrs = {"title": "basins of attraction"}
+    return stored
