@@ -147,8 +147,8 @@ def simulate(
         check_figure_path(target)
     state = (_angle("psi1", psi1, psi1_deg), _angle("psi2", psi2, psi2_deg), psi1_dot, psi2_dot)
     ds = simulation.simulate(
-        frequency_hz, state, preset=preset, overrides=read_pairs("--set", settings or [], "q=1.5"), n_transient=transient,
-        n_periods=periods, samples_per_period=samples, rtol=rtol, atol=atol,
+        frequency_hz, state, preset=preset, overrides=read_pairs("--set", settings or [], "q=1.5"),
+        n_transient=transient, n_periods=periods, samples_per_period=samples, rtol=rtol, atol=atol,
     )  # fmt: skip
     typer.echo(f"series: {simulation.write_series(ds, out)}")
     if not no_figure:

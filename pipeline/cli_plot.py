@@ -116,9 +116,7 @@ def basins(
 
 
 @plot_app.command(epilog=EXIT_HELP)
-def fractions(
-    directory: Directory, at: At = None, out: Out = None, file_format: FileFormat = None
-) -> None:
+def fractions(directory: Directory, at: At = None, out: Out = None, file_format: FileFormat = None) -> None:
     """Draw basin fractions over the swept parameter, as stacked bands."""
 
     def draw(found: xr.Dataset) -> DataFigure:

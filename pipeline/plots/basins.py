@@ -46,8 +46,8 @@ def plot_basins(
     degrees
         Degrees instead of radians.
     n_periods
-        Drive periods that each cell took, of the same cube; if given, cells that took longer to close are darker,
-        on a logarithmic scale from the 1st to the 99th percentile.
+        Drive periods that each cell took, of the same cube; if given, cells that took longer to close are
+        darker, on a logarithmic scale from the 1st to the 99th percentile.
 
     Returns
     -------
@@ -145,7 +145,8 @@ def _painted(
 
 def _closed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
     """Cells on closed orbits: the time that others took is no time to converge."""
-    return np.append(part["kind"].values == _CLOSED_ORBIT, False)[data["attractor_id"].values]
+    closed = np.append(part["kind"].values == _CLOSED_ORBIT, False)
+    return np.asarray(closed[data["attractor_id"].values])
 
 
 def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
@@ -239,7 +240,7 @@ def _draw_scale(fig: Figure, scale: LogNorm, left_in: float) -> None:
     box = fig.add_axes((left_in / width, (_BOTTOM_IN + 0.08) / height, 1.9 / width, 0.11 / height))
     ramp = LinearSegmentedColormap.from_list("time", [(0.85,) * 3, (0.85 * (1.0 - _DARKEST),) * 3])
     bar = fig.colorbar(ScalarMappable(scale, ramp), cax=box, orientation="horizontal")
-    bar.outline.set_linewidth(style.LINE_PT)  # type: ignore[operator]
+    bar.outline.set_linewidth(style.LINE_PT)
     box.set_gid("time")
     bar.set_label("drive periods to converge", fontsize=style.LEGEND_PT, labelpad=4.0)
     box.xaxis.set_label_position("top")

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import AutoMinorLocator
 
@@ -96,7 +95,11 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
                 fraction,
                 {"units": "1", "long_name": "share of the initial states"},
             ),
-            "n_cells": ((parameter,), np.full(n, ids.shape[1], np.int32), {"units": "1", "long_name": "cells"}),
+            "n_cells": (
+                (parameter,),
+                np.full(n, ids.shape[1], np.int32),
+                {"units": "1", "long_name": "cells"},
+            ),
         },
         coords={
             parameter: part[parameter],
