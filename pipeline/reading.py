@@ -37,7 +37,8 @@ def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        With the specification, its TOML text and the versions that made it in the attributes.
+        With the specification's TOML text, the settings of the integration by name and the versions
+        that made it in the attributes.
 
     Raises
     ------
@@ -70,13 +71,16 @@ def open_committed(
     if "direction" in ds.coords:
         ds = ds.assign_coords(direction=_words(ds.coords["direction"]))
     version = info.versions.get("magpend", "(not installed)")
-    attrs = {
+    integration = parse_spec(info.spec).integration
+    attrs: dict[str, Any] = {
         "title": info.title,
         "source": f"magpend {version}, kernel {info.identity['kernel_version']}",
         "kind": plan.kind,
         "spec": info.spec_text,
         "digest": info.digest,
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
+        # numbers only: netCDF knows no truth values
+        **{name: int(v) if isinstance(v, bool) else v for name, v in integration.model_dump().items()},
     }
     if plan.path is not None:
         attrs["path"] = plan.dims[plan.path]

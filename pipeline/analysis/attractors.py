@@ -52,12 +52,18 @@ From `identify` an id numbers the attractors of one parameter point (attribute `
 lexicographic order of the least section point; from `match` it follows an attractor (``matched`` 1), and
 where that attractor is absent its row holds the fill values.
 
-`decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the orbit, 3 approaching
-the orbit, 4 one of the set; `orbits.decide` has the criteria. A cell that is not bounded (diverged, step
-limit, pending, unreached) has the id -1, and its own `status`; a bounded one that belongs to nothing
-found (see `bounded.Rule`) has the id -1 and `decision` 0. A spiral too far from its orbit to be told, and
-a chaotic transient, look like bounded sets here: what they become takes a longer run. An unstable orbit
-(`is_stable` 0) is listed only if a cell closed on it.
+`decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the orbit, 3 approaching the
+orbit, 4 one of the set, 5 ended on the orbit when it was run on; `orbits.decide` has the criteria. A cell
+that is not bounded (diverged, step limit, pending, unreached) has the id -1, and its own `status`; a
+bounded one that belongs to nothing found (see `bounded.Rule`) has the id -1 and `decision` 0. A spiral too
+far from its orbit to be told, and a chaotic transient, look like bounded sets here: what they become takes
+a longer run. An unstable orbit (`is_stable` 0) is listed only if a cell closed on it.
+
+A run with a loose `closure_tolerance` (1e-3 and more) is short, and its closed cells say little: sections
+recur within a few per cent near unstable orbits too, and near a period doubling with half the period.
+There a cell belongs only to a polished stable orbit, if it is near enough or spirals in; all others are
+run on (`orbits.run_on`) until they close within 1e-5, or stay undecided. So no attractor is made of a
+loose closure alone, and the periods are the orbits' own.
 """
 
 from __future__ import annotations
@@ -103,7 +109,7 @@ def identify(
     ds: xr.Dataset,
     *,
     parameters: Parameters | np.ndarray | None = None,
-    tolerance: float = 1e-4,
+    tolerance: float | None = None,
     polish: bool = True,
     residual: float = 1e-10,
     max_orbit_period: int = 16,
@@ -123,8 +129,10 @@ def identify(
         What was integrated; by default as `ds.attrs` say. Axes of the cube replace the values of the
         same name. With another `system`, its packed vector.
     tolerance
-        Scaled distance within which a closed cell belongs to an orbit; ten times the run's
-        closure tolerance or more.
+        Scaled distance within which a closed cell belongs to an orbit. By default ten times the
+        attribute ``closure_tolerance`` of `ds`, and 1e-4 at least: a slow spiral can be eight times
+        the closure tolerance away (`magpend_core.observers.closed_period`). Above 1e-3 the run is
+        taken as loosely closed, see `pipeline.analysis.attractors`.
     polish
         Whether to run Newton's method. Without it closed cells are grouped by distance alone, no
         spiral is recognised, and features that need integration are missing.
@@ -153,6 +161,10 @@ def identify(
     ValueError
         If a variable or the parameters are missing.
     """
+    if tolerance is None:
+        tolerance = max(1e-4, 10.0 * float(ds.attrs.get("closure_tolerance", 1e-5)))
+    elif not tolerance > 0.0:
+        raise ValueError(f"tolerance = {tolerance!r} is out of bounds: it must be greater than 0.")
     missing = [name for name in ("section", "status", "orbit_period") if name not in ds]
     if missing:
         raise ValueError(f"The dataset has no {', '.join(missing)}; give the dataset of pipeline.open_run.")
@@ -171,7 +183,7 @@ def identify(
 
 # ---- result ------------------------------------------------------------------------------------
 
-_DECISIONS = "undecided closed certain approaching same_set"
+_DECISIONS = "undecided closed certain approaching same_set run_on"
 
 
 def _flags(words: str) -> dict[str, Any]:

@@ -22,8 +22,11 @@ from pipeline.analysis.bounded import Clouds, Rule, assign, find_sets
 from pipeline.analysis.features import Cells, Features
 from pipeline.analysis.orbits import (
     CLOSED,
+    LOOSE_SHARE,
     MAX_GUESSES,
+    RUN_ON,
     SAME_SET,
+    STRICT,
     UNDECIDED,
     Block,
     ClosedCells,
@@ -31,9 +34,12 @@ from pipeline.analysis.orbits import (
     Orbit,
     decide,
     distinct,
+    marks_of,
     near_closed,
+    number_of,
     polish,
     raw_orbit,
+    run_on,
 )
 from pipeline.analysis.sets import Geometry, hashes, order_by_points
 
@@ -43,8 +49,8 @@ START_DIMS = ("initial_condition", "psi1_0", "psi2_0", "psi1_dot_0", "psi2_dot_0
 ABSENT, CLOSED_ORBIT, BOUNDED_SET = range(3)
 """Values of `kind`."""
 
-ROUNDS = 3
-"""Most rounds of guessing and polishing."""
+ROUNDS, ROUNDS_LOOSE = 3, 6
+"""Most rounds of guessing and polishing, with a strict and a loose tolerance."""
 
 BUDGET = 256 * 2**20
 """Bytes of sections held at once."""
@@ -61,6 +67,16 @@ class Options:
     rule: Rule
     n_points: int
     mirror_threshold: float
+
+    @property
+    def is_loose(self) -> bool:
+        """Whether closed cells may be too far from their orbit for an orbit of their own."""
+        return self.polish and self.tolerance > STRICT
+
+    @property
+    def box(self) -> float:
+        """Side of the boxes that group closed cells."""
+        return LOOSE_SHARE * self.tolerance if self.is_loose else self.tolerance
 
 
 @dataclass
@@ -193,21 +209,51 @@ def _polish_together(
     if not asked:
         return {}
     sizes = [len(g.key) for g in asked.values()]
-    orbits = polish(
-        np.repeat([points[i].packed for i in asked], sizes, axis=0),
-        np.repeat([points[i].frequency for i in asked], sizes),
-        np.concatenate([g.point for g in asked.values()]),
-        np.concatenate([g.period for g in asked.values()]),
+    packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
+    frequency = np.repeat([points[i].frequency for i in asked], sizes)
+    start = np.concatenate([g.point for g in asked.values()])
+    period = np.concatenate([g.period for g in asked.values()])
+    mark = np.concatenate([g.mark for g in asked.values()])
+    unknown = np.flatnonzero(period == 0)
+    start[unknown], period[unknown] = run_on(
+        packed[unknown], frequency[unknown], start[unknown], options.max_orbit_period, system
+    )
+    rows, place = _each_once(np.repeat(np.arange(len(sizes)), sizes), start, period, mark, unknown, geometry)
+    polished = polish(
+        packed[rows], frequency[rows], start[rows], period[rows],
         geometry=geometry, system=system, tolerance=options.residual,
     )  # fmt: skip
+    orbits = [polished[i] if i >= 0 else None for i in place]
     ends = np.cumsum(sizes)
     return {i: orbits[end - n : end] for i, n, end in zip(asked, sizes, ends, strict=True)}
+
+
+def _each_once(
+    search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray,
+    geometry: Geometry,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Rows to polish, and for each row the place of its own among them, -1 for none.
+
+    Of rows that were run on and ended in one box, on one orbit that is, the one of least hash.
+    """
+    rows = np.arange(len(period))
+    key = mark.copy()
+    boxes = geometry.boxes(start[ended], STRICT)
+    key[ended] = hashes(np.concatenate([period[ended, None], boxes], axis=1))
+    group = np.stack([search.astype(np.uint64), np.isin(rows, ended).astype(np.uint64), key], axis=1)
+    order = rows[np.lexsort((mark, *group.T[::-1]))]
+    order = order[period[order] > 0]
+    new = np.ones(len(order), bool)
+    new[1:] = (group[order][1:] != group[order][:-1]).any(axis=1) | ~np.isin(order[1:], ended)
+    place = np.full(len(period), -1)
+    place[order] = np.cumsum(new) - 1
+    return order[new], place
 
 
 def _search(point: Point, options: Options, geometry: Geometry) -> _Search:
     """Find the attractors of one point; yields guesses and is sent their orbits."""
     n_states = len(geometry.scales)
-    closed = ClosedCells(geometry, options.tolerance, Guesses.none(n_states))
+    closed = ClosedCells(geometry, options.box, Guesses.none(n_states))
     for block in point.blocks():
         closed.add(block)
     keys, group = closed.close()
@@ -215,7 +261,9 @@ def _search(point: Point, options: Options, geometry: Geometry) -> _Search:
     if options.polish:
         guesses = closed.guesses
         guesses = guesses.best(group[np.searchsorted(keys, guesses.key)].astype(np.uint64))
-        for _ in range(ROUNDS):
+        if options.is_loose:
+            guesses = guesses.least(MAX_GUESSES)
+        for _ in range(ROUNDS_LOOSE if options.is_loose else ROUNDS):
             if len(guesses.key):
                 polished = yield guesses
                 more = distinct([*orbits, *(o for o in polished if o is not None)], geometry)
@@ -225,12 +273,36 @@ def _search(point: Point, options: Options, geometry: Geometry) -> _Search:
             guesses = _undecided(point, orbits, options, geometry)
             if not len(guesses.key):
                 break
-    return _conclude(point, orbits, keys, group, closed, options, geometry)
+    ends: dict[int, int] = {}
+    if options.is_loose:
+        rest = _closed_undecided(point, orbits, options, geometry)
+        if len(rest.key):
+            answers = yield rest
+            for mark, orbit in zip(rest.mark, answers, strict=True):
+                if orbit is not None and orbit.is_stable:
+                    number = number_of(orbit, orbits, geometry)
+                    orbits = orbits if number < len(orbits) else [*orbits, orbit]
+                    ends[int(mark)] = number
+    return _conclude(point, orbits, keys, group, closed, ends, options, geometry)
+
+
+def _closed_undecided(point: Point, orbits: Sequence[Orbit], options: Options, geometry: Geometry) -> Guesses:
+    """Return the closed cells that none of the orbits accounts for, to be run on."""
+    found = Guesses.none(len(geometry.scales))
+    for block in point.blocks():
+        label, _ = decide(block, orbits, options.tolerance, geometry)
+        rest = np.flatnonzero(block.is_closed & (label < 0))
+        section = block.section[rest]
+        marks = marks_of(section)
+        zero = np.zeros(len(rest))
+        own = Guesses(marks, zero, marks, section[:, -1], zero.astype(np.int64))
+        found = found.joined(own)
+    return found
 
 
 def _undecided(point: Point, orbits: Sequence[Orbit], options: Options, geometry: Geometry) -> Guesses:
     """Guesses from cells that none of the orbits accounts for."""
-    closed = ClosedCells(geometry, options.tolerance, Guesses.none(len(geometry.scales)))
+    closed = ClosedCells(geometry, options.box, Guesses.none(len(geometry.scales)))
     near = Guesses.none(len(geometry.scales))
     for block in point.blocks():
         label, _ = decide(block, orbits, options.tolerance, geometry)
@@ -240,9 +312,11 @@ def _undecided(point: Point, orbits: Sequence[Orbit], options: Options, geometry
         near = near.joined(near_closed(block.section[loose], options.max_orbit_period, geometry))
     keys, group = closed.close()
     own = closed.guesses.best(group[np.searchsorted(keys, closed.guesses.key)].astype(np.uint64))
-    near = near.take(np.lexsort((near.mark, near.score))[:MAX_GUESSES])
-    near = near.take(np.argsort(near.mark))
-    return own.followed_by(near)
+    if options.is_loose:
+        # the period seen may be half the true one, and the orbit an unstable one: the future tells
+        own = closed.guesses.least(MAX_GUESSES)
+        own = own.followed_by(own.without_period())
+    return own.followed_by(near.least(MAX_GUESSES))
 
 
 def _part(block: Block, rows: np.ndarray) -> Block:
@@ -253,7 +327,7 @@ def _part(block: Block, rows: np.ndarray) -> Block:
 
 def _conclude(
     point: Point, orbits: list[Orbit], keys: np.ndarray, group: np.ndarray, closed: ClosedCells,
-    options: Options, geometry: Geometry,
+    ends: Mapping[int, int], options: Options, geometry: Geometry,
 ) -> Found:  # fmt: skip
     """Label all cells, and describe what they are labelled with."""
     label = np.full(point.n_cells, -1, np.int64)
@@ -262,6 +336,9 @@ def _conclude(
     left = np.full(point.n_cells, -1, np.int64)
     for block in point.blocks():
         label[block.cells], decision[block.cells] = decide(block, orbits, options.tolerance, geometry)
+        if options.is_loose:
+            _label_ends(block, ends, label, decision)
+            continue
         own = closed.group_of(block, keys, group)
         own[label[block.cells] >= 0] = -1
         left[block.cells] = own
@@ -275,6 +352,14 @@ def _conclude(
     return _describe(point, orbits, label, decision, options, geometry)
 
 
+def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
+    """Label the closed cells that were run on by where they went, in place."""
+    rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
+    for row, mark in zip(rest, marks_of(block.section[rest]), strict=True):
+        if int(mark) in ends:
+            label[row + block.cells.start], decision[row + block.cells.start] = ends[int(mark)], RUN_ON
+
+
 def _representatives(
     block: Block, group: np.ndarray, best: dict[int, tuple[float, int, np.ndarray]], geometry: Geometry
 ) -> None:
@@ -282,7 +367,7 @@ def _representatives(
     rows = np.flatnonzero(group >= 0)
     if not len(rows):
         return
-    marks = hashes(block.section[rows].reshape(len(rows), -1))
+    marks = marks_of(block.section[rows])
     for row, mark in zip(rows, marks, strict=True):
         p = min(int(block.orbit_period[row]), block.section.shape[1])
         section = block.section[row]

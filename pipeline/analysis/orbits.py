@@ -1,7 +1,7 @@
 """Closed orbits of one parameter point: from cells to guesses, from guesses to polished orbits, and back.
 
-The only module of the analysis that integrates: `polish` runs Newton's method of the core, and what it
-needs of a cube is one section point per guess.
+`polish` runs Newton's method of the core and `run_on` the engine; what they need of a cube is one
+section point per guess.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from magpend_core.orbits import polish_orbits, stroboscopic_map
+from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from magpend_core.system import System
 from pipeline.analysis.sets import Geometry, groups, hashes, rounded_points
@@ -26,10 +27,19 @@ REACH = 0.3
 SAME_ORBIT = 1e-7
 """Polished orbits at most this far apart are one, on top of the error that their residuals allow."""
 
+STRICT = 1e-3
+"""Largest tolerance at which a closed cell may stand for an orbit that Newton's method did not confirm."""
+
+LOOSE_SHARE = 0.1
+"""Share of a tolerance above `STRICT` within which a closed cell counts as on an orbit at once."""
+
+RUN_ON_PERIODS, RUN_ON_TOLERANCE, RUN_ON_RTOL = 2000, 1e-5, 1e-8
+"""How `run_on` integrates: drive periods at most, closure tolerance, tolerance of the steps."""
+
 MAX_GUESSES = 64
 """Most guesses per parameter point from cells that are not closed."""
 
-UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET = range(5)
+UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, RUN_ON = range(6)
 """How a cell was decided: values of `decision`."""
 
 
@@ -84,6 +94,7 @@ class Guesses:
     point : ndarray, (n, state)
         Last section point.
     period : ndarray of int64
+        0 if it is not known: then the point is to be run on until it closes.
     """
 
     key: np.ndarray
@@ -110,6 +121,15 @@ class Guesses:
         first = np.ones(len(order), bool)
         first[1:] = keys[order][1:] != keys[order][:-1]
         return self.take(order[first])
+
+    def least(self, n: int) -> Guesses:
+        """Return the `n` of least score, in the order of their marks."""
+        least = np.lexsort((self.mark, self.score))[:n]
+        return self.take(least[np.argsort(self.mark[least], kind="stable")])
+
+    def without_period(self) -> Guesses:
+        """Return the same points, their period unknown."""
+        return Guesses(self.key, self.score, self.mark, self.point, np.zeros_like(self.period))
 
     def joined(self, other: Guesses) -> Guesses:
         """Both, reduced to the best per key."""
@@ -190,6 +210,11 @@ def _rows_of(points: np.ndarray, p: int, geometry: Geometry, side: float) -> tup
     return rows, hashes(rows)
 
 
+def marks_of(section: np.ndarray) -> np.ndarray:
+    """Hash of each cell's sections."""
+    return hashes(section.reshape(len(section), section.shape[1] * section.shape[2]))
+
+
 def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Guesses:
     """Guesses from cells that are not closed but come back ever closer.
 
@@ -199,7 +224,7 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Gue
     k = section.shape[1]
     period = np.zeros(len(section), np.int64)
     score = np.full(len(section), np.inf)
-    for p in range(1, min(max_period, k // 4) + 1):
+    for p in range(1, min(max_period, k // 2) + 1):
         half = (k - p) // 2
         rest = np.flatnonzero(period == 0)
         lag = geometry.distance(section[rest][:, k - 2 * half :], section[rest][:, k - 2 * half - p : k - p])
@@ -210,8 +235,7 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Gue
     found = np.flatnonzero(period)
     last = section[found, -1]
     rows = np.concatenate([period[found, None], geometry.boxes(last, NEAR)], axis=1)
-    marks = hashes(section[found].reshape(len(found), -1)) if len(found) else np.zeros(0, np.uint64)
-    return Guesses(hashes(rows), score[found], marks, last, period[found]).best()
+    return Guesses(hashes(rows), score[found], marks_of(section[found]), last, period[found]).best()
 
 
 @dataclass(frozen=True)
@@ -316,6 +340,28 @@ def polish(
     return orbits
 
 
+def run_on(
+    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, max_orbit_period: int, system: System
+) -> tuple[np.ndarray, np.ndarray]:
+    """Run section points on until they close within `RUN_ON_TOLERANCE`.
+
+    Returns
+    -------
+    points : ndarray, (n, state)
+        Last sections.
+    period : ndarray of int64, (n,)
+        Drive periods; 0 for points that have not closed after `RUN_ON_PERIODS`.
+    """
+    if not len(points):
+        return points, np.zeros(0, np.int64)
+    result = run_branches(
+        packed[:, None], frequency[:, None], points, n_transient=RUN_ON_PERIODS, n_keep=1,
+        rtol=RUN_ON_RTOL, atol=RUN_ON_RTOL, stop_when_closed=True, closure_tolerance=RUN_ON_TOLERANCE,
+        max_orbit_period=max_orbit_period, system=system,
+    )  # fmt: skip
+    return result.section[:, 0, -1], result.orbit_period[:, 0].astype(np.int64)
+
+
 def _images(
     packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, system: System
 ) -> tuple[list[np.ndarray], np.ndarray]:
@@ -344,6 +390,11 @@ def distinct(orbits: Sequence[Orbit], geometry: Geometry) -> list[Orbit]:
         if not any(_coincide(orbit, other, geometry) for other in kept):
             kept.append(orbit)
     return kept
+
+
+def number_of(orbit: Orbit, orbits: Sequence[Orbit], geometry: Geometry) -> int:
+    """Place of an orbit among others; their number if it is not there."""
+    return next((i for i, other in enumerate(orbits) if _coincide(orbit, other, geometry)), len(orbits))
 
 
 def _coincide(a: Orbit, b: Orbit, geometry: Geometry) -> bool:
@@ -386,8 +437,12 @@ def decide(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Say which orbit each cell of a block has reached.
 
-    A closed cell belongs to the nearest orbit if its last sections, one period of them, lie within
-    `tolerance` of it, each at its phase. A cell that is not (or whose status is not closed) can be
+    A closed cell belongs to the nearest stable orbit if its last sections, one period of them, lie
+    within `tolerance` of it, each at its phase, or to the nearest other orbit. Above `STRICT` that is
+    not enough: sections a few per cent apart recur near unstable orbits too, and near a period doubling
+    with half the period. Then a cell belongs to stable orbits only, and within `LOOSE_SHARE` of the
+    tolerance: on 4096 cells at 2.2 Hz, closed within 3e-2, that holds for 99.8 % of those that end
+    there and for none of the 6 that left again. A cell that is not (or whose status is not closed) can be
     spiralling in on a stable polished orbit. With the monodromy matrix M and a norm in which M
     contracts by r < 1, let d be the distances from the orbit of the sections that share its phase, and
     e = ``|d' - M d| / |d|`` the relative error of the linear map over the younger half of them. An
@@ -409,10 +464,15 @@ def decide(
     """
     label = np.full(len(block.status), -1, np.int64)
     decision = np.zeros(len(block.status), np.int8)
-    for cells, which, phase in _nearest(block.section, np.flatnonzero(block.is_closed), orbits, geometry):
-        own = cells[_on_orbit(block.section[cells], orbits[which], phase, tolerance, geometry)]
-        label[own], decision[own] = which, CLOSED
     stable = [i for i, orbit in enumerate(orbits) if orbit.is_stable]
+    unstable = [i for i in range(len(orbits)) if i not in stable]
+    within = tolerance if tolerance <= STRICT else LOOSE_SHARE * tolerance
+    for numbers in [stable] if tolerance > STRICT else [stable, unstable]:
+        closed = np.flatnonzero(block.is_closed & (decision == UNDECIDED))
+        for cells, which, phase in _nearest(block.section, closed, [orbits[i] for i in numbers], geometry):
+            number = numbers[which]
+            own = cells[_on_orbit(block.section[cells], orbits[number], phase, within, geometry)]
+            label[own], decision[own] = number, CLOSED
     rest = np.flatnonzero((block.is_closed | block.is_bounded) & (decision == UNDECIDED))
     for cells, which, phase in _nearest(block.section, rest, [orbits[i] for i in stable], geometry):
         code = _approach(block.section[cells], orbits[stable[which]], phase, tolerance, geometry)

@@ -28,6 +28,9 @@ def test_open_run__explains_itself(made):
     assert ds.attrs["spec"] == made.info.spec_text
     assert ds.attrs["title"] == "small sweep"
     assert "q = 1.543" in ds.attrs["parameters"]
+    assert ds.attrs["closure_tolerance"] == 1e-6
+    assert ds.attrs["n_transient"] == 2
+    assert ds.attrs["stop_when_closed"] == 0
     for name in ds.data_vars:
         assert ds[name].attrs["units"]
         assert ds[name].attrs["long_name"]
