@@ -57,3 +57,20 @@ def test_work_precision__draws_and_prints(bench, monkeypatch, tmp_path, capsys):
     assert out.stat().st_size > 0
     assert "us per period" in printed
     assert "numbalsoda is left out" in printed
+
+
+def test_multistable_pendulum__prints_both_variants_with_the_same_labels(bench, capsys):
+    bench("multistable_pendulum").main(["--starts", "200", "--rounds", "1"])
+    printed = capsys.readouterr().out
+    assert "to the end" in printed
+    assert "until certain" in printed
+    assert "starts with other labels in the two: 0" in printed
+    assert "undecided  0 starts" in printed
+
+
+def test_multistable_pendulum__threads_change_nothing(bench, monkeypatch):
+    pendulum = bench("multistable_pendulum")
+    monkeypatch.setattr(pendulum, "CHUNK", 16)
+    one, three = (pendulum.whole("to the end", 50, 200.0, threads, 3) for threads in (1, 3))
+    assert one.label.tolist() == three.label.tolist()
+    assert one.attempts == three.attempts
