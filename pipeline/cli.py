@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pipeline.cli_analyse import analyse_app
 from pipeline.cli_common import EXIT_HELP, Directory, read_pairs
 from pipeline.cli_plot import check_figure_path, draw_bifurcation, plot_app
 from pipeline.exits import Exit
@@ -22,6 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+app.add_typer(analyse_app, name="analyse")
 app.add_typer(plot_app, name="plot")
 
 

@@ -16,11 +16,12 @@ as `attractors` does.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 Echo = Callable[[str], None]
 
+_LEFTOVER_SECONDS = 3600.0
 _ANALYSIS = Path(__file__).parent / "analysis"
 
 
@@ -232,6 +234,91 @@ def attractor_defaults() -> dict[str, Any]:
     return {**_defaults_of(identify), **rule, **_defaults_of(match)}
 
 
+def basins(directory: Source, *, echo: Echo | None = None, **options: Any) -> xr.Dataset:
+    """Basins of a sweep: cells, fractions, boundaries.
+
+    Parameters
+    ----------
+    directory, echo
+        As in `attractors`.
+    options
+        Those of `attractors` and of `pipeline.analysis.basins.basins`. `basin_defaults` lists them.
+
+    Returns
+    -------
+    Dataset
+        See `pipeline.analysis.basins.basins`.
+
+    Raises
+    ------
+    SpecError
+        If an option is unknown or out of bounds, or the run is no sweep of initial conditions.
+    """
+    from pipeline.analysis.basins import basins as compute
+    from pipeline.analysis.basins import check_basin_options, check_starts
+
+    snapshot = Snapshot.of(directory)
+    wanted = _with_defaults("basins", options, basin_defaults())
+    own = {name: wanted[name] for name in _defaults_of(compute)}
+    shared = {name: value for name, value in wanted.items() if name not in own}
+    with _refused(snapshot):
+        check_basin_options(**own)
+        check_starts(snapshot.open())
+    return derive(
+        snapshot,
+        "basins",
+        wanted,
+        lambda s: compute(s.open(), attractors(s, echo=echo, **shared), **own),
+        echo,
+    )
+
+
+def basin_defaults() -> dict[str, Any]:
+    """Options of `basins` with their defaults."""
+    from pipeline.analysis.basins import basins as compute
+
+    return {**attractor_defaults(), **_defaults_of(compute)}
+
+
+def hysteresis(directory: Source, *, echo: Echo | None = None, **options: Any) -> xr.Dataset:
+    """Hysteresis of a continuation in both directions: loops, and jumps between attractors.
+
+    Parameters
+    ----------
+    directory, echo, options
+        As in `attractors`.
+
+    Returns
+    -------
+    Dataset
+        See `pipeline.analysis.hysteresis.hysteresis`.
+
+    Raises
+    ------
+    SpecError
+        If an option is unknown, or the run is no continuation in both directions.
+    """
+    from pipeline.analysis.hysteresis import check_directions
+    from pipeline.analysis.hysteresis import hysteresis as compute
+
+    snapshot = Snapshot.of(directory)
+    wanted = _with_defaults("hysteresis", options, attractor_defaults())
+    with _refused(snapshot):
+        check_directions(snapshot.open())
+    return derive(
+        snapshot, "hysteresis", wanted, lambda s: compute(s.open(), attractors(s, echo=echo, **wanted)), echo
+    )
+
+
+@contextlib.contextmanager
+def _refused(snapshot: Snapshot) -> Iterator[None]:
+    """Turn what an analysis refuses into a sentence with the directory's name."""
+    try:
+        yield
+    except ValueError as error:
+        raise SpecError([f"{snapshot.info.directory}: {error}"]) from None
+
+
 def _identify(snapshot: Snapshot, options: Mapping[str, Any]) -> xr.Dataset:
     from pipeline.analysis.attractors import Rule, identify
 
@@ -253,9 +340,61 @@ def _defaults_of(function: Callable[..., Any]) -> dict[str, Any]:
     }
 
 
+_POSITIVE = ("tolerance", "residual", "mirror_threshold", "threshold", "rule_box", "rule_same_share")
+_AT_LEAST_ONE = ("max_orbit_period", "n_points", "look_back", "rule_n_anchors", "rule_n_rounds")
+
+
 def _with_defaults(product: str, options: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """All options of a product, numbers in the type of their default."""
+    """All options of a product, checked, numbers in the type of their default."""
     problems = [unknown_key(f"{product}.{name}", name, defaults) for name in options if name not in defaults]
+    found = dict(defaults)
+    for name in options.keys() & defaults.keys():
+        kind = type(defaults[name])
+        try:
+            found[name] = kind(options[name])
+        except (TypeError, ValueError):
+            found[name] = None
+        if found[name] != options[name]:  # NaN is not itself
+            words = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+            problems.append(f"{name} = {options[name]!r}: must be {words[kind]}.")
+        elif name in _POSITIVE and not found[name] > 0:
+            problems.append(f"{name} = {options[name]!r} is out of bounds: it must be greater than 0.")
+        elif name in _AT_LEAST_ONE and found[name] < 1:
+            problems.append(f"{name} = {options[name]!r} is out of bounds: it must be 1 or more.")
+        elif name == "rule_same_share" and found[name] > 1:
+            problems.append(f"{name} = {options[name]!r} is out of bounds: it must be at most 1.")
     if problems:
-        raise SpecError(problems)
-    return {name: type(default)(options.get(name, default)) for name, default in defaults.items()}
+        raise SpecError(sorted(problems))
+    return found
+
+
+# ---- what is no longer wanted ------------------------------------------------------------------
+
+
+def stale(source: Source) -> list[Path]:
+    """Products of an earlier cube or an earlier version of the code, damaged ones, and leftovers.
+
+    A leftover is what a process that was killed had begun to write; one younger than an hour may
+    belong to a process at work and is not listed.
+    """
+    snapshot = Snapshot.of(source)
+    folder = snapshot.info.directory / store.DERIVED
+    now = {"cube_digest": snapshot.digest, "analysis_version": analysis_version()}
+
+    def is_stale(path: Path) -> bool:
+        try:
+            attrs = store.read_product_attrs(path)
+        except store.DamagedError:
+            return True
+        return any(attrs.get(name) != value for name, value in now.items())
+
+    products = [path for path in sorted(folder.glob("*.zarr")) if is_stale(path)]
+    return products + store.leftover_products(folder, older_than=_LEFTOVER_SECONDS)
+
+
+def prune(source: Source) -> list[Path]:
+    """Remove what `stale` lists; returns it."""
+    found = stale(source)
+    for path in found:
+        store.remove_product(path)
+    return found

@@ -23,6 +23,7 @@ import hashlib
 import json
 import os
 import shutil
+import time
 import uuid
 import warnings
 from collections.abc import AsyncGenerator, Iterable, Iterator, Mapping
@@ -663,6 +664,12 @@ def remove_product(path: Path) -> None:
     with contextlib.suppress(FileNotFoundError):
         path.rename(aside)
     shutil.rmtree(aside, ignore_errors=True)
+
+
+def leftover_products(folder: Path, older_than: float) -> list[Path]:
+    """Temporary folders of products that nothing has changed for some seconds."""
+    limit = time.time() - older_than
+    return [p for p in sorted(folder.glob(f".*.zarr.*{_TEMPORARY}")) if p.stat().st_mtime < limit]
 
 
 def _temporary_beside(path: Path) -> Path:

@@ -42,8 +42,7 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
     ValueError
         If the cube has no branches in both directions.
     """
-    if "branch" not in ds["status"].dims or set(ds["direction"].values) != {"up", "down"}:
-        raise ValueError('hysteresis needs a continuation with direction = "both".')
+    check_directions(ds)
     cells = ids["attractor_id"]
     dims = [str(d) for d in cells.dims if d != "branch"]
     path = str(ds.attrs.get("path", dims[0] if len(dims) == 1 else ""))
@@ -81,6 +80,12 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
         .assign(_jumps(values, direction, along))
         .transpose(*dims, ...)
     )
+
+
+def check_directions(ds: xr.Dataset) -> None:
+    """Refuse a cube without branches in both directions."""
+    if "branch" not in ds["status"].dims or set(ds["direction"].values) != {"up", "down"}:
+        raise ValueError('hysteresis needs a continuation with direction = "both".')
 
 
 def _presence(values: np.ndarray, n_ids: int) -> np.ndarray:

@@ -1,0 +1,185 @@
+"""``magpend analyse``: attractors, basins and hysteresis of a stored cube."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
+
+from pipeline.cli_common import EXIT_HELP, Directory, refusals
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+analyse_app = typer.Typer(
+    help="Find attractors, basins and hysteresis in a stored cube; results are kept in DIR/derived.",
+    no_args_is_help=True,
+)
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Interval(StrEnum):
+    """Confidence intervals of fractions."""
+
+    WILSON = "wilson"
+    CLOPPER_PEARSON = "clopper-pearson"
+
+
+class Scaling(StrEnum):
+    """What scales with the uncertainty exponent."""
+
+    PERTURBATION = "perturbation"
+    BOXES = "boxes"
+    ENTROPY = "entropy"
+
+
+class Metric(StrEnum):
+    """Distances between cells."""
+
+    TAXICAB = "taxicab"
+    CHESSBOARD = "chessboard"
+
+
+def _option(name: str, default: Any, text: str) -> inspect.Parameter:
+    """Option of an analysis; the bounds in the text are checked by `pipeline.derived`."""
+    kind: Any = type(default)
+    annotation = Annotated[kind, typer.Option(help=text)]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+ATTRACTOR_OPTIONS = (
+    _option(
+        "tolerance", 1e-4,
+        "Scaled distance (1 rad, 10 rad/s) within which a closed cell belongs to an orbit; above 0, ten "
+        "times the run's closure tolerance or more.",
+    ),
+    _option("polish", True, "Refine orbits by Newton's method, which integrates a point per orbit."),
+    _option("residual", 1e-10, "Scaled residual that Newton's method is to reach; above 0."),
+    _option("max_orbit_period", 16, "Longest period guessed for cells that are not closed; 1 or more."),
+    _option("n_points", 64, "Section points stored per attractor; 1 or more."),
+    _option("mirror_threshold", 0.3, "Largest distance of a mirror partner from the image; above 0."),
+    _option("rule_box", 0.1, "Bounded sets: scaled side of the boxes that are compared; above 0."),
+    _option("rule_same_share", 0.5, "Bounded sets: least share of boxes in common; above 0, at most 1."),
+    _option("rule_rotation", 0.2, "Bounded sets: largest difference of rotation, turns per period."),
+    _option("rule_n_anchors", 192, "Bounded sets: cells compared with each other in a round; 1 or more."),
+    _option("rule_n_rounds", 4, "Bounded sets: rounds; 1 or more."),
+    _option("threshold", 0.3, "Matching: largest distance between appearances of one id; above 0."),
+    _option("look_back", 3, "Matching: steps over which an id is remembered; 1 or more."),
+)  # fmt: skip
+
+BASIN_OPTIONS = (
+    _option("interval", Interval.WILSON, "Confidence interval of the fractions."),
+    _option("confidence", 0.95, "Level of all intervals; between 0 and 1."),
+    _option("box", 5, "Basin entropy: side of the boxes \\[cells]; 2 or more."),
+    _option("block", 1, "Basin entropy: side of the squares of boxes that the bootstrap draws; 1 or more."),
+    _option("scaling", Scaling.PERTURBATION, "Uncertainty exponent: what scales."),
+    _option("radius", 1, "Wada test: radius of the fattened boundary \\[cells]; 1 or more."),
+    _option("metric", Metric.TAXICAB, "Wada test: distance between cells."),
+    _option("resamples", 200, "Samples of each bootstrap; 2 or more."),
+    _option("seed", 0, "Seed of the bootstraps."),
+)
+
+
+def _takes(*options: inspect.Parameter) -> Callable[[F], F]:
+    """Give a command that has ``**options`` these options by name."""
+
+    def decorate(function: F) -> F:
+        own = inspect.signature(function, eval_str=True)
+        kept = [p for p in own.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
+        command: Any = function
+        command.__signature__ = own.replace(parameters=[*kept, *options])
+        command.__annotations__ = {p.name: p.annotation for p in (*kept, *options)}
+        return function
+
+    return decorate
+
+
+Csv = Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table as CSV, too.")]
+
+
+@analyse_app.callback()
+def _directory(context: typer.Context, directory: Directory) -> None:
+    context.obj = directory
+
+
+@analyse_app.command(epilog=EXIT_HELP)
+@_takes(*ATTRACTOR_OPTIONS)
+def attractors(context: typer.Context, csv: Csv = None, **options: Any) -> None:
+    """Find the attractors at every parameter point, and follow them along the axes.
+
+    A table per parameter point, or with more than six points a line per attractor with the range in
+    which it exists. Shares are those of the cells whose outcome is known, with 95 % intervals.
+    """
+    from pipeline import derived, report
+
+    ds = _derive(context, derived.attractors, csv, options)
+    with refusals(context.obj):
+        rows = report.attractor_rows(ds)
+        _tell(report.attractor_lines(ds, rows), rows, csv, ds)
+
+
+@analyse_app.command(epilog=EXIT_HELP)
+@_takes(*BASIN_OPTIONS, *ATTRACTOR_OPTIONS)
+def basins(context: typer.Context, csv: Csv = None, **options: Any) -> None:
+    """Measure the basins of a sweep: fractions with intervals, entropy, uncertainty exponent, Wada test.
+
+    The last three need starts on a grid.
+    """
+    from pipeline import derived, report
+
+    ds = _derive(context, derived.basins, csv, options)
+    with refusals(context.obj):
+        rows = report.basin_rows(ds)
+        _tell(report.basin_lines(ds, rows), rows, csv, ds)
+
+
+@analyse_app.command(epilog=EXIT_HELP)
+@_takes(*ATTRACTOR_OPTIONS)
+def hysteresis(context: typer.Context, csv: Csv = None, **options: Any) -> None:
+    """Say where a continuation meets other attractors going up than going down, and where it jumps."""
+    from pipeline import derived, report
+
+    ds = _derive(context, derived.hysteresis, csv, options)
+    rows = report.jump_rows(ds)
+    _tell(report.hysteresis_lines(ds, rows), rows, csv, ds)
+
+
+@analyse_app.command(epilog=EXIT_HELP)
+def prune(
+    context: typer.Context,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List them; remove nothing.")] = False,
+) -> None:
+    """Remove results of an earlier state of the cube or an earlier version of magpend."""
+    from pipeline import derived
+
+    found = (derived.stale if dry_run else derived.prune)(context.obj)
+    for path in found:
+        typer.echo(f"{'stale' if dry_run else 'removed'}: {path}")
+    if not found:
+        typer.echo("nothing to remove")
+
+
+def _derive(
+    context: typer.Context, product: Callable[..., xr.Dataset], csv: Path | None, options: dict[str, Any]
+) -> xr.Dataset:
+    from pipeline.problems import SpecError
+
+    if csv is not None and (csv.is_dir() or not csv.parent.is_dir()):
+        raise SpecError([f"--csv {csv}: must be a file in a folder that exists."])
+    return product(context.obj, echo=typer.echo, **options)
+
+
+def _tell(lines: list[str], rows: list[dict[str, Any]], csv: Path | None, ds: xr.Dataset) -> None:
+    from pipeline import report
+
+    for line in lines:
+        typer.echo(line)
+    if csv is not None:
+        typer.echo(f"table: {report.write_csv(rows, csv)}")
+    if "source" in ds.encoding:
+        typer.echo(f"stored: {ds.encoding['source']}")
