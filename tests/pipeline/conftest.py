@@ -168,3 +168,22 @@ def start(tmp_path, environment):
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
+
+
+@pytest.fixture
+def main(monkeypatch, tmp_path, capsys):
+    """Call the command line in this process; returns exit code, output and errors."""
+    from pipeline.cli import main as entry
+
+    def call(*arguments):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["magpend", *map(str, arguments)])
+        code = 0
+        try:
+            entry()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call

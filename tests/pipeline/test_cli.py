@@ -29,7 +29,7 @@ def test_help__is_light(environment):
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert found.stdout.splitlines()[-1] == "[]"
-    for command in ("run", "status", "verify", "plot", "simulate", "presets"):
+    for command in ("run", "status", "verify", "analyse", "plot", "simulate", "presets"):
         assert command in found.stdout
 
 
@@ -64,6 +64,9 @@ def test_run__bad_spec_creates_nothing(magpend, write_spec, tmp_path, option):
         ["run", "spec.toml", "--smoke"],
         ["status", "."],
         ["verify", "."],
+        ["analyse", ".", "attractors"],
+        ["analyse", ".", "basins", "--box", "x"],
+        ["analyse", ".", "nonsense"],
         ["plot", "bifurcation", "."],
         ["plot", "bifurcation", ".", "--state", "psi3"],
         ["plot", "bifurcation", ".", "--out", "a.gif"],
@@ -85,25 +88,6 @@ def test_bad_input__refused_without_a_trace(main, write_spec, sweep_text, tmp_pa
     assert code == Exit.REFUSED
     assert err
     assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.fixture
-def main(monkeypatch, tmp_path, capsys):
-    """Call the command line in this process; returns exit code, output and errors."""
-    from pipeline.cli import main as entry
-
-    def call(*arguments):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["magpend", *map(str, arguments)])
-        code = 0
-        try:
-            entry()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
 
 
 def test_run__dry_run_creates_nothing(main, write_spec, sweep_text, tmp_path):
