@@ -91,8 +91,9 @@ def basins(
     result = cells.assign(n_periods=ds["n_periods"].transpose(*dims, *start_dims).load())
     labels = outcomes(ids)
     fractions = basin_fractions(
-        labels, dims=start_dims, ids=ids["attractor"].values.tolist(), confidence=confidence, method=interval
-    )
+        labels, dims=start_dims, ids=ids["attractor"].values.tolist(),
+        inferred=ids["status"] == Status.INFERRED, confidence=confidence, method=interval,
+    )  # fmt: skip
     result = result.assign(fractions.data_vars).assign(_unfinished(ids, start_dims))
     result = result.assign_coords(label=fractions["label"])
     reason = _no_grid(ds, start_dims)
