@@ -1,6 +1,7 @@
 """Physics and kernels of magpend: the forced double pendulum with magnets, many at a time."""
 
 from magpend_core.jit import source_digest as kernel_version
+from magpend_core.lyapunov import LyapunovExponents, lyapunov_exponents
 from magpend_core.model import Torques, accelerations, energy, jacobian, torques
 from magpend_core.orbits import PeriodicOrbits, polish_orbits
 from magpend_core.parameters import ParameterError, Parameters, load_preset, preset_names, preset_provenance
@@ -9,6 +10,7 @@ from magpend_core.status import Status
 from magpend_core.trajectory import trajectory
 
 __all__ = [
+    "LyapunovExponents",
     "ParameterError",
     "Parameters",
     "PeriodicOrbits",
@@ -20,6 +22,7 @@ __all__ = [
     "jacobian",
     "kernel_version",
     "load_preset",
+    "lyapunov_exponents",
     "polish_orbits",
     "preset_names",
     "preset_provenance",

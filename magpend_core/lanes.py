@@ -68,7 +68,7 @@ SHRINK = 0.2
 GROW = 5.0
 
 # events that the vector part leaves for the scalar pass
-NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW = 0.0, 1.0, 2.0, 3.0
+NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW, DUE = 0.0, 1.0, 2.0, 3.0, 4.0
 PENDING, DIVERGED = int(Status.PENDING), int(Status.DIVERGED)
 STEP_LIMIT, STEP_UNDERFLOW = int(Status.STEP_LIMIT), int(Status.STEP_UNDERFLOW)
 UNREACHED = int(Status.UNREACHED)
@@ -226,6 +226,9 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
     event = where_less(0.5, arrived, REACHED, where_less(max_attempts, attempts, TOO_MANY_STEPS, NOTHING))
     tiny = 1e-15 * load(w, base + ROWS.period)
     event = where_less(next_wish, tiny, UNDERFLOW, event)
+    if REWRITES:
+        last = load(w, base + ROWS.state + (N - 1) * WIDTH)
+        event = where_less(event, 0.5, where_less(last, RENEW_BELOW, DUE, event), event)
     store(w, base + ROWS.event, event)
 
 
@@ -323,6 +326,16 @@ def move_lane(w: Any, source: int, target: int) -> None:
     b = (target // WIDTH) * ROWS.size + target % WIDTH
     for row in range(0, ROWS.size, WIDTH):
         w[b + row] = w[a + row]
+
+
+def renew_state(w: Any, base: int, lane: int, state: Any, memory: Any, settings: Any) -> None:
+    """Let the observer rewrite a lane's state."""
+    for i in range(N):
+        state[i] = w[base + ROWS.state + i * WIDTH + lane]
+    renew(state, memory, settings)
+    for i in range(N):
+        w[base + ROWS.state + i * WIDTH + lane] = state[i]
+    w[base + ROWS.fresh + lane] = 1.0
 
 
 class Work(NamedTuple):
@@ -431,6 +444,10 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     event = w[base + ROWS.event + column]
     w[base + ROWS.event + column] = NOTHING
     status = PENDING
+    if REWRITES and (event == REACHED or event == DUE):
+        renew_state(w, base, column, section, work.memory[lane], settings)
+        if event == DUE:
+            return False
     if event == REACHED:
         if work.edge[lane] < NE:
             work.edge[lane] = begin_segment(w, base, column, work.edge_table[lane], work.edge[lane] + 1)
@@ -514,7 +531,7 @@ def copy_lane(work: Work, source: int, target: int) -> None:
 
 _INLINE = (
     "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period",
-    "in_bounds", "take_section", "move_lane", "has_failed",
+    "in_bounds", "take_section", "renew_state", "move_lane", "has_failed",
 )  # fmt: skip
 _CALLED = (
     "choose_step", "run_stage", "finish_step", "attempt",
@@ -532,6 +549,8 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
         "NC": system.n_constants,
         "NE": system.n_edges,
         "HAS_LAYERS": system.has_layers,
+        "REWRITES": observer.rewrites,
+        "RENEW_BELOW": observer.renew_below,
         "IS_ANGLE": system.is_angle,
         "SCALES": system.scales,
         "ESCAPE": system.escape,
@@ -546,6 +565,7 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
     for key in observers.HELPERS:
         bindings[key] = inline(specialise(getattr(observers, key), name, **bindings))
     bindings["observe"] = inline(specialise(observer.observe, name, **bindings))
+    bindings["renew"] = inline(specialise(observer.renew, name, **bindings))
     for key in (*_INLINE, *_CALLED):
         function = specialise(globals()[key], name, **bindings)
         bindings[key] = inline(function) if key in _INLINE else njit(**OPTIONS)(function)
@@ -556,5 +576,5 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
 def engine_of(system: System, observer: Observer) -> Callable[..., None]:
     """Compile `advance` for a system and an observer."""
     bindings = engine_bindings(system, observer)
-    cached = is_covered(*system.functions, observer.observe, observer.memory_size)
+    cached = is_covered(*system.functions, observer.observe, observer.memory_size, observer.renew)
     return kernel(specialise(advance, f"{system.label}_{observer.name}", **bindings), cached)

@@ -7,12 +7,17 @@ An observer is a pair of functions bound at compile time.
     (-pi, pi]; `turns` counts the full turns of each angle since the branch's start; `memory` is the
     cell's own scratch vector, zero at the start; `record` (n_keep, n_states) and `measures` are the
     cell's outputs. Returns ``PENDING`` to go on, any other status to end the cell.
-``memory_size(settings) -> int``
+``memory_size(settings, n_states) -> int``
     Length of `memory`.
+``renew(state, memory, settings)``, only where an observer rewrites states
+    Called at each edge of the forcing within a period, after a step that leaves the last state below
+    `renew_below`, and before `observe` at the period's end; the trajectory goes on from what it makes
+    of `state`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -39,14 +44,25 @@ class Settings(NamedTuple):
     window: int
 
 
+def _leave(state: Any, memory: Any, settings: Any) -> None:
+    """Rewrite nothing."""
+
+
 @dataclass(frozen=True)
 class Observer:
-    """A named pair of functions for the engine, with values for free names in the first."""
+    """Named functions for the engine, with values for free names in them."""
 
     name: str
     observe: Callable[..., int]
     memory_size: Callable[..., int]
     bindings: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    renew: Callable[..., None] = _leave
+    renew_below: float = -math.inf
+
+    @property
+    def rewrites(self) -> bool:
+        """Whether `renew` does anything."""
+        return self.renew is not _leave
 
 
 HELPERS = ("_lag_distance", "_largest_lag", "_smallest_divisor", "closed_period")

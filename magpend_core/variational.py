@@ -42,7 +42,7 @@ def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict
 
 
 @cache
-def with_tangents(system: System, n_vectors: int) -> System:
+def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> System:
     """Return `system` extended by `n_vectors` tangent vectors.
 
     Parameters
@@ -51,11 +51,14 @@ def with_tangents(system: System, n_vectors: int) -> System:
         What is linearised; needs its `jacobian`.
     n_vectors
         1 to ``system.n_states``.
+    divergence
+        Whether one more state, the last, integrates the trace of the Jacobian: the logarithm of the
+        factor by which the flow changes volumes.
 
     Returns
     -------
     System
-        With n_states (1 + n_vectors) states.
+        With n_states (1 + n_vectors) states, and one more for the divergence.
 
     Raises
     ------
@@ -66,12 +69,13 @@ def with_tangents(system: System, n_vectors: int) -> System:
     if not 1 <= n_vectors <= n:
         raise ValueError(f"n_vectors = {n_vectors} is out of bounds: it must be between 1 and {n}.")
     bindings = {"_rhs": system.rhs, "_jacobian": system.jacobian, "_layers": system.layers}
+    trace = ", " + " + ".join(f"jacobian[{i * n + i}]" for i in range(n)) if divergence else ""
     rhs = _compile(
         f"def rhs(y, u, c):\n"
         f"    base = ({_first(n)},)\n"
         f"    jacobian = _jacobian(base, u, c)\n"
         f"    dy = _rhs(base, u, c)\n"
-        f"    return ({', '.join(f'dy[{i}]' for i in range(n))}, {_products(n, n_vectors)})\n",
+        f"    return ({', '.join(f'dy[{i}]' for i in range(n))}, {_products(n, n_vectors)}{trace})\n",
         "rhs",
         system.rhs,
         bindings,
@@ -83,13 +87,14 @@ def with_tangents(system: System, n_vectors: int) -> System:
         system.layers,
         bindings,
     )
-    entries = n * n_vectors
+    entries = n * n_vectors + divergence
     return dataclasses.replace(
         system,
-        name=f"{system.name}_tangents{n_vectors}",
+        name=f"{system.name}_tangents{n_vectors}" + ("_divergence" if divergence else ""),
         state_names=(
             *system.state_names,
             *(f"d{s}_{k}" for k in range(n_vectors) for s in system.state_names),
+            *["divergence"] * divergence,
         ),
         is_angle=(*system.is_angle, *[False] * entries),
         scales=(*system.scales, *[1.0] * entries),

@@ -4,7 +4,7 @@ numba has no vector math library, so ``math.exp`` in a kernel is a call into lib
 and its last bit depends on the machine. The functions here are made of additions, products, at most
 one division and selects; they take a float64 or a group of lanes (see `simd`).
 
-Accuracy: the largest errors, in units in the last place, are below 1 for `exp`, 1.6 for `sincos`, 2
+Accuracy: the largest errors, in units in the last place, are below 1 for `exp` and `log`, 1.6 for `sincos`, 2
 for `sin` and 3.5 for `atan` (between 0.41 and 0.55; 1.6 elsewhere), measured against 40-digit arithmetic
 in ``tests/core/test_vecmath.py``. Next to their zeros beyond the first the sines are off by up to
 3e-27 times the argument, which there is more. The polynomials interpolate in Chebyshev nodes, with
@@ -47,6 +47,7 @@ _PI_1 = 2.0 * _PIO2_1
 _PI_2ND = 2.0 * _PIO2_2
 _TAN_PI_8 = 0.41421356237309503
 _TAN_3PI_8 = 2.414213562373095
+_SQRT_2 = math.sqrt(2.0)
 _PI_2 = math.pi / 2
 _PI_4 = math.pi / 4
 
@@ -135,6 +136,27 @@ def atan(x: Any) -> Any:
     p = p * u + 0.19999999999898407
     p = p * u - 0.3333333333333325
     return copysign(base + (w + (w * u) * p), x)
+
+
+@inline
+def log(x: Any) -> Any:
+    """Natural logarithm of a positive normal number."""
+    m = mantissa(x)
+    halve = where_less(_SQRT_2, m, 1.0, 0.0)
+    k = binary_exponent(x) + halve
+    f = m * (1.0 - 0.5 * halve) - 1.0
+    # log(1 + f) = 2 artanh(s) with s = f/(2 + f); coefficients of fdlibm
+    s = f / (2.0 + f)
+    u = s * s
+    p = 0.14798198605116586
+    p = p * u + 0.15313837699209373
+    p = p * u + 0.1818357216161805
+    p = p * u + 0.22222198432149784
+    p = p * u + 0.2857142874366239
+    p = p * u + 0.3999999999940942
+    p = p * u + 0.6666666666666735
+    half = 0.5 * f * f
+    return k * _LN2_HIGH - ((half - (s * (half + u * p) + k * _LN2_LOW)) - f)
 
 
 @inline

@@ -1,5 +1,6 @@
 """What the tests of the core share: reference numbers, parameter sets, a second system, subprocesses."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -112,6 +113,25 @@ def oscillator():
         jacobian=_oscillator_jacobian,
         escape=(1e3, 1e3, 1e6, 1e6, 1e6, 1e6),
         has_layers=False,
+    )
+
+
+@inline
+def _duffing_rhs(y, u, c):
+    return (y[1], u - c[0] * y[1] - c[1] * y[0] - c[2] * y[0] * y[0] * y[0])
+
+
+@pytest.fixture(scope="session")
+def duffing(oscillator):
+    """The same oscillator without the derivatives."""
+    return dataclasses.replace(
+        oscillator,
+        name="forced_oscillator_alone",
+        state_names=("x", "v"),
+        is_angle=(False, False),
+        scales=(1.0, 1.0),
+        rhs=_duffing_rhs,
+        escape=(1e3, 1e3),
     )
 
 

@@ -11,8 +11,19 @@ from magpend_core import vecmath
 from magpend_core.jit import OPTIONS
 from magpend_core.simd import WIDTH, load, store
 
-NAMES = ("exp", "sine of sincos", "cosine of sincos", "sin", "atan", "log2_rough", "exp2_rough", "wrapped")
+NAMES = (
+    "exp",
+    "sine of sincos",
+    "cosine of sincos",
+    "sin",
+    "atan",
+    "log2_rough",
+    "exp2_rough",
+    "wrapped",
+    "log",
+)
 exp, sincos, sin, atan = vecmath.exp, vecmath.sincos, vecmath.sin, vecmath.atan
+log = vecmath.log
 log2_rough, exp2_rough, wrapped = vecmath.log2_rough, vecmath.exp2_rough, vecmath.wrapped
 
 
@@ -30,12 +41,13 @@ def _of_lanes(x, out):
         store(out, 5 * n + i, log2_rough(v))
         store(out, 6 * n + i, exp2_rough(v))
         store(out, 7 * n + i, wrapped(v))
+        store(out, 8 * n + i, log(v))
 
 
 @njit(**OPTIONS)
 def _of_number(v):
     sine, cosine = sincos(v)
-    return exp(v), sine, cosine, sin(v), atan(v), log2_rough(v), exp2_rough(v), wrapped(v)
+    return exp(v), sine, cosine, sin(v), atan(v), log2_rough(v), exp2_rough(v), wrapped(v), log(v)
 
 
 def evaluate(x):
@@ -70,6 +82,7 @@ CASES = {
     "sine of sincos": (mpmath.sin, 1.6, SINE_RANGES),
     "cosine of sincos": (mpmath.cos, 1.6, SINE_RANGES),
     "sin": (mpmath.sin, 2.0, SINE_RANGES),
+    "log": (mpmath.log, 1.0, ((0.5, 2.0), (0.99, 1.01), (1e-6, 1e6), (1e-300, 1e-290))),
     "atan": (mpmath.atan, 3.5, ((-0.42, 0.42), (0.414, 0.436), (-3.0, 3.0), (-1e3, 1e3), (-1e-6, 1e-6))),
 }
 
@@ -107,8 +120,8 @@ def test_vecmath__numbers_and_lanes_have_the_same_bits():
     numbers = np.array([_of_number(v) for v in x]).T
     positive = x > 0.0
     assert (lanes[:, positive].view(np.int64) == numbers[:, positive].view(np.int64)).all()
-    # the logarithm is for positive numbers only
-    rest = np.array([name != "log2_rough" for name in NAMES])
+    # logarithms are for positive numbers only
+    rest = np.array([name not in ("log2_rough", "log") for name in NAMES])
     assert (lanes[rest][:, ~positive].view(np.int64) == numbers[rest][:, ~positive].view(np.int64)).all()
 
 
@@ -152,6 +165,13 @@ def test_nan__stays_nan_in_sines_and_atan():
     values = evaluate([np.nan])
     for name in ("sine of sincos", "cosine of sincos", "sin", "atan", "wrapped"):
         assert np.isnan(values[name]).all(), name
+
+
+def test_log__over_all_magnitudes():
+    x = np.concatenate([10.0 ** points((-300.0, 300.0)), [1.0]])
+    values = evaluate(x)["log"]
+    assert worst_ulps(x[:-1], values[:-1], mpmath.log) < 1.0
+    assert values[-1] == 0.0
 
 
 def test_log2_rough__is_within_5e_4():
