@@ -12,6 +12,7 @@ import typer
 from pipeline.cli_analyse import analyse_app
 from pipeline.cli_common import EXIT_HELP, Directory, read_pairs
 from pipeline.cli_plot import check_figure_path, draw_bifurcation, plot_app
+from pipeline.cli_zoom import zoom
 from pipeline.exits import Exit
 
 app = typer.Typer(
@@ -25,6 +26,7 @@ app = typer.Typer(
 )
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(plot_app, name="plot")
+app.command(epilog=EXIT_HELP)(zoom)
 
 
 def _version(wanted: bool) -> None:

@@ -25,8 +25,11 @@ RTOL_OF_RULE = 1e-8
 ROOT = 6
 """The time grows with the sixth root of 1/rtol."""
 
-LEAST_LATTICE = 16
-"""Tiles of a refined grid have at least this many cells of the first lattice, where the grid has them."""
+LEAST_LATTICE = 64
+"""Tiles of a refined grid have about this many cells of the first lattice, where 64 MB hold them.
+
+A boundary is followed within a tile, not from one to the next: small tiles overlook more.
+"""
 
 LANES = 16
 """Trajectories per task come in multiples of this, so that the kernel's lanes are full."""
@@ -142,7 +145,8 @@ def make_plan(spec: Spec) -> Plan:
     else:
         grid = cells.shape[len(spec.axes) :]
         if spec.execution.trajectories_per_task is None:
-            wanted = max(wanted, LEAST_LATTICE * spec.refine ** len(grid))
+            most = TASK_BYTES // _bytes_per_cell(spec)
+            wanted = max(wanted, min(LEAST_LATTICE * spec.refine ** len(grid), most))
         block = (*(1 for _ in spec.axes), *_tile(grid, spec.refine, wanted))
     return Plan(spec.kind, cells.dims, cells.shape, cells.path, block, spec.integration.n_keep, seconds)
 
@@ -160,10 +164,15 @@ def _seconds_per_cell(spec: Spec) -> float:
 def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:
     """Trajectories per task."""
     wanted_seconds = min(max(n_cells * seconds_per_cell / WANTED_TASKS, LEAST_SECONDS), MOST_SECONDS)
-    per_cell = sum(v.itemsize(own_sizes(spec.integration.n_keep)) for v in VARIABLES)
+    per_cell = _bytes_per_cell(spec)
     limit = CHUNK_BYTES if n_points == 1 else TASK_BYTES
     n = min(wanted_seconds / (seconds_per_cell * n_points), limit / (per_cell * n_points))
     return max(1, round(n / LANES)) * LANES
+
+
+def _bytes_per_cell(spec: Spec) -> int:
+    """Bytes of a cell's variables, uncompressed."""
+    return sum(v.itemsize(own_sizes(spec.integration.n_keep)) for v in VARIABLES)
 
 
 def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, ...]:
