@@ -1,0 +1,158 @@
+"""Pseudo-arclength continuation of the solutions of a problem (Keller 1977).
+
+The predictor is a step along the tangent, the corrector is Newton's method in the plane normal to it, so
+that folds in the parameter are nothing special. Unknowns are scaled; lengths are Euclidean in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipeline.analysis.branches.lockstep import Query, Steps
+from pipeline.analysis.branches.problems import Problem, Value
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """How to walk.
+
+    Attributes
+    ----------
+    first_step, longest_step, shortest_step : float
+        Arclengths; below the shortest a walk ends.
+    max_points : int
+        Points of one walk.
+    tolerance : float
+        Largest scaled residual of a point.
+    max_iterations : int
+        Newton steps before a step is halved.
+    largest_turn : float
+        Largest angle between neighbouring tangents [rad].
+    """
+
+    first_step: float = 1e-3
+    longest_step: float = 5e-3
+    shortest_step: float = 1e-7
+    max_points: int = 4000
+    tolerance: float = 1e-10
+    max_iterations: int = 6
+    largest_turn: float = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A solution: unknowns, unit tangent, the problem's value there, Newton steps taken."""
+
+    u: np.ndarray
+    tangent: np.ndarray
+    value: Value
+    n_iterations: int
+
+    @property
+    def residual(self) -> float:
+        """Largest scaled residual."""
+        return float(np.abs(self.value.residual).max())
+
+
+@dataclass(eq=False)
+class Walk:
+    """Points in their order, and why there are no more."""
+
+    points: list[Point] = field(default_factory=list)
+    end: str = ""
+
+
+def correct(
+    problem: Problem, guess: np.ndarray, normal: np.ndarray, settings: Settings, along: np.ndarray | None = None
+) -> Steps[Point | None]:
+    """Find the solution in the plane through `guess` with this normal; None if Newton's method fails.
+
+    The point's tangent goes along `along`, by default along the normal.
+    """
+    u = guess.copy()
+    last = np.inf
+    for iteration in range(settings.max_iterations + 1):
+        value = yield Query(problem, u)
+        if not value.is_finite:
+            return None
+        residual = float(np.abs(value.residual).max())
+        if residual <= settings.tolerance:
+            tangent = tangent_of(value, normal if along is None else along)
+            return None if tangent is None else Point(u, tangent, value, iteration)
+        if residual > 2.0 * last or iteration == settings.max_iterations:
+            return None
+        last = residual
+        matrix = np.vstack([value.derivative, normal])
+        right = np.append(-value.residual, -normal @ (u - guess))
+        try:
+            step = np.linalg.solve(matrix, right)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.abs(step).max() < 0.5:
+            return None
+        u = u + step
+    return None
+
+
+def tangent_of(value: Value, along: np.ndarray) -> np.ndarray | None:
+    """Unit vector of the kernel of the derivative with a positive product with `along`."""
+    matrix = np.vstack([value.derivative, along])
+    right = np.zeros(len(matrix))
+    right[-1] = 1.0
+    try:
+        tangent = np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        return None
+    length = np.linalg.norm(tangent)
+    return tangent / length if np.isfinite(length) else None
+
+
+def kernel_of(value: Value) -> np.ndarray:
+    """Unit vector of the kernel of the derivative, of either sign."""
+    return np.asarray(np.linalg.svd(value.derivative)[2][-1])
+
+
+Between = Callable[[Point, Point], "Steps[bool]"]
+"""What is done between two neighbouring points; False asks for a shorter step."""
+
+Stop = Callable[[list[Point]], str]
+"""Looks at the points so far; a word ends the walk."""
+
+
+def walk(problem: Problem, start: Point, settings: Settings, stop: Stop, between: Between) -> Steps[Walk]:
+    """Follow the solutions from a point along its tangent.
+
+    `between` may refuse a step, which is then tried with half the length; `stop` is asked after every
+    point. The start is the first of the points.
+    """
+    found = Walk([start])
+    step = settings.first_step
+    while len(found.points) < settings.max_points:
+        here = found.points[-1]
+        there = yield from correct(problem, here.u + step * here.tangent, here.tangent, settings)
+        if there is None or not _is_near(here, there, step, settings) or not (yield from between(here, there)):
+            step *= 0.5
+            if step < settings.shortest_step:
+                found.end = "stuck"
+                return found
+            continue
+        found.points.append(there)
+        found.end = stop(found.points)
+        if found.end:
+            return found
+        if there.n_iterations <= 3:
+            step = min(1.5 * step, settings.longest_step)
+        elif there.n_iterations > 4:
+            step *= 0.7
+    found.end = "max_points"
+    return found
+
+
+def _is_near(here: Point, there: Point, step: float, settings: Settings) -> bool:
+    """Whether the step stayed on the curve: little turned, and little corrected."""
+    cosine = float(here.tangent @ there.tangent)
+    moved = np.linalg.norm(there.u - here.u - step * here.tangent)
+    return cosine >= np.cos(settings.largest_turn) and bool(moved <= 0.5 * step)

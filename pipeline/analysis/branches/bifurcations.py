@@ -1,0 +1,186 @@
+"""Bifurcations on a branch of orbits: noticed by test functions, located by regula falsi with bisection."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pipeline.analysis.branches.arclength import Point, Settings, correct
+from pipeline.analysis.branches.lockstep import Steps
+from pipeline.analysis.branches.problems import OrbitProblem, doubling_test, torus_test
+
+FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", "branch_point"
+KINDS = (FOLD, DOUBLING, TORUS, BRANCHING)
+
+WIDTH = 1e-8
+"""Arclength to which a bifurcation is bracketed; the parameter changes by less, in its scale."""
+
+Test = Callable[[Point], float]
+
+
+def multipliers_of(point: Point) -> np.ndarray:
+    """Floquet multipliers by falling modulus."""
+    found = np.linalg.eigvals(point.value.monodromy)
+    return found[np.argsort(-np.abs(found), kind="stable")]
+
+
+def n_unstable(point: Point) -> int:
+    """Number of multipliers outside the unit circle."""
+    return int((np.abs(np.linalg.eigvals(point.value.monodromy)) > 1.0).sum())
+
+
+def _branching_test(point: Point) -> float:
+    return float(np.linalg.det(np.vstack([point.value.derivative, point.tangent])))
+
+
+TESTS: dict[str, Test] = {
+    FOLD: lambda point: float(point.tangent[-1]),
+    DOUBLING: lambda point: doubling_test(point.value.monodromy),
+    TORUS: lambda point: torus_test(point.value.monodromy),
+    BRANCHING: _branching_test,
+}
+"""Functions of a point that change their sign at a bifurcation.
+
+A fold turns the tangent back in the parameter. At a branch point (pitchfork, transcritical) the equations
+and the tangent are dependent.
+"""
+
+
+@dataclass(eq=False)
+class Bifurcation:
+    """A located bifurcation.
+
+    Attributes
+    ----------
+    kind : str
+        One of `KINDS`.
+    point : Point
+        The orbit there.
+    bracket : float
+        Distance of the parameter values between which the test function changes its sign.
+    n_unstable_before, n_unstable_after : int
+        Multipliers outside the unit circle on both sides, in the order of the branch.
+    after : int
+        Index of the point of the branch after which it comes.
+    criticality : str
+        Of a period doubling whose branch was followed: ``supercritical`` if the doubled orbits lie where
+        the orbit is less stable, else ``subcritical``.
+    child : Branch or None
+        The other branch through it, if that is known.
+    """
+
+    kind: str
+    point: Point
+    bracket: float
+    n_unstable_before: int
+    n_unstable_after: int
+    after: int = -1
+    criticality: str = ""
+    child: Any = None
+
+    @property
+    def critical_multiplier(self) -> complex:
+        """The multiplier on the unit circle; of a complex pair the one with positive imaginary part."""
+        multipliers = multipliers_of(self.point)
+        if self.kind == TORUS:
+            upper = multipliers[multipliers.imag > 0.0]
+            return complex(upper[np.argmin(np.abs(np.abs(upper) - 1.0))])
+        target = -1.0 if self.kind == DOUBLING else 1.0
+        return complex(multipliers[np.argmin(np.abs(multipliers - target))])
+
+
+_CHANGES = {FOLD: 1, DOUBLING: 1, TORUS: 2, BRANCHING: 1}
+
+
+@dataclass(eq=False)
+class Watch:
+    """Looks for bifurcations between neighbouring points of a walk and keeps those that it locates."""
+
+    problem: OrbitProblem
+    settings: Settings
+    skip_first: bool = False
+    found: list[Bifurcation] = field(default_factory=list)
+    n_steps: int = 0
+
+    def between(self, a: Point, b: Point) -> Steps[bool]:
+        """Locate what lies between two points; False if the change of stability is not explained by it."""
+        if self.skip_first and self.n_steps == 0:
+            self.n_steps += 1
+            return True
+        kinds = [kind for kind in KINDS if TESTS[kind](a) * TESTS[kind](b) < 0.0]
+        long = np.linalg.norm(b.u - a.u) > 100.0 * self.settings.shortest_step
+        if long and not _explains(kinds, n_unstable(b) - n_unstable(a)):
+            return False
+        located = []
+        for kind in kinds:
+            one = yield from locate(self.problem, a, b, kind, self.settings)
+            if one is None and long:
+                return False
+            if one is not None:
+                one.after = self.n_steps
+                located.append(one)
+        self.found += _tell_apart(located, a)
+        self.n_steps += 1
+        return True
+
+
+def _explains(kinds: list[str], change: int) -> bool:
+    """Whether some of these bifurcations can change the number of unstable multipliers so."""
+    reachable = {0}
+    for kind in kinds:
+        step = _CHANGES[kind]
+        # a fold or a torus test may also be a neutral saddle or a fold without a change of this count
+        reachable = {r + s for r in reachable for s in (-step, 0, step)}
+    return change in reachable
+
+
+def locate(problem: OrbitProblem, a: Point, b: Point, kind: str, settings: Settings) -> Steps[Bifurcation | None]:
+    """Find where a test function vanishes between two points; None if an orbit between is not found."""
+    test = TESTS[kind]
+    chord = b.u - a.u
+    length = float(np.linalg.norm(chord))
+    low, high = (0.0, a, test(a)), (1.0, b, test(b))
+    weights = [low[2], high[2]]  # Illinois: the value of an end that stays twice is halved
+    least = WIDTH / length
+    for trial in range(60):
+        if high[0] - low[0] <= least:
+            break
+        share = weights[0] / (weights[0] - weights[1]) if trial % 3 < 2 else 0.5
+        at = low[0] + share * (high[0] - low[0])
+        # a guess very near an end would leave the bracket wide: step over the root
+        at = min(max(at, low[0] + 0.4 * least), high[0] - 0.4 * least)
+        middle = yield from correct(problem, a.u + at * chord, chord / length, settings, along=a.tangent)
+        if middle is None:
+            return None
+        value = test(middle)
+        if value * low[2] > 0.0:
+            low, weights = (at, middle, value), [value, 0.5 * weights[1]]
+        else:
+            high, weights = (at, middle, value), [0.5 * weights[0], value]
+    scale = problem.family.scales[0]
+    bracket = abs(high[1].u[-1] - low[1].u[-1]) * scale
+    nearest = low if abs(low[2]) <= abs(high[2]) else high
+    return Bifurcation(kind, nearest[1], float(bracket), n_unstable(low[1]), n_unstable(high[1]))
+
+
+def _tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
+    """Drop neutral saddles and the folds that are branch points; order along the branch."""
+    branching = [one.point.u for one in located if one.kind == BRANCHING]
+    kept = []
+    for one in located:
+        if one.kind == TORUS and not _is_torus(one):
+            continue
+        if one.kind == FOLD and any(np.abs(one.point.u - u).max() < 1e-5 for u in branching):
+            continue
+        kept.append(one)
+    return sorted(kept, key=lambda one: float(a.tangent @ (one.point.u - a.u)))
+
+
+def _is_torus(one: Bifurcation) -> bool:
+    """Whether the pair with product 1 is complex; a real pair is a neutral saddle, no bifurcation."""
+    multipliers = multipliers_of(one.point)
+    complex_pairs = multipliers[multipliers.imag > 0.0]
+    return bool(len(complex_pairs)) and bool(np.abs(np.abs(complex_pairs) - 1.0).min() < 1e-4)

@@ -1,0 +1,296 @@
+"""All branches that hang together with some orbits: followed, switched at period doublings, none twice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipeline.analysis.branches.arclength import Point, Settings, correct
+from pipeline.analysis.branches.bifurcations import BRANCHING, DOUBLING, Bifurcation
+from pipeline.analysis.branches.following import (
+    Branch,
+    crossing_tangent,
+    doubled_start,
+    first_point,
+    half_branch,
+    joined,
+    opposite,
+)
+from pipeline.analysis.branches.lockstep import Steps, run_together
+from pipeline.analysis.branches.problems import Family, OrbitProblem
+
+SAME = 1e-6
+"""Scaled distance within which two orbits at one parameter value are the same."""
+
+GUESS = 0.05
+"""Scaled distance from the chord of a branch within which an orbit may lie on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """An orbit to begin with: its family, a section point, the parameter's value."""
+
+    family: Family
+    state: np.ndarray
+    value: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """What is looked at.
+
+    Attributes
+    ----------
+    low, high : float
+        Interval of the parameter.
+    max_period : int
+        Longest period of a branch [drive periods].
+    max_generations : int
+        How often branches spring from branches.
+    settings : Settings
+    """
+
+    low: float
+    high: float
+    max_period: int = 8
+    max_generations: int = 3
+    settings: Settings = field(default_factory=Settings)
+
+
+def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
+    """Follow the branches of all starts, and those that spring from them.
+
+    Returns
+    -------
+    list of Branch
+        Those of the starts in their order, then one generation after the other.
+    """
+    branches: list[Branch] = []
+    _follow_starts(starts, branches, scope)
+    fresh = list(branches)
+    for _ in range(scope.max_generations):
+        orphans = _adopt(branches, fresh, scope)
+        n_known = len(branches)
+        _follow_starts(orphans, branches, scope)
+        _switch(branches, scope)
+        fresh = branches[n_known:]
+        if not fresh:
+            break
+    _adopt(branches, fresh, scope)
+    return branches
+
+
+def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope) -> None:
+    """Append the branches of those starts that lie on none yet; starts of one parameter value together."""
+    for value in dict.fromkeys(start.value for start in starts):
+        group = [s for s in starts if s.value == value and s.family.period <= scope.max_period]
+        known = _lie_on(group, branches)
+        group = [s for s, is_known in zip(group, known, strict=True) if not is_known]
+        for start, branch in zip(group, _both_ways(group, scope), strict=True):
+            if branch is not None and not _lie_on([start], branches)[0]:
+                branches.append(branch)
+
+
+def _both_ways(starts: Sequence[Start], scope: Scope) -> list[Branch | None]:
+    firsts = run_together(
+        [
+            first_point(OrbitProblem(s.family), s.family.unknowns(s.state, [s.value]), scope.settings)
+            for s in starts
+        ]
+    )
+    pairs = [(s.family, p) for s, p in zip(starts, firsts, strict=True) if p is not None]
+    halves = run_together(
+        [
+            half_branch(family, way, scope.low, scope.high, scope.settings)
+            for family, point in pairs
+            for way in (opposite(point), point)
+        ]
+    )
+    found = iter(
+        joined(family, *halves[2 * i : 2 * i + 2]) for i, (family, _) in enumerate(pairs)
+    )
+    return [None if p is None else next(found) for p in firsts]
+
+
+def _lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
+    """Whether each start is an orbit of one of the branches."""
+    asked = [(i, guess) for i, s in enumerate(starts) for b in branches for guess in _near(s, b)]
+    settings = Settings()
+    found = run_together([_at_value(starts[i].family, guess, settings) for i, guess in asked])
+    known = [False] * len(starts)
+    for (i, _), point in zip(asked, found, strict=True):
+        if point is not None and _distance(starts[i], point) <= SAME:
+            known[i] = True
+    return known
+
+
+def _at_value(family: Family, guess: np.ndarray, settings: Settings) -> Steps[Point | None]:
+    normal = np.zeros(len(guess))
+    normal[-1] = 1.0
+    found = yield from correct(OrbitProblem(family), guess, normal, settings)
+    return found
+
+
+def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
+    """Points between those of a branch at the start's parameter value that are near its orbit."""
+    family = branch.family
+    if family.period != start.family.period or not _same_others(family, start.family):
+        return
+    values = branch.values
+    for i in np.flatnonzero((values[:-1] - start.value) * (values[1:] - start.value) <= 0.0):
+        width = values[i + 1] - values[i]
+        share = (start.value - values[i]) / width if width else 0.0
+        a, b = branch.points[i], branch.points[i + 1]
+        guess = a.u + share * (b.u - a.u)
+        guess[-1] = start.value / family.scales[0]
+        orbits = [p.value.images for p in (a, b)]
+        if min(np.abs(family.mismatch(family.unknowns(start.state, [0.0]), x)).max() for o in orbits for x in o) < GUESS:
+            yield guess
+
+
+def _same_others(a: Family, b: Family) -> bool:
+    """Whether two families differ in the free parameter at most."""
+    return a.free == b.free and np.array_equal(_fixed(a), _fixed(b))
+
+
+def _fixed(family: Family) -> np.ndarray:
+    values = np.append(family.parameters, family.frequency_hz)
+    names = (*family.system.parameter_names, "frequency_hz")
+    return np.array([v for n, v in zip(names, values, strict=True) if n not in family.free])
+
+
+def _distance(start: Start, point: Point) -> float:
+    """Scaled distance of a start from the nearest section point of an orbit."""
+    here = start.family.unknowns(start.state, [0.0])
+    return min(float(np.abs(start.family.mismatch(here, x)).max()) for x in point.value.images)
+
+
+# ---- switching ---------------------------------------------------------------------------------
+
+
+def _adopt(branches: list[Branch], fresh: Sequence[Branch], scope: Scope) -> list[Start]:
+    """Tie branches that end on orbits of half their period to the period doubling there.
+
+    Returns orbits of half the period, as starts, for ends at which no doubling is known.
+    """
+    orphans = []
+    for branch in fresh:
+        for which in (0, 1):
+            if branch.ends[which] != "period_halving":
+                continue
+            at = _doubling_at(branches, branch, which)
+            if at is None:
+                orphans.append(_half_orbit(branch, which))
+                continue
+            ends = list(branch.ends)
+            ends[which] = "start" if at.child is None else "period_halving"
+            if at.child is None:
+                at.child = branch
+                branch.origin = branch.origin or at
+                at.criticality = _criticality(at, branch, -1 if which else 0)
+    return orphans
+
+
+def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifurcation | None:
+    """The nearest period doubling of half the period, within a few steps of the branch's end."""
+    end, inner = (branch.points[0], branch.points[1]) if which == 0 else branch.points[:-3:-1]
+    reach = 3.0 * max(float(np.linalg.norm(end.u - inner.u)), 1e-3)
+    best, nearest = None, reach
+    for other in branches:
+        if 2 * other.family.period != branch.family.period or not _same_others(other.family, branch.family):
+            continue
+        for one in other.bifurcations:
+            if one.kind == DOUBLING:
+                away = max(_gap(branch.family, end, one), abs(end.u[-1] - one.point.u[-1]))
+                if away < nearest:
+                    best, nearest = one, away
+    return best
+
+
+def _gap(family: Family, end: Point, one: Bifurcation) -> float:
+    """Scaled distance of an orbit from the nearest section point of the one at a bifurcation."""
+    return min(float(np.linalg.norm(family.mismatch(end.u, x))) for x in one.point.value.images)
+
+
+def _half_orbit(branch: Branch, which: int) -> Start:
+    """The middle between the two halves of the orbit at the end of a branch."""
+    family, end = branch.family, branch.points[-which]
+    half = family.period // 2
+    step = family.mismatch(end.u, end.value.images[half - 1])
+    u = end.u.copy()
+    u[:-1] += 0.5 * step
+    single = replace(family, period=half)
+    return Start(single, single.state(u), float(single.values(u)[0]))
+
+
+def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
+    """Compare the side of the parameter on which the child lies with that where the parent is less stable."""
+    rising = at.point.tangent[-1] > 0.0
+    worse_above = (at.n_unstable_after > at.n_unstable_before) == rising
+    inner = child.points[end + 3 if end == 0 else end - 3]
+    return "supercritical" if (inner.u[-1] > at.point.u[-1]) == worse_above else "subcritical"
+
+
+def _switch(branches: list[Branch], scope: Scope) -> None:
+    """Follow the branches of twice the period, and those through branch points, that are not known yet."""
+    open_ends = [
+        (branch, one)
+        for branch in branches
+        for one in branch.bifurcations
+        if one.child is None
+        and (one.kind == BRANCHING or (one.kind == DOUBLING and 2 * branch.family.period <= scope.max_period))
+    ]
+    doublings = [(b, one) for b, one in open_ends if one.kind == DOUBLING]
+    starts = run_together([doubled_start(b.family, one) for b, one in doublings])
+    ready = [(b, one, s) for (b, one), s in zip(doublings, starts, strict=True) if s is not None]
+    halves = run_together(
+        [
+            half_branch(
+                replace(b.family, period=2 * b.family.period), start, scope.low, scope.high, scope.settings, True
+            )
+            for b, _, start in ready
+        ]
+    )
+    for (parent, one, _), half in zip(ready, halves, strict=True):
+        if len(half.walk.points) < 5 or one.child is not None:
+            continue
+        family = replace(parent.family, period=2 * parent.family.period)
+        child = Branch(family, half.walk.points, half.bifurcations, ("start", half.walk.end), one)
+        one.child, one.criticality = child, _criticality(one, child, 0)
+        branches.append(child)
+        if child.ends[1] == "period_halving":
+            other = _doubling_at(branches, child, 1)
+            if other is not None:
+                other.child, other.criticality = child, _criticality(other, child, -1)
+    _cross([(b, one) for b, one in open_ends if one.kind == BRANCHING], branches, scope)
+
+
+def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch], scope: Scope) -> None:
+    """Follow the other branch through each branch point, both ways."""
+    for parent, one in points:
+        tangent = crossing_tangent(one)
+        start = Point(one.point.u, tangent, one.point.value, 0)
+        if _is_crossing(start, parent, one, branches):
+            continue
+        halves = run_together(
+            [
+                half_branch(parent.family, way, scope.low, scope.high, scope.settings, True)
+                for way in (opposite(start), start)
+            ]
+        )
+        child = joined(parent.family, *halves)
+        child.origin, one.child = one, child
+        branches.append(child)
+
+
+def _is_crossing(start: Point, parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> bool:
+    """Whether the other branch is known: a branch with a branch point at the same orbit."""
+    for branch in branches:
+        for other in branch.bifurcations if branch.family.period == parent.family.period else ():
+            same = _gap(branch.family, start, other) < 1e-4 and abs(start.u[-1] - other.point.u[-1]) < 1e-4
+            if other is not one and other.kind == BRANCHING and same:
+                one.child = other.child = branch
+                return True
+    return False

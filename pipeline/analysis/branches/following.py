@@ -1,0 +1,202 @@
+"""One branch of periodic orbits: both ways from an orbit, until something ends it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipeline.analysis.branches.arclength import Point, Settings, Walk, correct, kernel_of, walk
+from pipeline.analysis.branches.bifurcations import Bifurcation, Watch
+from pipeline.analysis.branches.lockstep import Query, Steps
+from pipeline.analysis.branches.problems import Family, OrbitProblem
+
+ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start")
+
+
+@dataclass(eq=False)
+class Branch:
+    """Orbits of one period along one parameter.
+
+    Attributes
+    ----------
+    family : Family
+    points : list of Point
+    bifurcations : list of Bifurcation
+        In the order of the points.
+    ends : tuple of str
+        Why it ends at its first and last point, of `ENDS`; ``start``: at the bifurcation it sprang from.
+    origin : Bifurcation or None
+        Where it sprang from.
+    """
+
+    family: Family
+    points: list[Point]
+    bifurcations: list[Bifurcation]
+    ends: tuple[str, str]
+    origin: Bifurcation | None = None
+
+    @property
+    def values(self) -> np.ndarray:
+        """Parameter values of the points."""
+        return np.array([self.family.values(p.u)[0] for p in self.points])
+
+
+@dataclass(eq=False)
+class Half:
+    """One way from a start."""
+
+    walk: Walk
+    bifurcations: list[Bifurcation] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stop:
+    """Says when a walk is over."""
+
+    family: Family
+    low: float
+    high: float
+
+    def __call__(self, points: list[Point]) -> str:
+        here = points[-1]
+        if not self.low <= self.family.values(here.u)[0] <= self.high:
+            return "bound"
+        if self._is_closed(points):
+            return "closed"
+        return "period_halving" if self._has_halved(points) else ""
+
+    def _is_closed(self, points: list[Point]) -> bool:
+        """Whether the last step passed the start, at any phase of the orbit."""
+        if len(points) < 5:
+            return False
+        first, before, here = points[0], points[-2], points[-1]
+        if first.tangent[-1] * here.tangent[-1] <= 0.0 and abs(first.tangent[-1]) > 0.2:
+            return False
+        step = here.u - before.u
+        for image in first.value.images:
+            offset = self._difference(image, first.u[-1], before.u)
+            share = float(offset @ step) / float(step @ step)
+            away = np.linalg.norm(offset - share * step)
+            if 0.0 < share <= 1.0 and away < 0.05 * np.linalg.norm(step):
+                return True
+        return False
+
+    def _difference(self, state: np.ndarray, parameter: float, u: np.ndarray) -> np.ndarray:
+        """Scaled unknowns of a state and parameter minus `u`."""
+        return np.append(self.family.mismatch(u, state), parameter - u[-1])
+
+    def _has_halved(self, points: list[Point]) -> bool:
+        """Whether the two halves of the orbit changed places: it passed the orbit of half the period."""
+        if self.family.period % 2 or len(points) < 3:
+            return False
+        before, here = (self._half_way(p) for p in points[-2:])
+        return float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < 0.2
+
+    def _half_way(self, point: Point) -> np.ndarray:
+        return self.family.mismatch(point.u, point.value.images[self.family.period // 2 - 1])
+
+
+def first_point(problem: OrbitProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
+    """Correct an orbit at its parameter value; its tangent points to rising parameter values."""
+    normal = np.zeros(problem.size)
+    normal[-1] = 1.0
+    found = yield from correct(problem, u, normal, settings)
+    if found is None:
+        return None
+    tangent = kernel_of(found.value)
+    return Point(found.u, tangent * (1.0 if tangent[-1] >= 0.0 else -1.0), found.value, found.n_iterations)
+
+
+def half_branch(
+    family: Family, start: Point, low: float, high: float, settings: Settings, from_bifurcation: bool = False
+) -> Steps[Half]:
+    """Follow orbits from a point along its tangent; the last point lies on the bound that was passed."""
+    problem = OrbitProblem(family)
+    watch = Watch(problem, settings, skip_first=from_bifurcation)
+    found = yield from walk(problem, start, settings, _Stop(family, low, high), watch.between)
+    n_last = len(found.points) - 2
+    if found.end == "bound":
+        yield from _cut(problem, found, low, high, settings)
+        inside = [low <= family.values(b.point.u)[0] <= high for b in watch.found]
+        watch.found = [b for b, good in zip(watch.found, inside, strict=True) if good]
+    elif found.end == "period_halving":
+        # the half-period orbit is a singular point of these equations: what was located there is it
+        found.points.pop()
+        watch.found = [b for b in watch.found if b.after < n_last]
+    elif found.end == "closed":
+        # the last step goes over the first one again
+        watch.found = [b for b in watch.found if b.after < n_last or not _is_known(b, watch.found)]
+    return Half(found, watch.found)
+
+
+def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
+    """Whether the same bifurcation was located on an earlier step."""
+    return any(
+        b.kind == one.kind and b.after < one.after and abs(b.point.u[-1] - one.point.u[-1]) < 1e-6 for b in found
+    )
+
+
+def _cut(problem: OrbitProblem, found: Walk, low: float, high: float, settings: Settings) -> Steps[None]:
+    """Replace the point beyond the bound by one on it."""
+    family = problem.family
+    before, beyond = found.points[-2:]
+    values = [family.values(p.u)[0] for p in (before, beyond)]
+    bound = low if values[1] < low else high
+    share = (bound - values[0]) / (values[1] - values[0])
+    normal = np.zeros(problem.size)
+    normal[-1] = 1.0
+    guess = before.u + share * (beyond.u - before.u)
+    guess[-1] = bound / family.scales[0]
+    on_it = yield from correct(problem, guess, normal, settings, along=before.tangent)
+    found.points.pop()
+    if on_it is not None and share > 1e-9:
+        found.points.append(on_it)
+
+
+def joined(family: Family, backward: Half, forward: Half) -> Branch:
+    """One branch of two halves from the same start: first the backward one, reversed."""
+    if forward.walk.end == "closed":
+        return Branch(family, forward.walk.points, forward.bifurcations, ("closed", "closed"))
+    back = [Point(p.u, -p.tangent, p.value, p.n_iterations) for p in reversed(backward.walk.points)]
+    n = len(back) - 1
+    turned = [
+        Bifurcation(
+            b.kind, Point(b.point.u, -b.point.tangent, b.point.value, b.point.n_iterations), b.bracket,
+            b.n_unstable_after, b.n_unstable_before, n - 1 - b.after,
+        )
+        for b in reversed(backward.bifurcations)
+    ]  # fmt: skip
+    for one in forward.bifurcations:
+        one.after += n
+    return Branch(
+        family, back + forward.walk.points[1:], turned + forward.bifurcations, (backward.walk.end, forward.walk.end)
+    )
+
+
+def opposite(point: Point) -> Point:
+    """The same point, looked at the other way."""
+    return Point(point.u, -point.tangent, point.value, point.n_iterations)
+
+
+def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
+    """The orbit at a period doubling, taken twice, with the tangent of the branch of twice the period."""
+    double = Family(
+        family.system, 2 * family.period, family.frequency_hz, family.parameters, family.free, family.scales
+    )
+    value = yield Query(OrbitProblem(double), at.point.u)
+    if not value.is_finite:
+        return None
+    matrix = family.scaled(at.point.value.monodromy)
+    multipliers, vectors = np.linalg.eig(matrix)
+    direction = vectors[:, np.argmin(np.abs(multipliers + 1.0))].real
+    tangent = np.append(direction / np.linalg.norm(direction), 0.0)
+    return Point(at.point.u, tangent, value, 0)
+
+
+def crossing_tangent(at: Bifurcation) -> np.ndarray:
+    """Tangent of the other branch through a branch point, to first order normal to the known one."""
+    kernel = np.linalg.svd(at.point.value.derivative)[2][-2:]
+    own = kernel @ at.point.tangent
+    other = kernel.T @ np.array([-own[1], own[0]])
+    return np.asarray(other / np.linalg.norm(other))

@@ -1,0 +1,112 @@
+"""Many computations in step, whose trajectories share the engine's lanes.
+
+A computation is a generator: it yields a `Query`, gets the `Value` of its problem there, and returns its
+result. A single orbit would fill one lane of sixteen; all computations that wait are served in one call,
+for little more than the price of one. The numbers of each are those that it would get alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from magpend_core.sections import run_branches
+from magpend_core.simd import WIDTH
+from magpend_core.system import System
+from magpend_core.variational import with_tangents
+from pipeline.analysis.branches.problems import RTOL, Ends, Problem, Rows, Value
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Query:
+    """A problem to be evaluated at `u`."""
+
+    problem: Problem
+    u: np.ndarray
+
+
+Steps = Generator[Query, Value, T]
+"""A computation that returns a `T`."""
+
+
+def run_together(computations: Sequence[Steps[T]]) -> list[T]:
+    """Run computations to their ends and return their results, in their order."""
+    results: list[T | None] = [None] * len(computations)
+    waiting: dict[int, Query] = {}
+
+    def advance(i: int, value: Value | None) -> None:
+        try:
+            waiting[i] = next(computations[i]) if value is None else computations[i].send(value)
+        except StopIteration as stop:
+            results[i] = stop.value
+
+    for i in range(len(computations)):
+        advance(i, None)
+    while waiting:
+        queries, waiting = waiting, {}
+        for i, value in zip(queries, _evaluate(list(queries.values())), strict=True):
+            advance(i, value)
+    return results  # type: ignore[return-value]
+
+
+def run_alone(computation: Steps[T]) -> T:
+    """Run one computation."""
+    return run_together([computation])[0]
+
+
+def _evaluate(queries: Sequence[Query]) -> list[Value]:
+    rows = [q.problem.rows(q.u) for q in queries]
+    ends: list[Ends | None] = [None] * len(rows)
+    for chosen in _calls(rows, [q.problem.system for q in queries]):
+        system = queries[chosen[0]].problem.system
+        for i, found in zip(chosen, _integrate([rows[i] for i in chosen], system), strict=True):
+            ends[i] = found
+    return [q.problem.value(q.u, e) for q, e in zip(queries, ends, strict=True) if e is not None]
+
+
+def _calls(rows: Sequence[Rows], systems: Sequence[System]) -> list[list[int]]:
+    """Which queries share a call: those of one system and period, all periods if they fit into a group."""
+    by_system: dict[str, list[int]] = {}
+    for i, system in enumerate(systems):
+        by_system.setdefault(system.label, []).append(i)
+    calls: list[list[int]] = []
+    for members in by_system.values():
+        if sum(len(rows[i].states) for i in members) <= WIDTH:
+            calls.append(members)
+            continue
+        by_period: dict[int, list[int]] = {}
+        for i in members:
+            by_period.setdefault(rows[i].period, []).append(i)
+        calls.extend(by_period.values())
+    return calls
+
+
+def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
+    n = system.n_states
+    states = np.concatenate([r.states for r in rows])
+    finite = np.isfinite(states).all(axis=1)
+    identity = np.broadcast_to(np.eye(n).ravel(), (len(states), n * n))
+    result = run_branches(
+        np.concatenate([r.parameters for r in rows])[:, None],
+        np.concatenate([r.frequency_hz for r in rows])[:, None],
+        np.concatenate([np.where(finite[:, None], states, 0.0), identity], axis=1),
+        n_transient=0,
+        n_keep=max(r.period for r in rows),
+        rtol=RTOL,
+        atol=RTOL,
+        system=with_tangents(system, n),
+    )
+    section = result.section[:, 0]
+    found, first = [], 0
+    for r in rows:
+        own = section[first : first + len(r.states), : r.period]
+        first += len(r.states)
+        # tangent vector k, the derivative by state k, is a column
+        monodromy = own[:, -1, n:].reshape(-1, n, n).transpose(0, 2, 1)
+        found.append(Ends(own[:, :, :n], monodromy))
+    return found

@@ -1,0 +1,270 @@
+"""What is continued: equations for orbits and for their bifurcations, on scaled unknowns.
+
+Every problem is ``F(u) = 0`` with one unknown more than equations, so that its solutions are curves. A
+problem says which trajectories it needs at some `u`, and turns their ends into `F` and its derivative;
+the trajectories of many problems run in one call of the engine (see `lockstep`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Protocol
+
+import numpy as np
+
+from magpend_core.orbits import wrap_angles
+from magpend_core.system import System
+
+FREQUENCY = "frequency_hz"
+
+RTOL = 1e-12
+"""Tolerance of the integrations."""
+
+PARAMETER_STEP = 1e-6
+"""Step of central differences by a parameter, in units of its scale.
+
+Neighbouring trajectories take the same steps, so that differences of the map are smooth down to 1e-14:
+from 1e-4 to 1e-7 the differences by the frequency agree to 1e-8.
+"""
+
+STATE_STEP = 1e-6
+"""Step of central differences of the monodromy matrix, in units of the system's scales."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Ends of the trajectories that a problem asked for.
+
+    Attributes
+    ----------
+    images : ndarray, (m, period, n_states)
+        Sections after 1, 2, ... drive periods.
+    monodromy : ndarray, (m, n_states, n_states)
+        Derivative of the last image by the start.
+    """
+
+    images: np.ndarray
+    monodromy: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Trajectories wanted: starts (m, n_states), frequencies (m,), packed parameters (m, k)."""
+
+    states: np.ndarray
+    frequency_hz: np.ndarray
+    parameters: np.ndarray
+    period: int
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """A problem at some `u`: F (m,), its derivative (m, m + 1), and what the orbit looks like there."""
+
+    residual: np.ndarray
+    derivative: np.ndarray
+    images: np.ndarray
+    monodromy: np.ndarray
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all trajectories arrived."""
+        return bool(np.isfinite(self.residual).all() and np.isfinite(self.derivative).all())
+
+
+class Problem(Protocol):
+    """``F(u) = 0`` in one unknown more than equations."""
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+
+    @property
+    def system(self) -> System:
+        """What is integrated."""
+
+    def rows(self, u: np.ndarray) -> Rows:
+        """Trajectories that are needed at `u`."""
+
+    def value(self, u: np.ndarray, ends: Ends) -> Value:
+        """F and its derivative from the trajectories' ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Orbits of one period with some parameters free.
+
+    Attributes
+    ----------
+    system : System
+    period : int
+        In drive periods.
+    frequency_hz : float
+        Used unless it is free.
+    parameters : ndarray
+        Packed vector; entries that are free do not matter.
+    free : tuple of str
+        Names of the free parameters.
+    scales : tuple of float
+        Change of each free parameter that counts as 1.
+    """
+
+    system: System
+    period: int
+    frequency_hz: float
+    parameters: np.ndarray
+    free: tuple[str, ...]
+    scales: tuple[float, ...]
+
+    @property
+    def unit(self) -> np.ndarray:
+        """What one unit of each unknown is: the states', then the free parameters'."""
+        return np.array([*self.system.scales, *self.scales])
+
+    def unknowns(self, state: np.ndarray, values: Sequence[float]) -> np.ndarray:
+        """Scaled unknowns of a section point and values of the free parameters."""
+        return np.concatenate([state, values]) / self.unit
+
+    def state(self, u: np.ndarray) -> np.ndarray:
+        """Section point [rad, rad/s], angles wrapped."""
+        n = self.system.n_states
+        return wrap_angles(u[:n] * np.asarray(self.system.scales), self.system)
+
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """Values of the free parameters."""
+        return np.asarray(u[self.system.n_states :] * np.asarray(self.scales))
+
+    def rows(self, many: np.ndarray) -> Rows:
+        """Trajectories of one period from each of many unknowns, shape (m, size)."""
+        n = self.system.n_states
+        frequency = np.full(len(many), self.frequency_hz)
+        packed = np.tile(self.parameters, (len(many), 1))
+        for i, (name, scale) in enumerate(zip(self.free, self.scales, strict=True)):
+            column = many[:, n + i] * scale
+            if name == FREQUENCY:
+                frequency = column
+            else:
+                packed[:, self.system.parameter_names.index(name)] = column
+        return Rows(many[:, :n] * np.asarray(self.system.scales), frequency, packed, self.period)
+
+    def mismatch(self, u: np.ndarray, image: np.ndarray) -> np.ndarray:
+        """Scaled difference between the image and the point, angles on their circle."""
+        scales = np.asarray(self.system.scales)
+        start = u[: self.system.n_states] * scales
+        return np.asarray(wrap_angles(image - start, self.system) / scales)
+
+    def scaled(self, monodromy: np.ndarray) -> np.ndarray:
+        """Monodromy matrix in scaled states."""
+        scales = np.asarray(self.system.scales)
+        return np.asarray(monodromy * scales / scales[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class OrbitProblem:
+    """Fixed points of the p-fold stroboscopic map, with one free parameter."""
+
+    family: Family
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.family.system.n_states + 1
+
+    @property
+    def system(self) -> System:
+        """What is integrated."""
+        return self.family.system
+
+    def rows(self, u: np.ndarray) -> Rows:
+        """The orbit, and its two neighbours in the parameter."""
+        step = np.zeros(self.size)
+        step[-1] = PARAMETER_STEP
+        return self.family.rows(np.stack([u, u + step, u - step]))
+
+    def value(self, u: np.ndarray, ends: Ends) -> Value:
+        """Mismatch after the period and its derivative."""
+        n = self.size - 1
+        last = [self.family.mismatch(u, image) for image in ends.images[:, -1]]
+        slope = _wrapped(last[1] - last[2], self.family) / (2.0 * PARAMETER_STEP)
+        matrix = self.family.scaled(ends.monodromy[0]) - np.eye(n)
+        return Value(last[0], np.column_stack([matrix, slope]), ends.images[0], ends.monodromy[0])
+
+
+def _wrapped(difference: np.ndarray, family: Family) -> np.ndarray:
+    scales = np.asarray(family.system.scales)
+    return np.asarray(wrap_angles(difference * scales, family.system) / scales)
+
+
+def fold_test(monodromy: np.ndarray) -> float:
+    """det(M - 1): zero where a multiplier is +1."""
+    return float(np.linalg.det(monodromy - np.eye(len(monodromy))))
+
+
+def doubling_test(monodromy: np.ndarray) -> float:
+    """det(M + 1): changes its sign where a real multiplier passes -1."""
+    return float(np.linalg.det(monodromy + np.eye(len(monodromy))))
+
+
+def torus_test(monodromy: np.ndarray) -> float:
+    """Product of mu_i mu_j - 1 over all pairs: zero where a pair of multipliers has the product 1.
+
+    The determinant of the bialternate product of M with itself, minus 1 (Kuznetsov, Elements of Applied
+    Bifurcation Theory, 3rd ed., 2004, Sect. 10.2.2).
+    """
+    multipliers = np.linalg.eigvals(monodromy)
+    pairs = [multipliers[i] * multipliers[j] - 1.0 for i, j in combinations(range(len(multipliers)), 2)]
+    return float(np.prod(pairs).real)
+
+
+TESTS: dict[str, Callable[[np.ndarray], float]] = {
+    "fold": fold_test,
+    "period_doubling": doubling_test,
+    "neimark_sacker": torus_test,
+}
+"""Functions of the monodromy matrix that vanish at a bifurcation, by its name."""
+
+
+@dataclass(frozen=True, eq=False)
+class BifurcationProblem:
+    """Orbits at a bifurcation, with two free parameters: the orbit's equations and ``test = 0``."""
+
+    family: Family
+    kind: str
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.family.system.n_states + 2
+
+    @property
+    def system(self) -> System:
+        """What is integrated."""
+        return self.family.system
+
+    @property
+    def _steps(self) -> np.ndarray:
+        n = self.family.system.n_states
+        return np.array([STATE_STEP] * n + [PARAMETER_STEP] * 2)
+
+    def rows(self, u: np.ndarray) -> Rows:
+        """The orbit, and two neighbours in every unknown."""
+        shifts = np.diag(self._steps)
+        return self.family.rows(np.concatenate([u[None], u + shifts, u - shifts]))
+
+    def value(self, u: np.ndarray, ends: Ends) -> Value:
+        """Mismatch and test function with their derivative."""
+        n, size = self.family.system.n_states, self.size
+        test = TESTS[self.kind]
+        tests = np.array([test(m) if np.isfinite(m).all() else np.nan for m in ends.monodromy])
+        mismatch = np.array([self.family.mismatch(u, image) for image in ends.images[:, -1]])
+        up, down = slice(1 + n, 1 + size), slice(1 + size + n, None)
+        slopes = np.array([_wrapped(a - b, self.family) for a, b in zip(mismatch[up], mismatch[down], strict=True)])
+        matrix = np.column_stack(
+            [self.family.scaled(ends.monodromy[0]) - np.eye(n), slopes.T / (2.0 * PARAMETER_STEP)]
+        )
+        gradient = (tests[1 : 1 + size] - tests[1 + size :]) / (2.0 * self._steps)
+        return Value(
+            np.append(mismatch[0], tests[0]), np.vstack([matrix, gradient]), ends.images[0], ends.monodromy[0]
+        )
