@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cli_analyse import analyse_app
+from pipeline.cli_branches import branches
 from pipeline.cli_common import EXIT_HELP, Directory, read_pairs
 from pipeline.cli_plot import check_figure_path, draw_bifurcation, plot_app
 from pipeline.cli_zoom import zoom
@@ -159,6 +160,9 @@ def simulate(
         from pipeline.plots import plot_trajectory, save_figure
 
         typer.echo(f"figure: {save_figure(plot_trajectory(ds), target)}")
+
+
+app.command(epilog=EXIT_HELP)(branches)
 
 
 @app.command(epilog=EXIT_HELP)

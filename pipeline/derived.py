@@ -92,8 +92,8 @@ def analysis_version() -> str:
     from magpend_core import kernel_version
 
     digest = hashlib.sha256(kernel_version().encode())
-    for path in sorted(_ANALYSIS.glob("*.py")):
-        digest.update(path.name.encode() + path.read_bytes())
+    for path in sorted(_ANALYSIS.rglob("*.py")):
+        digest.update(path.relative_to(_ANALYSIS).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 

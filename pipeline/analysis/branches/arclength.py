@@ -66,7 +66,11 @@ class Walk:
 
 
 def correct(
-    problem: Problem, guess: np.ndarray, normal: np.ndarray, settings: Settings, along: np.ndarray | None = None
+    problem: Problem,
+    guess: np.ndarray,
+    normal: np.ndarray,
+    settings: Settings,
+    along: np.ndarray | None = None,
 ) -> Steps[Point | None]:
     """Find the solution in the plane through `guess` with this normal; None if Newton's method fails.
 
@@ -133,7 +137,11 @@ def walk(problem: Problem, start: Point, settings: Settings, stop: Stop, between
     while len(found.points) < settings.max_points:
         here = found.points[-1]
         there = yield from correct(problem, here.u + step * here.tangent, here.tangent, settings)
-        if there is None or not _is_near(here, there, step, settings) or not (yield from between(here, there)):
+        if (
+            there is None
+            or not _is_near(here, there, step, settings)
+            or not (yield from between(here, there))
+        ):
             step *= 0.5
             if step < settings.shortest_step:
                 found.end = "stuck"

@@ -63,6 +63,8 @@ class Bifurcation:
         Distance of the parameter values between which the test function changes its sign.
     n_unstable_before, n_unstable_after : int
         Multipliers outside the unit circle on both sides, in the order of the branch.
+    rises_before : bool
+        Whether the parameter rises along the branch before it; at a fold it turns.
     after : int
         Index of the point of the branch after which it comes.
     criticality : str
@@ -77,6 +79,7 @@ class Bifurcation:
     bracket: float
     n_unstable_before: int
     n_unstable_after: int
+    rises_before: bool
     after: int = -1
     criticality: str = ""
     child: Any = None
@@ -137,7 +140,9 @@ def _explains(kinds: list[str], change: int) -> bool:
     return change in reachable
 
 
-def locate(problem: OrbitProblem, a: Point, b: Point, kind: str, settings: Settings) -> Steps[Bifurcation | None]:
+def locate(
+    problem: OrbitProblem, a: Point, b: Point, kind: str, settings: Settings
+) -> Steps[Bifurcation | None]:
     """Find where a test function vanishes between two points; None if an orbit between is not found."""
     test = TESTS[kind]
     chord = b.u - a.u
@@ -163,7 +168,8 @@ def locate(problem: OrbitProblem, a: Point, b: Point, kind: str, settings: Setti
     scale = problem.family.scales[0]
     bracket = abs(high[1].u[-1] - low[1].u[-1]) * scale
     nearest = low if abs(low[2]) <= abs(high[2]) else high
-    return Bifurcation(kind, nearest[1], float(bracket), n_unstable(low[1]), n_unstable(high[1]))
+    rises = bool(low[1].tangent[-1] > 0.0)
+    return Bifurcation(kind, nearest[1], float(bracket), n_unstable(low[1]), n_unstable(high[1]), rises)
 
 
 def _tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:

@@ -11,7 +11,7 @@ from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.bifurcations import BRANCHING, DOUBLING, Bifurcation
 from pipeline.analysis.branches.following import (
     Branch,
-    crossing_tangent,
+    crossing_half,
     doubled_start,
     first_point,
     half_branch,
@@ -69,16 +69,14 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
     """
     branches: list[Branch] = []
     _follow_starts(starts, branches, scope)
-    fresh = list(branches)
     for _ in range(scope.max_generations):
-        orphans = _adopt(branches, fresh, scope)
         n_known = len(branches)
-        _follow_starts(orphans, branches, scope)
+        _follow_starts(_adopt(branches), branches, scope)
+        _adopt(branches)
         _switch(branches, scope)
-        fresh = branches[n_known:]
-        if not fresh:
+        if len(branches) == n_known:
             break
-    _adopt(branches, fresh, scope)
+    _adopt(branches)
     return branches
 
 
@@ -108,9 +106,7 @@ def _both_ways(starts: Sequence[Start], scope: Scope) -> list[Branch | None]:
             for way in (opposite(point), point)
         ]
     )
-    found = iter(
-        joined(family, *halves[2 * i : 2 * i + 2]) for i, (family, _) in enumerate(pairs)
-    )
+    found = iter(joined(family, *halves[2 * i : 2 * i + 2]) for i, (family, _) in enumerate(pairs))
     return [None if p is None else next(found) for p in firsts]
 
 
@@ -146,7 +142,14 @@ def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
         guess = a.u + share * (b.u - a.u)
         guess[-1] = start.value / family.scales[0]
         orbits = [p.value.images for p in (a, b)]
-        if min(np.abs(family.mismatch(family.unknowns(start.state, [0.0]), x)).max() for o in orbits for x in o) < GUESS:
+        if (
+            min(
+                np.abs(family.mismatch(family.unknowns(start.state, [0.0]), x)).max()
+                for o in orbits
+                for x in o
+            )
+            < GUESS
+        ):
             yield guess
 
 
@@ -170,23 +173,20 @@ def _distance(start: Start, point: Point) -> float:
 # ---- switching ---------------------------------------------------------------------------------
 
 
-def _adopt(branches: list[Branch], fresh: Sequence[Branch], scope: Scope) -> list[Start]:
+def _adopt(branches: Sequence[Branch]) -> list[Start]:
     """Tie branches that end on orbits of half their period to the period doubling there.
 
     Returns orbits of half the period, as starts, for ends at which no doubling is known.
     """
     orphans = []
-    for branch in fresh:
+    for branch in branches:
         for which in (0, 1):
             if branch.ends[which] != "period_halving":
                 continue
             at = _doubling_at(branches, branch, which)
             if at is None:
                 orphans.append(_half_orbit(branch, which))
-                continue
-            ends = list(branch.ends)
-            ends[which] = "start" if at.child is None else "period_halving"
-            if at.child is None:
+            elif at.child is None:
                 at.child = branch
                 branch.origin = branch.origin or at
                 at.criticality = _criticality(at, branch, -1 if which else 0)
@@ -248,7 +248,12 @@ def _switch(branches: list[Branch], scope: Scope) -> None:
     halves = run_together(
         [
             half_branch(
-                replace(b.family, period=2 * b.family.period), start, scope.low, scope.high, scope.settings, True
+                replace(b.family, period=2 * b.family.period),
+                start,
+                scope.low,
+                scope.high,
+                scope.settings,
+                True,
             )
             for b, _, start in ready
         ]
@@ -270,26 +275,28 @@ def _switch(branches: list[Branch], scope: Scope) -> None:
 def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch], scope: Scope) -> None:
     """Follow the other branch through each branch point, both ways."""
     for parent, one in points:
-        tangent = crossing_tangent(one)
-        start = Point(one.point.u, tangent, one.point.value, 0)
-        if _is_crossing(start, parent, one, branches):
+        if _is_crossing(parent, one, branches):
             continue
         halves = run_together(
             [
-                half_branch(parent.family, way, scope.low, scope.high, scope.settings, True)
-                for way in (opposite(start), start)
+                crossing_half(parent.family, one, way, scope.low, scope.high, scope.settings)
+                for way in (-1.0, 1.0)
             ]
         )
         child = joined(parent.family, *halves)
-        child.origin, one.child = one, child
-        branches.append(child)
+        if len(child.points) > 2:
+            child.origin, one.child = one, child
+            branches.append(child)
 
 
-def _is_crossing(start: Point, parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> bool:
+def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> bool:
     """Whether the other branch is known: a branch with a branch point at the same orbit."""
     for branch in branches:
         for other in branch.bifurcations if branch.family.period == parent.family.period else ():
-            same = _gap(branch.family, start, other) < 1e-4 and abs(start.u[-1] - other.point.u[-1]) < 1e-4
+            same = (
+                _gap(branch.family, one.point, other) < 1e-4
+                and abs(one.point.u[-1] - other.point.u[-1]) < 1e-4
+            )
             if other is not one and other.kind == BRANCHING and same:
                 one.child = other.child = branch
                 return True

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings, Walk, correct, kernel_of, walk
-from pipeline.analysis.branches.bifurcations import Bifurcation, Watch
+from pipeline.analysis.branches.bifurcations import FOLD, Bifurcation, Watch
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import Family, OrbitProblem
 
@@ -91,7 +92,7 @@ class _Stop:
         if self.family.period % 2 or len(points) < 3:
             return False
         before, here = (self._half_way(p) for p in points[-2:])
-        return float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < 0.2
+        return bool(float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < 0.2)
 
     def _half_way(self, point: Point) -> np.ndarray:
         return self.family.mismatch(point.u, point.value.images[self.family.period // 2 - 1])
@@ -133,7 +134,8 @@ def half_branch(
 def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
     """Whether the same bifurcation was located on an earlier step."""
     return any(
-        b.kind == one.kind and b.after < one.after and abs(b.point.u[-1] - one.point.u[-1]) < 1e-6 for b in found
+        b.kind == one.kind and b.after < one.after and abs(b.point.u[-1] - one.point.u[-1]) < 1e-6
+        for b in found
     )
 
 
@@ -163,14 +165,17 @@ def joined(family: Family, backward: Half, forward: Half) -> Branch:
     turned = [
         Bifurcation(
             b.kind, Point(b.point.u, -b.point.tangent, b.point.value, b.point.n_iterations), b.bracket,
-            b.n_unstable_after, b.n_unstable_before, n - 1 - b.after,
+            b.n_unstable_after, b.n_unstable_before, b.rises_before != (b.kind != FOLD), n - 1 - b.after,
         )
         for b in reversed(backward.bifurcations)
     ]  # fmt: skip
     for one in forward.bifurcations:
         one.after += n
     return Branch(
-        family, back + forward.walk.points[1:], turned + forward.bifurcations, (backward.walk.end, forward.walk.end)
+        family,
+        back + forward.walk.points[1:],
+        turned + forward.bifurcations,
+        (backward.walk.end, forward.walk.end),
     )
 
 
@@ -194,9 +199,30 @@ def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
     return Point(at.point.u, tangent, value, 0)
 
 
-def crossing_tangent(at: Bifurcation) -> np.ndarray:
-    """Tangent of the other branch through a branch point, to first order normal to the known one."""
+def crossing_half(
+    family: Family, at: Bifurcation, way: float, low: float, high: float, settings: Settings
+) -> Steps[Half]:
+    """Follow the other branch through a branch point, one way.
+
+    Its tangent lies in the kernel of the derivative, of two dimensions there; the known branch does not
+    meet the plane at a small distance from it, so that Newton's method in that plane finds the other.
+    """
     kernel = np.linalg.svd(at.point.value.derivative)[2][-2:]
     own = kernel @ at.point.tangent
-    other = kernel.T @ np.array([-own[1], own[0]])
-    return np.asarray(other / np.linalg.norm(other))
+    normal = kernel.T @ np.array([-own[1], own[0]])
+    normal *= way / np.linalg.norm(normal)
+    start = Point(at.point.u, normal, at.point.value, 0)
+    problem = OrbitProblem(family)
+    # at a pitchfork the parameter stands still
+    level = kernel.T @ np.array([-kernel[1, -1], kernel[0, -1]])
+    slanted = float(level @ normal)
+    ways = ([level / slanted] if abs(slanted) > 0.1 * np.linalg.norm(level) else []) + [normal]
+    for step, direction in product(settings.first_step * np.array([1.0, 5.0, 25.0]), ways):
+        first = yield from correct(problem, at.point.u + step * direction, normal, settings)
+        if first is not None:
+            found = yield from half_branch(family, first, low, high, settings)
+            found.walk.points.insert(0, start)
+            for one in found.bifurcations:
+                one.after += 1
+            return found
+    return Half(Walk([start], "stuck"))

@@ -125,12 +125,12 @@ class Family:
 
     def unknowns(self, state: np.ndarray, values: Sequence[float]) -> np.ndarray:
         """Scaled unknowns of a section point and values of the free parameters."""
-        return np.concatenate([state, values]) / self.unit
+        return np.asarray(np.concatenate([state, values]) / self.unit)
 
     def state(self, u: np.ndarray) -> np.ndarray:
         """Section point [rad, rad/s], angles wrapped."""
         n = self.system.n_states
-        return wrap_angles(u[:n] * np.asarray(self.system.scales), self.system)
+        return wrap_angles(np.asarray(u[:n] * np.asarray(self.system.scales)), self.system)
 
     def values(self, u: np.ndarray) -> np.ndarray:
         """Values of the free parameters."""
@@ -260,7 +260,9 @@ class BifurcationProblem:
         tests = np.array([test(m) if np.isfinite(m).all() else np.nan for m in ends.monodromy])
         mismatch = np.array([self.family.mismatch(u, image) for image in ends.images[:, -1]])
         up, down = slice(1 + n, 1 + size), slice(1 + size + n, None)
-        slopes = np.array([_wrapped(a - b, self.family) for a, b in zip(mismatch[up], mismatch[down], strict=True)])
+        slopes = np.array(
+            [_wrapped(a - b, self.family) for a, b in zip(mismatch[up], mismatch[down], strict=True)]
+        )
         matrix = np.column_stack(
             [self.family.scaled(ends.monodromy[0]) - np.eye(n), slopes.T / (2.0 * PARAMETER_STEP)]
         )

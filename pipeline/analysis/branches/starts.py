@@ -1,0 +1,190 @@
+"""Orbits to begin with: those that attract cells of a cube, and those near recurrences in its chaos."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.orbits import polish_orbits, scaled_distance, stroboscopic_map
+from magpend_core.parameters import Parameters
+from magpend_core.pendulum import system_of
+from magpend_core.system import System
+from pipeline.analysis.branches.exploring import Start
+from pipeline.analysis.branches.problems import FREQUENCY, Family
+from pipeline.analysis.identify import START_DIMS
+
+CLOSE = 0.1
+"""Largest scaled distance of a recurrence that is worth a try."""
+
+TRIES = 16
+"""Recurrences tried per period."""
+
+BOUNDED = 2
+
+
+def attracting(
+    attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int
+) -> list[Start]:
+    """Polished closed orbits among the attractors of a run.
+
+    Parameters
+    ----------
+    attractors
+        From `pipeline.analysis.attractors`.
+    parameters
+        What was integrated, axes of the cube aside.
+    parameter
+        What is to be continued.
+    scale
+        Change of it that counts as 1.
+    max_period
+        Longest period taken [drive periods].
+
+    Returns
+    -------
+    list of Start
+        In the order of the cube's points and attractors.
+    """
+    starts = []
+    for point in _points(attractors):
+        frequency, packed = _parameters_at(point, parameters)
+        for i in range(attractors.sizes["attractor"]):
+            one = point.isel(attractor=i)
+            period = int(one["orbit_period"])
+            if int(one["is_polished"]) and 1 <= period <= max_period:
+                family = family_of(system_of(parameters), period, frequency, packed, parameter, scale)
+                state = np.asarray(one["attractor_points"].values[0])
+                starts.append(Start(family, state, value_of(family, frequency, packed)))
+    return starts
+
+
+def family_of(
+    system: System, period: int, frequency_hz: float, packed: np.ndarray, parameter: str, scale: float
+) -> Family:
+    """Orbits of a period with one free parameter."""
+    return Family(system, period, frequency_hz, packed, (parameter,), (scale,))
+
+
+def value_of(family: Family, frequency_hz: float, packed: np.ndarray) -> float:
+    """Value of the free parameter among given ones."""
+    name = family.free[0]
+    if name == FREQUENCY:
+        return frequency_hz
+    return float(packed[family.system.parameter_names.index(name)])
+
+
+def _points(ds: xr.Dataset) -> list[xr.Dataset]:
+    """Parameter points of a dataset."""
+    dims = [str(d) for d in ds["status"].dims if d not in START_DIMS]
+    shape = [ds.sizes[d] for d in dims]
+    indices = [dict(zip(dims, map(int, index), strict=True)) for index in np.ndindex(*shape)]
+    return [ds.isel(index) for index in indices]
+
+
+def _parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarray]:
+    """Frequency and packed parameters of a point of the cube."""
+    axes = {n: float(point.coords[n]) for n in base.names if n in point.coords and not point.coords[n].dims}
+    return float(point.coords["frequency"]), base.replace(**axes).pack()
+
+
+def recurrent(
+    cube: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int
+) -> list[Start]:
+    """Orbits, most of them unstable, that bounded trajectories of a cube come near.
+
+    Where two sections of a trajectory are close, p periods apart, Newton's method from the first often
+    leads to an orbit of period p (Auerbach et al., Phys. Rev. Lett. 58, 1987, 2387).
+
+    Parameters
+    ----------
+    cube
+        With `section` and `status`; only cells of status bounded are used.
+    parameters, parameter, scale, max_period
+        As for `attracting`.
+
+    Returns
+    -------
+    list of Start
+        Different orbits, by rising period at each point of the cube.
+    """
+    system = system_of(parameters)
+    starts = []
+    for point in _points(cube):
+        dims = [d for d in point["status"].dims if d in START_DIMS]
+        section = point["section"].transpose(*dims, "period_index", "state").values
+        section = section.reshape(-1, *section.shape[len(dims) :])[point["status"].values.ravel() == BOUNDED]
+        if not len(section):
+            continue
+        frequency, packed = _parameters_at(point, parameters)
+        for state, period in orbits_near(section, frequency, packed, max_period, system):
+            family = family_of(system, period, frequency, packed, parameter, scale)
+            starts.append(Start(family, state, value_of(family, frequency, packed)))
+    return starts
+
+
+def orbits_near(
+    section: np.ndarray, frequency_hz: float, packed: np.ndarray, max_period: int, system: System
+) -> list[tuple[np.ndarray, int]]:
+    """Periodic orbits near close recurrences of trajectories.
+
+    Parameters
+    ----------
+    section
+        Sections of consecutive drive periods, shape (trajectory, period, n_states) [rad, rad/s].
+    frequency_hz
+        Drive frequency [Hz].
+    packed
+        Packed parameters.
+    max_period
+        Longest period [drive periods].
+    system
+        What is integrated.
+
+    Returns
+    -------
+    list of (ndarray, int)
+        A section point and the least period of each orbit found, no orbit twice, by rising period.
+    """
+    guesses, periods = [], []
+    for period in range(1, min(max_period, section.shape[1] - 1) + 1):
+        distance = scaled_distance(section[:, period:], section[:, :-period], system)
+        order = np.argsort(distance, axis=None, kind="stable")
+        chosen = _spread(section, [np.unravel_index(k, distance.shape) for k in order], distance, system)
+        guesses += chosen
+        periods += [period] * len(chosen)
+    if not guesses:
+        return []
+    n = len(guesses)
+    polished = polish_orbits(
+        np.tile(packed, (n, 1)), np.full(n, frequency_hz), np.array(guesses), np.array(periods), system=system
+    )
+    found: list[tuple[np.ndarray, int]] = []
+    order = np.argsort(polished.orbit_period, kind="stable")
+    for row in order[polished.converged[order]]:
+        state, period = polished.section[row], int(polished.orbit_period[row])
+        if not any(p == period and _on_orbit(state, x, p, frequency_hz, packed, system) for x, p in found):
+            found.append((state, period))
+    return found
+
+
+def _spread(
+    section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
+) -> list[np.ndarray]:
+    """Points of the closest recurrences, each farther than `CLOSE` from those before."""
+    chosen: list[np.ndarray] = []
+    for place in places:
+        if len(chosen) == TRIES or not distance[place] <= CLOSE:
+            break
+        point = section[place]
+        if all(scaled_distance(point, other, system) > CLOSE for other in chosen):
+            chosen.append(point)
+    return chosen
+
+
+def _on_orbit(
+    state: np.ndarray, other: np.ndarray, period: int, frequency_hz: float, packed: np.ndarray, system: System
+) -> bool:
+    images, _ = stroboscopic_map(packed[None], np.array([frequency_hz]), other[None], period, system=system)
+    return bool(scaled_distance(images[0], state, system).min() < 1e-6)

@@ -1,0 +1,311 @@
+"""Branches of periodic orbits, against exact solutions and scipy's integrators."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import fsolve
+
+from magpend_core.jit import inline
+from magpend_core.system import System
+from magpend_core.vecmath import sincos
+from pipeline.analysis.branches import Scope, Start, dataset_of, explore, table_of, windows_of
+from pipeline.analysis.branches.arclength import Settings
+from pipeline.analysis.branches.bifurcations import multipliers_of, n_unstable
+from pipeline.analysis.branches.following import first_point
+from pipeline.analysis.branches.lockstep import run_alone, run_together
+from pipeline.analysis.branches.problems import (
+    Family,
+    OrbitProblem,
+    doubling_test,
+    fold_test,
+    torus_test,
+)
+
+
+@inline
+def _constants(frequency, p, out):
+    for i in range(5):
+        out[i] = p[i]
+    out[5] = 2.0 * np.pi * frequency
+
+
+@inline
+def _forcing(t, c):
+    return c[4] * sincos(c[5] * t)[1]
+
+
+@inline
+def _rhs(y, u, c):
+    x, v = y
+    return v, u - (c[0] + c[1] * x * x) * v - c[2] * x - c[3] * x * x * x
+
+
+@inline
+def _jacobian(y, u, c):
+    x, v = y
+    zero = 0.0 * x
+    return zero, zero + 1.0, -2.0 * c[1] * x * v - c[2] - 3.0 * c[3] * x * x, zero - c[0] - c[1] * x * x
+
+
+@inline
+def _no_edges(frequency, p, times, half_widths, jumps):
+    return
+
+
+@inline
+def _no_layers(y, dy, c):
+    return ()
+
+
+def _system(**changes):
+    fields = {
+        "name": "branch_oscillator",
+        "state_names": ("x", "v"),
+        "is_angle": (False, False),
+        "scales": (1.0, 1.0),
+        "parameter_names": ("damping", "nonlinear", "linear", "cubic", "amplitude"),
+        "n_constants": 6,
+        "constants": _constants,
+        "forcing": _forcing,
+        "rhs": _rhs,
+        "n_edges": 0,
+        "edges": _no_edges,
+        "layers": _no_layers,
+        "jacobian": _jacobian,
+        "escape": (1e3, 1e3),
+        "has_layers": False,
+    }
+    return System(**{**fields, **changes})
+
+
+# x'' = amplitude cos(2 pi f t) - (damping + nonlinear x^2) x' - linear x - cubic x^3
+OSCILLATOR = _system()
+
+
+def family(frequency, parameters, free, scale, period=1, system=OSCILLATOR):
+    return Family(system, period, frequency, np.array(parameters, float), (free,), (scale,))
+
+
+def flow(state, frequency, parameters, share=1.0):
+    """Image of a state and the derivative of the map, by scipy."""
+    damping, nonlinear, linear, cubic, amplitude = parameters
+    omega = 2.0 * np.pi * frequency
+
+    def rates(t, z):
+        x, v, *m = z
+        stiffness = linear + 3.0 * cubic * x * x + 2.0 * nonlinear * x * v
+        friction = damping + nonlinear * x * x
+        force = amplitude * np.cos(omega * t) - friction * v - linear * x - cubic * x**3
+        m = np.reshape(m, (2, 2))
+        return [v, force, *m[1], *(-stiffness * m[0] - friction * m[1])]
+
+    start = [*state, 1.0, 0.0, 0.0, 1.0]
+    end = solve_ivp(rates, (0.0, share / frequency), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    return end[:2], end[2:].reshape(2, 2)
+
+
+def settled(state, frequency, parameters, n_periods=60):
+    """Section point after some periods, by scipy."""
+
+    def rates(t, z):
+        force = parameters[4] * np.cos(2.0 * np.pi * frequency * t)
+        friction = parameters[0] + parameters[1] * z[0] * z[0]
+        return [z[1], force - friction * z[1] - parameters[2] * z[0] - parameters[3] * z[0] ** 3]
+
+    return solve_ivp(rates, (0.0, n_periods / frequency), state, rtol=1e-8, atol=1e-8).y[:, -1]
+
+
+def recomputed(bifurcation, orbits, test, parameters_at):
+    """Where scipy finds the same bifurcation, from a start that is a little off."""
+
+    def equations(unknowns):
+        frequency, parameters = parameters_at(unknowns[2])
+        image, matrix = flow(unknowns[:2], frequency, parameters)
+        return [*(image - unknowns[:2]), test(matrix)]
+
+    u = bifurcation.point.u
+    start = np.append(orbits.state(u), orbits.values(u)[0]) * (1.0 + 1e-4)
+    found, _, good, _ = fsolve(equations, start, xtol=1e-13, full_output=True)
+    assert good == 1
+    return found[2]
+
+
+def only(branch, kind):
+    return [b for b in branch.bifurcations if b.kind == kind]
+
+
+def test_explore__linear_oscillator():
+    """The exact orbit and multipliers at every frequency."""
+    damping, linear, amplitude = 0.3, 4.0, 1.0
+    orbits = family(0.2, [damping, 0, linear, 0, amplitude], "frequency_hz", 0.5)
+    (branch,) = explore([Start(orbits, np.zeros(2), 0.2)], Scope(0.1, 0.6))
+    assert branch.ends == ("bound", "bound")
+    assert not branch.bifurcations
+    np.testing.assert_array_equal(branch.values[[0, -1]], [0.1, 0.6])
+    omega = 2.0 * np.pi * branch.values
+    response = amplitude / (linear - omega**2 + 1j * damping * omega)
+    states = np.array([orbits.state(p.u) for p in branch.points])
+    np.testing.assert_allclose(states, np.stack([response.real, -omega * response.imag], axis=1), atol=1e-9)
+    root = -damping / 2.0 + 1j * np.sqrt(linear - damping**2 / 4.0)
+    exact = np.exp(root / branch.values)
+    for point, value in zip(branch.points, exact, strict=True):
+        assert np.abs(multipliers_of(point) - value).min() < 1e-9
+
+
+@pytest.fixture(scope="module")
+def resonance():
+    """The bent resonance of a hardening spring: stable, unstable, stable again."""
+    orbits = family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency_hz", 0.3)
+    (branch,) = explore([Start(orbits, np.array([0.3, 0.0]), 0.1)], Scope(0.1, 0.4))
+    return orbits, branch
+
+
+def test_explore__folds_of_duffing(resonance):
+    orbits, branch = resonance
+    upper, lower = only(branch, "fold")
+    assert branch.bifurcations == [upper, lower]
+    for fold, sides in ((upper, (0, 1)), (lower, (1, 0))):
+        assert (fold.n_unstable_before, fold.n_unstable_after) == sides
+        assert fold.bracket < 1e-8
+        assert abs(fold.critical_multiplier - 1.0) < 1e-6
+        there = recomputed(fold, orbits, fold_test, lambda f: (f, orbits.parameters))
+        assert orbits.values(fold.point.u)[0] == pytest.approx(there, abs=1e-8)
+
+
+def test_explore__determinant(resonance):
+    """Liouville: the flow contracts areas by exp(-damping T), on stable and unstable orbits."""
+    _, branch = resonance
+    found = [np.linalg.det(p.value.monodromy) for p in branch.points]
+    np.testing.assert_allclose(found, np.exp(-0.1 / branch.values), rtol=1e-9)
+    assert {n_unstable(p) for p in branch.points} == {0, 1}
+    assert max(p.residual for p in branch.points) < 1e-10
+
+
+def test_dataset_of__resonance(resonance):
+    """Three stable segments' worth of tables: numbers as on the branch."""
+    _, branch = resonance
+    ds = dataset_of([branch], "frequency_hz", None)
+    upper, lower = sorted(table_of(ds), key=lambda row: -row["value"])
+    assert [upper["type"], lower["type"]] == ["fold", "fold"]
+    assert (upper["unstable_below"], upper["unstable_above"]) == ("0|1", "none")
+    assert (lower["unstable_below"], lower["unstable_above"]) == ("none", "0|1")
+    first, second = windows_of(ds)
+    assert (first["begins"], first["ends"]) == ("bound", "fold")
+    assert (second["begins"], second["ends"]) == ("fold", "bound")
+    assert (first["to"], second["from"]) == (upper["value"], lower["value"])
+
+
+@pytest.fixture(scope="module")
+def cascade():
+    """Two wells, amplitude as the parameter: the first doublings of one well's orbit."""
+    parameters = [0.3, 0, -1.0, 1.0, 0.2]
+    orbits = family(1.2 / (2.0 * np.pi), parameters, "amplitude", 0.1)
+    return orbits, explore(
+        [Start(orbits, settled([1.2, 0.0], orbits.frequency_hz, parameters), 0.2)],
+        Scope(0.2, 0.3, max_period=4),
+    )
+
+
+def test_explore__period_doublings(cascade):
+    orbits, branches = cascade
+    assert [b.family.period for b in branches] == [1, 2, 4]
+    first, second = (only(b, "period_doubling")[0] for b in branches[:2])
+    there = recomputed(
+        first, orbits, doubling_test, lambda a: (orbits.frequency_hz, [*orbits.parameters[:4], a])
+    )
+    assert orbits.values(first.point.u)[0] == pytest.approx(there, abs=1e-8)
+    assert (first.n_unstable_before, first.n_unstable_after) == (0, 1)
+    assert first.criticality == second.criticality == "supercritical"
+    assert first.child is branches[1]
+    assert branches[1].origin is first
+    # the doubled orbit is stable until its own doubling, and not the single one
+    point = branches[1].points[5]
+    assert n_unstable(point) == 0
+    image, _ = flow(
+        branches[1].family.state(point.u),
+        orbits.frequency_hz,
+        [*orbits.parameters[:4], branches[1].values[5]],
+    )
+    assert np.abs(image - branches[1].family.state(point.u)).max() > 1e-3
+
+
+def test_explore__start_on_doubled_orbit(cascade):
+    """From the doubled orbit the single one is found as the branch that it ends on."""
+    orbits, branches = cascade
+    middle = branches[1].points[10]
+    state, value = branches[1].family.state(middle.u), branches[1].values[10]
+    again = explore([Start(branches[1].family, state, float(value))], Scope(0.2, 0.3, max_period=2))
+    assert sorted(b.family.period for b in again) == [1, 2]
+    single, double = sorted(again, key=lambda b: b.family.period)
+    assert only(single, "period_doubling")[0].child is double
+    np.testing.assert_allclose(
+        orbits.values(only(single, "period_doubling")[0].point.u),
+        orbits.values(only(branches[0], "period_doubling")[0].point.u),
+        atol=1e-8,
+    )
+
+
+def test_explore__neimark_sacker():
+    """A forced van der Pol oscillator leaves entrainment through a torus."""
+    parameters = [-0.2, 0.2, 1.0, 0.0, 0.4]
+    orbits = family(0.16, parameters, "frequency_hz", 0.05)
+    (branch,) = explore([Start(orbits, settled([1.0, 1.5], 0.16, parameters), 0.16)], Scope(0.15, 0.22))
+    tori = only(branch, "neimark_sacker")
+    assert tori
+    for torus in tori:
+        assert abs(abs(torus.critical_multiplier) - 1.0) < 1e-7
+        assert torus.critical_multiplier.imag > 0.1
+        assert sorted((torus.n_unstable_before, torus.n_unstable_after)) == [0, 2]
+        there = recomputed(torus, orbits, torus_test, lambda f: (f, parameters))
+        assert orbits.values(torus.point.u)[0] == pytest.approx(there, abs=1e-8)
+
+
+def test_explore__symmetry_breaking():
+    """The symmetric orbit of a symmetric spring; scipy finds the pitchfork with the half-period map."""
+    parameters = [0.1, 0, 0.0, 1.0, 0.3]
+    orbits = family(1.0 / (2.0 * np.pi), parameters, "amplitude", 1.0)
+    branches = explore(
+        [Start(orbits, settled([0.0, 0.0], orbits.frequency_hz, parameters), 0.3)],
+        Scope(0.02, 3.0, max_period=1),
+    )
+    pitchfork = only(branches[0], "branch_point")[0]
+    broken = pitchfork.child
+    assert broken is not None
+
+    def equations(unknowns):
+        image, matrix = flow(unknowns[:2], orbits.frequency_hz, [*parameters[:4], unknowns[2]], share=0.5)
+        # the symmetry: x(t + T/2) = -x(t), so that the half-period map with a turn has the orbit as its
+        # fixed point, and the multiplier -1 where the symmetry breaks
+        return [*(-image - unknowns[:2]), doubling_test(-matrix)]
+
+    u = pitchfork.point.u
+    start = np.append(orbits.state(u), orbits.values(u)[0])
+    there, _, good, _ = fsolve(equations, start * (1 + 1e-5), xtol=1e-13, full_output=True)
+    assert good == 1
+    assert orbits.values(u)[0] == pytest.approx(there[2], abs=1e-7)
+    far = broken.points[-1] if broken.points[0] is pitchfork.point else broken.points[0]
+    half, _ = flow(orbits.state(far.u), orbits.frequency_hz, [*parameters[:4], orbits.values(far.u)[0]], 0.5)
+    assert np.abs(half + orbits.state(far.u)).max() > 1e-2
+
+
+def test_run_together__same_bits():
+    """Values do not depend on what else is computed, nor on the periods beside."""
+    settings = Settings()
+    problems = [
+        (OrbitProblem(o), o.unknowns(np.array([0.4, 0.1]), [0.1]))
+        for o in (family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency_hz", 0.3, period=p) for p in (1, 2, 3))
+    ]
+    alone = [run_alone(first_point(p, u, settings)) for p, u in problems]
+    for count in (3, 9):
+        together = run_together([first_point(p, u, settings) for p, u in problems * (count // 3)])
+        for a, b in zip(alone * (count // 3), together, strict=True):
+            np.testing.assert_array_equal(a.u, b.u)
+            np.testing.assert_array_equal(a.value.monodromy, b.value.monodromy)
+
+
+def test_torus_test__neutral_saddle():
+    """A real pair of product 1 makes the test vanish: what is located there is dropped."""
+    assert torus_test(np.diag([2.0, 0.5])) == pytest.approx(0.0)
+    assert torus_test(np.diag([2.0, 0.4])) * torus_test(np.diag([2.0, 0.6])) < 0.0
