@@ -147,7 +147,7 @@ def lyapunov_exponents(
     states: np.ndarray,
     *,
     n_exponents: int = 4,
-    n_transient: int = 50,
+    n_transient: int = 200,
     n_periods: int = 400,
     n_blocks: int = 16,
     rtol: float = 1e-8,

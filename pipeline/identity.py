@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pipeline.plan import Plan
-from pipeline.schema import FORMAT, REFINEMENT, VARIABLES
+from pipeline.schema import FORMAT, REFINEMENT
 from pipeline.spec import Spec
 
 
@@ -24,7 +24,7 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
         "kernel_version": kernel_version,
         "spec": tables,
         "parameter_values": spec.parameters.load().as_dict(),
-        "chunks": {v.name: list(plan.chunks(v)) for v in VARIABLES},
+        "chunks": {v.name: list(plan.chunks(v)) for v in plan.variables},
     }
 
 

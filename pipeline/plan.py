@@ -14,12 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.cells import CellMap
-from pipeline.schema import VARIABLES, Variable, own_sizes
-from pipeline.spec import FREQUENCY, Spec
+from pipeline.schema import LYAPUNOV_VARIABLES, VARIABLES, Variable, own_sizes
+from pipeline.spec import FREQUENCY, Lyapunov, Spec
 
 MICROSECONDS_PER_PERIOD, MICROSECONDS_PER_SECOND = 9.0, 21.5
 """Rule of thumb for one trajectory on one core at rtol 1e-8: a period of length T takes
 9 us + 21.5 us T/s (measured between 0.1 and 3 Hz on AVX-512, good to 20 %)."""
+
+TANGENT_COST = 1.9
+"""A period with all tangent vectors in units of one without (1.5 for one vector)."""
 
 RTOL_OF_RULE = 1e-8
 ROOT = 6
@@ -56,6 +59,8 @@ class Plan:
     n_keep : int
     seconds_per_cell : float
         Estimated time on one core [s].
+    lyapunov : Lyapunov or None
+        What is asked for of exponents.
     """
 
     kind: str
@@ -65,6 +70,17 @@ class Plan:
     block: tuple[int, ...]
     n_keep: int
     seconds_per_cell: float
+    lyapunov: Lyapunov | None = None
+
+    @property
+    def variables(self) -> tuple[Variable, ...]:
+        """Variables of the cube."""
+        return variables_of(self.lyapunov)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Sizes of the dims that are not cell dims."""
+        return _sizes(self.n_keep, self.lyapunov)
 
     @property
     def n_cells(self) -> int:
@@ -89,7 +105,7 @@ class Plan:
     @property
     def n_bytes(self) -> int:
         """Size of the cube before compression [bytes]."""
-        return self.n_cells * sum(v.itemsize(own_sizes(self.n_keep)) for v in VARIABLES)
+        return self.n_cells * sum(v.itemsize(self.sizes) for v in self.variables)
 
     @property
     def core_seconds(self) -> float:
@@ -117,13 +133,22 @@ class Plan:
 
     def chunks(self, variable: Variable) -> tuple[int, ...]:
         """Chunk shape of a variable: the task's block, cut along the path where it is too large."""
-        sizes = own_sizes(self.n_keep)
+        sizes = self.sizes
         chunk = list(self.block)
         if self.path is not None:
             per_point = math.prod(chunk) // chunk[self.path] * variable.itemsize(sizes)
             n_chunks = math.ceil(chunk[self.path] * per_point / CHUNK_BYTES)
             chunk[self.path] = math.ceil(chunk[self.path] / n_chunks)
         return (*chunk, *(sizes[d] for d in variable.own_dims))
+
+
+def variables_of(lyapunov: Lyapunov | None) -> tuple[Variable, ...]:
+    """Return the variables of a cube with these products."""
+    return (*VARIABLES, *LYAPUNOV_VARIABLES) if lyapunov else VARIABLES
+
+
+def _sizes(n_keep: int, lyapunov: Lyapunov | None) -> dict[str, int]:
+    return own_sizes(n_keep, lyapunov.n_exponents, lyapunov.n_blocks) if lyapunov else own_sizes(n_keep)
 
 
 def make_plan(spec: Spec) -> Plan:
@@ -148,7 +173,10 @@ def make_plan(spec: Spec) -> Plan:
             most = TASK_BYTES // _bytes_per_cell(spec)
             wanted = max(wanted, min(LEAST_LATTICE * spec.refine ** len(grid), most))
         block = (*(1 for _ in spec.axes), *_tile(grid, spec.refine, wanted))
-    return Plan(spec.kind, cells.dims, cells.shape, cells.path, block, spec.integration.n_keep, seconds)
+    return Plan(
+        spec.kind, cells.dims, cells.shape, cells.path, block, spec.integration.n_keep, seconds,
+        spec.products.lyapunov,
+    )  # fmt: skip
 
 
 def _seconds_per_cell(spec: Spec) -> float:
@@ -157,7 +185,9 @@ def _seconds_per_cell(spec: Spec) -> float:
     frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else spec.parameters.frequency_hz
     mean_period = float(np.mean(1.0 / np.asarray(frequency)))
     microseconds = MICROSECONDS_PER_PERIOD + MICROSECONDS_PER_SECOND * mean_period
-    periods = integration.n_transient + integration.n_keep
+    periods = float(integration.n_transient + integration.n_keep)
+    if spec.products.lyapunov:
+        periods += TANGENT_COST * (spec.products.lyapunov.n_transient + spec.products.lyapunov.n_periods)
     return periods * microseconds * 1e-6 * float((RTOL_OF_RULE / integration.rtol) ** (1 / ROOT))
 
 
@@ -172,7 +202,9 @@ def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: flo
 
 def _bytes_per_cell(spec: Spec) -> int:
     """Bytes of a cell's variables, uncompressed."""
-    return sum(v.itemsize(own_sizes(spec.integration.n_keep)) for v in VARIABLES)
+    lyapunov = spec.products.lyapunov
+    sizes = _sizes(spec.integration.n_keep, lyapunov)
+    return sum(v.itemsize(sizes) for v in variables_of(lyapunov))
 
 
 def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, ...]:

@@ -11,13 +11,11 @@ import numpy as np
 from pipeline import store
 from pipeline.cells import DIRECTION_CODES
 from pipeline.plan import Plan, make_plan
-from pipeline.schema import LINKS, STATE_UNITS, STATES, VARIABLES
+from pipeline.schema import LINKS, STATE_UNITS, STATES
 from pipeline.spec import parse_spec
 
 if TYPE_CHECKING:
     import xarray as xr
-
-_VARIABLES = frozenset(v.name for v in VARIABLES)
 
 
 def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
@@ -66,8 +64,12 @@ def open_committed(
 
     view: Any = store.committed_view(info, plan, commits)
     ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
-    ds = ds.set_coords([name for name in ds.data_vars if name not in _VARIABLES])
-    ds = ds[[v.name for v in VARIABLES]].assign_coords(_labels())
+    names = [v.name for v in plan.variables]
+    ds = ds.set_coords([name for name in ds.data_vars if name not in names])
+    ds = ds[names].assign_coords(_labels())
+    if "exponent" in ds.dims:
+        numbers = np.arange(1, ds.sizes["exponent"] + 1, dtype=np.int32)
+        ds = ds.assign_coords(exponent=("exponent", numbers, {"long_name": "number of the exponent"}))
     if "direction" in ds.coords:
         ds = ds.assign_coords(direction=_words(ds.coords["direction"]))
     version = info.versions.get("magpend", "(not installed)")

@@ -243,6 +243,37 @@ class Integration(Table):
     max_orbit_period: Annotated[int, Field(ge=1, le=32_000)] = 16
 
 
+class Lyapunov(Table):
+    """``products.lyapunov``: exponents along each cell's attractor, from its last kept section on.
+
+    `n_exponents` from the largest, `n_transient` drive periods in which the tangent vectors turn into
+    their directions, then `n_periods` in `n_blocks` blocks.
+    """
+
+    n_exponents: Annotated[int, Field(ge=1, le=len(STATES))] = len(STATES)
+    n_transient: Annotated[int, Field(ge=0, le=1_000_000)] = 200
+    n_periods: Annotated[int, Field(ge=2, le=100_000_000)] = 400
+    n_blocks: Annotated[int, Field(ge=2, le=1000)] = 16
+
+    @model_validator(mode="after")
+    def _whole_blocks(self) -> Lyapunov:
+        if self.n_periods % self.n_blocks:
+            nearest = -(-self.n_periods // self.n_blocks) * self.n_blocks
+            raise ValueError(
+                f"n_periods = {self.n_periods} must be a multiple of n_blocks = {self.n_blocks}, "
+                f"such as {nearest}."
+            )
+        return self
+
+
+class Products(Table):
+    """``[products]``: what is computed of each cell besides its sections."""
+
+    nested_model: ClassVar[type[BaseModel] | None] = Lyapunov
+
+    lyapunov: Lyapunov | None = None
+
+
 class Execution(Table):
     """``[execution]``: sizes of tasks. They decide the layout of the store, never the numbers."""
 
@@ -260,6 +291,7 @@ class Spec:
     initial_conditions: Starts
     continuation: Continuation | None
     integration: Integration
+    products: Products
     execution: Execution
 
     @property
@@ -271,7 +303,8 @@ class Spec:
     def as_dict(self) -> dict[str, Any]:
         """Return plain data with all defaults filled in; `parse_spec` reads it back."""
         tables: dict[str, Any] = {"kind": self.kind, "title": self.title}
-        for name in ("parameters", "initial_conditions", "continuation", "integration", "execution"):
+        names = ("parameters", "initial_conditions", "continuation", "integration", "products", "execution")
+        for name in names:
             table = getattr(self, name)
             if table is not None:
                 tables[name] = table.model_dump(mode="json", exclude_none=True)
@@ -285,6 +318,7 @@ _TABLES: dict[str, type[Table]] = {
     "parameters": ParametersTable,
     "continuation": Continuation,
     "integration": Integration,
+    "products": Products,
     "execution": Execution,
 }
 _KEYS = (
@@ -295,6 +329,7 @@ _KEYS = (
     "initial_conditions",
     "continuation",
     "integration",
+    "products",
     "execution",
 )
 
@@ -403,7 +438,15 @@ def parse_spec(data: Mapping[str, Any]) -> Spec:
         raise SpecError(problems)
     assert starts is not None
     return Spec(
-        kind, title, tables["parameters"], axes, starts, walk, tables["integration"], tables["execution"]
+        kind,
+        title,
+        tables["parameters"],
+        axes,
+        starts,
+        walk,
+        tables["integration"],
+        tables["products"],
+        tables["execution"],
     )
 
 

@@ -42,7 +42,7 @@ from zarr.storage import LocalStore, WrapperStore
 from pipeline.cells import Coordinate, coordinates
 from pipeline.identity import canonical, differences, digest_of
 from pipeline.plan import Plan
-from pipeline.schema import STATES, VARIABLES
+from pipeline.schema import STATES
 from pipeline.spec import Spec
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ def _write_skeleton(cube: Path, spec: Spec, plan: Plan, attrs: Mapping[str, Any]
     """Write the metadata of all variables, and the coordinates."""
     kind = {"kind": plan.kind, "state": list(STATES), "Conventions": "CF-1.11"}
     group = zarr.create_group(LocalStore(cube), zarr_format=3, attributes={**kind, **attrs})
-    for variable in VARIABLES:
+    for variable in plan.variables:
         _create_array(
             group, variable.name, (*plan.dims, *variable.own_dims),
             (*plan.shape, *plan.chunks(variable)[len(plan.shape) :]),
@@ -345,7 +345,7 @@ def write_task(
         Cells by status name, for `status`.
     """
     cube = info.directory / CUBE
-    objects = [key for v in VARIABLES for key in _write_block(cube, plan, index, v.name, values[v.name])]
+    objects = [key for v in plan.variables for key in _write_block(cube, plan, index, v.name, values[v.name])]
     _sync((cube / key for key in objects), cube)
     marker = {
         "digest": info.digest,

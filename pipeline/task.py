@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core import Status, kernel_version, run_branches
+from magpend_core import Status, kernel_version, lyapunov_exponents, run_branches
 from magpend_core.pendulum import system_of
 from pipeline.cells import CellMap
+from pipeline.exponents import exponents
 from pipeline.identity import digest_of, identity_of
 from pipeline.plan import Plan, make_plan
 from pipeline.refinement import infer
@@ -50,7 +51,11 @@ def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, n
             inputs.parameters[branches], inputs.frequency_hz[branches], inputs.initial_states[branches],
             system=system, **integration,
         )  # fmt: skip
-        return {v.name: np.asarray(getattr(result, v.name), dtype=v.dtype) for v in VARIABLES}
+        values = {v.name: np.asarray(getattr(result, v.name), dtype=v.dtype) for v in VARIABLES}
+        if spec.products.lyapunov:
+            frequency, parameters = inputs.frequency_hz[branches], inputs.parameters[branches]
+            values |= exponents(parameters, frequency, result, spec, system)
+        return values
 
     if spec.refine is None:
         values = integrate(slice(None))
@@ -94,10 +99,16 @@ def warm_up(spec: Spec) -> float:
     One process compiles, so that workers find the machine code instead of each making it.
     """
     started = time.perf_counter()
-    packed = spec.parameters.load().pack()
+    parameters = spec.parameters.load()
+    packed, system = parameters.pack().reshape(1, 1, -1), system_of(parameters)
     options = {**spec.integration.model_dump(), "n_transient": 0, "n_keep": 1}
-    run_branches(
-        packed.reshape(1, 1, -1), np.full((1, 1), 2.0), np.zeros((1, 4)),
-        system=system_of(spec.parameters.load()), **options,
-    )  # fmt: skip
+    run_branches(packed, np.full((1, 1), 2.0), np.zeros((1, 4)), system=system, **options)
+    if spec.products.lyapunov:
+        n_exponents, short = (
+            spec.products.lyapunov.n_exponents,
+            {"n_transient": 0, "n_periods": 2, "n_blocks": 2},
+        )
+        lyapunov_exponents(
+            packed[0], np.full(1, 2.0), np.zeros((1, 4)), n_exponents=n_exponents, system=system, **short
+        )
     return time.perf_counter() - started

@@ -73,9 +73,7 @@ def test_lyapunov__on_closed_orbits_the_logarithms_of_the_multipliers(preset, re
     periods = np.array([orbit["orbit_period"] for orbit in orbits])
     orbit = polish_orbits(packed(preset, len(points)), frequency, points, periods)
     expected = np.log(np.abs(orbit.multipliers)) * (frequency / periods)[:, None]
-    found = lyapunov_exponents(
-        packed(preset, len(points)), frequency, orbit.section, n_transient=200, rtol=1e-9, atol=1e-9
-    )
+    found = lyapunov_exponents(packed(preset, len(points)), frequency, orbit.section, rtol=1e-9, atol=1e-9)
     assert np.sort(found.weighted)[:, ::-1] == pytest.approx(expected, abs=1e-4)
     # as the docstring says of the plain average
     assert (np.abs(found.exponents - expected) < 4.0 / 400 * frequency[:, None]).all()

@@ -105,13 +105,11 @@ def made(tmp_path, write_spec):
     info = store.create(tmp_path / "run", spec, plan, identity, SWEEP)
 
     def values(index: int) -> dict[str, np.ndarray]:
-        from pipeline.schema import VARIABLES, own_sizes
-
         shape = tuple(s.stop - s.start for s in plan.task(index))
-        sizes = own_sizes(plan.n_keep)
+        sizes = plan.sizes
         rng = np.random.default_rng(index)
         made_up = {}
-        for v in VARIABLES:
+        for v in plan.variables:
             numbers = rng.uniform(1, 5, (*shape, *(sizes[d] for d in v.own_dims)))
             made_up[v.name] = numbers.astype(v.dtype)
         made_up["status"][...] = 2
