@@ -4,6 +4,7 @@
     found = identify(ds)                 # integrates: Newton's method on one point per orbit
     named = match(found, threshold=0.3)  # does not; repeat it with other options
     loops = hysteresis(ds, named)        # continuation in both directions
+    stay = lifetimes(ds, named)          # integrates: which bounded sets are transients, and how long
 
 Schema
 ------
@@ -57,7 +58,7 @@ orbit, 4 one of the set, 5 ended on the orbit when it was run on; `orbits.decide
 that is not bounded (diverged, step limit, pending, unreached) has the id -1, and its own `status`; a
 bounded one that belongs to nothing found (see `bounded.Rule`) has the id -1 and `decision` 0. A spiral too
 far from its orbit to be told, and a chaotic transient, look like bounded sets here: what they become takes
-a longer run. An unstable orbit (`is_stable` 0) is listed only if a cell closed on it.
+a longer run, or `lifetimes`. An unstable orbit (`is_stable` 0) is listed only if a cell closed on it.
 
 A run with a loose `closure_tolerance` (1e-3 and more) is short, and its closed cells say little: sections
 recur within a few per cent near unstable orbits too, and near a period doubling with half the period.
@@ -75,41 +76,33 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.parameters import Parameters, load_preset
-from magpend_core.pendulum import PENDULUM_FITTED, system_of
+from magpend_core.parameters import Parameters
 from magpend_core.system import System
 from pipeline.analysis.bounded import Rule
 from pipeline.analysis.features import Features
 from pipeline.analysis.hysteresis import hysteresis
-from pipeline.analysis.identify import BUDGET, START_DIMS, Found, Options, search_all, slabs
+from pipeline.analysis.identify import (
+    BUDGET,
+    START_DIMS,
+    Found,
+    Options,
+    engine_inputs,
+    parameters_of,
+    search_all,
+    slabs,
+)
+from pipeline.analysis.lifetimes import lifetimes
 from pipeline.analysis.matching import match
 from pipeline.analysis.sides import Side
 
-__all__ = ["Rule", "hysteresis", "identify", "match", "parameters_of"]
-
-
-def parameters_of(ds: xr.Dataset) -> Parameters:
-    """Parameters that a run's attribute ``parameters`` tells, a line ``name = value`` for each.
-
-    Raises
-    ------
-    ValueError
-        If it is not there.
-    """
-    lines = str(ds.attrs.get("parameters", "")).splitlines()
-    values = {name.strip(): float(value) for name, _, value in (line.partition("=") for line in lines)}
-    if not values:
-        raise ValueError(
-            "The dataset has no attribute 'parameters'; give parameters, or set polish to False."
-        )
-    return load_preset().replace(**values)
+__all__ = ["Rule", "hysteresis", "identify", "lifetimes", "match", "parameters_of"]
 
 
 def identify(
     ds: xr.Dataset,
     *,
     parameters: Parameters | np.ndarray | None = None,
-    tolerance: float | None = None,
+    tolerance: float = 0.0,
     polish: bool = True,
     residual: float = 1e-10,
     max_orbit_period: int = 16,
@@ -129,7 +122,7 @@ def identify(
         What was integrated; by default as `ds.attrs` say. Axes of the cube replace the values of the
         same name. With another `system`, its packed vector.
     tolerance
-        Scaled distance within which a closed cell belongs to an orbit. By default ten times the
+        Scaled distance within which a closed cell belongs to an orbit; 0 takes ten times the
         attribute ``closure_tolerance`` of `ds`, and 1e-4 at least: a slow spiral can be eight times
         the closure tolerance away (`magpend_core.observers.closed_period`). Above 1e-3 the run is
         taken as loosely closed, see `pipeline.analysis.attractors`.
@@ -161,16 +154,14 @@ def identify(
     ValueError
         If a variable or the parameters are missing.
     """
-    if tolerance is None:
+    if tolerance == 0.0:
         tolerance = max(1e-4, 10.0 * float(ds.attrs.get("closure_tolerance", 1e-5)))
     elif not tolerance > 0.0:
-        raise ValueError(f"tolerance = {tolerance!r} is out of bounds: it must be greater than 0.")
+        raise ValueError(f"tolerance = {tolerance!r} is out of bounds: it must be 0 (default) or greater.")
     missing = [name for name in ("section", "status", "orbit_period") if name not in ds]
     if missing:
         raise ValueError(f"The dataset has no {', '.join(missing)}; give the dataset of pipeline.open_run.")
-    base = parameters_of(ds) if parameters is None and polish else parameters
-    if system is None:
-        system = system_of(base) if isinstance(base, Parameters) else PENDULUM_FITTED
+    base, system = engine_inputs(ds, parameters, system, needed=polish)
     options = Options(
         tolerance, polish, residual, max_orbit_period, rule or Rule(), n_points, mirror_threshold
     )

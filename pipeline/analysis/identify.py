@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.parameters import Parameters
+from magpend_core.parameters import Parameters, load_preset
+from magpend_core.pendulum import PENDULUM_FITTED, system_of
 from magpend_core.system import System
 from pipeline.analysis import features as feature
 from pipeline.analysis.bounded import Clouds, Rule, assign, find_sets
@@ -126,6 +127,33 @@ class Found:
     decision: np.ndarray
     features: list[Features]
     counts: list[int]
+
+
+def parameters_of(ds: xr.Dataset) -> Parameters:
+    """Parameters that a run's attribute ``parameters`` tells, a line ``name = value`` for each.
+
+    Raises
+    ------
+    ValueError
+        If it is not there.
+    """
+    lines = str(ds.attrs.get("parameters", "")).splitlines()
+    values = {name.strip(): float(value) for name, _, value in (line.partition("=") for line in lines)}
+    if not values:
+        raise ValueError(
+            "The dataset has no attribute 'parameters'; give parameters, or set polish to False."
+        )
+    return load_preset().replace(**values)
+
+
+def engine_inputs(
+    ds: xr.Dataset, parameters: Parameters | np.ndarray | None, system: System | None, *, needed: bool
+) -> tuple[Parameters | np.ndarray | None, System]:
+    """Parameters and system: those given, else those of the run."""
+    base = parameters_of(ds) if parameters is None and needed else parameters
+    if system is None:
+        system = system_of(base) if isinstance(base, Parameters) else PENDULUM_FITTED
+    return base, system
 
 
 # ---- reading -----------------------------------------------------------------------------------
@@ -307,7 +335,7 @@ def _undecided(point: Point, orbits: Sequence[Orbit], options: Options, geometry
     for block in point.blocks():
         label, _ = decide(block, orbits, options.tolerance, geometry)
         rest = np.flatnonzero(label < 0)
-        closed.add(_part(block, rest))
+        closed.add(block.take(rest))
         loose = rest[block.is_bounded[rest]]
         near = near.joined(near_closed(block.section[loose], options.max_orbit_period, geometry))
     keys, group = closed.close()
@@ -317,12 +345,6 @@ def _undecided(point: Point, orbits: Sequence[Orbit], options: Options, geometry
         own = closed.guesses.least(MAX_GUESSES)
         own = own.followed_by(own.without_period())
     return own.followed_by(near.least(MAX_GUESSES))
-
-
-def _part(block: Block, rows: np.ndarray) -> Block:
-    return Block(
-        block.cells, block.section[rows], block.status[rows], block.orbit_period[rows], block.turns[rows]
-    )
 
 
 def _conclude(

@@ -62,6 +62,12 @@ class Block:
     orbit_period: np.ndarray
     turns: np.ndarray
 
+    def take(self, rows: np.ndarray) -> Block:
+        """Cells by row; their places are no longer those of `cells`."""
+        return Block(
+            self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows]
+        )
+
     @property
     def is_closed(self) -> np.ndarray:
         """Cells whose sections close, or that were inferred to lie among such cells."""

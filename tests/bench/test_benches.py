@@ -74,3 +74,11 @@ def test_multistable_pendulum__threads_change_nothing(bench, monkeypatch):
     one, three = (pendulum.whole("to the end", 50, 200.0, threads, 3) for threads in (1, 3))
     assert one.label.tolist() == three.label.tolist()
     assert one.attempts == three.attempts
+
+
+def test_basins__prints_ratios_and_labels(bench, capsys):
+    few = ["--scipy-trajectories", "1", "--scipy-periods", "1"]
+    bench("basins").main(["--size", "4", "--bands", "2", "--transient", "300", *few])
+    printed = capsys.readouterr().out
+    for text in ("fixed transient", "stopped early", "ratio: periods 0.", "same labels: ", "RK45"):
+        assert text in printed
