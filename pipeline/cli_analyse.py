@@ -47,16 +47,16 @@ class Metric(StrEnum):
 
 def _option(name: str, default: Any, text: str) -> inspect.Parameter:
     """Option of an analysis; the bounds in the text are checked by `pipeline.derived`."""
-    kind: Any = type(default)
+    kind: Any = float | None if default is None else type(default)
     annotation = Annotated[kind, typer.Option(help=text)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 ATTRACTOR_OPTIONS = (
     _option(
-        "tolerance", 1e-4,
-        "Scaled distance (1 rad, 10 rad/s) within which a closed cell belongs to an orbit; above 0, ten "
-        "times the run's closure tolerance or more.",
+        "tolerance", None,
+        "Scaled distance (1 rad, 10 rad/s) within which a closed cell belongs to an orbit; above 0. "
+        "Default: ten times the run's closure tolerance, at least 1e-4.",
     ),
     _option("polish", True, "Refine orbits by Newton's method, which integrates a point per orbit."),
     _option("residual", 1e-10, "Scaled residual that Newton's method is to reach; above 0."),

@@ -330,13 +330,17 @@ def _identify(snapshot: Snapshot, options: Mapping[str, Any]) -> xr.Dataset:
 _NO_OPTIONS = frozenset({"block_bytes"})
 """Parameters that change nothing in a result."""
 
+_OPTIONAL = "float | None"
+"""Annotation of a number that by default follows from the run."""
+
 
 def _defaults_of(function: Callable[..., Any]) -> dict[str, Any]:
     """Options of a function that are numbers or words."""
     return {
         name: parameter.default
         for name, parameter in inspect.signature(function).parameters.items()
-        if isinstance(parameter.default, (bool, int, float, str)) and name not in _NO_OPTIONS
+        if (isinstance(parameter.default, (bool, int, float, str)) or parameter.annotation == _OPTIONAL)
+        and name not in _NO_OPTIONS
     }
 
 
@@ -345,11 +349,11 @@ _AT_LEAST_ONE = ("max_orbit_period", "n_points", "look_back", "rule_n_anchors", 
 
 
 def _with_defaults(product: str, options: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """All options of a product, checked, numbers in the type of their default."""
+    """All options of a product, checked, numbers in the type of their default; None asks for the default."""
     problems = [unknown_key(f"{product}.{name}", name, defaults) for name in options if name not in defaults]
     found = dict(defaults)
-    for name in options.keys() & defaults.keys():
-        kind = type(defaults[name])
+    for name in {n for n, value in options.items() if n in defaults and value is not None}:
+        kind = float if defaults[name] is None else type(defaults[name])
         try:
             found[name] = kind(options[name])
         except (TypeError, ValueError):
