@@ -131,6 +131,7 @@ def basin_rows(ds: xr.Dataset) -> list[Row]:
         one = ds.isel(at)
         for i, label in enumerate(ds["label"].values.tolist()):
             row = {**_where(ds, at), "label": label, "n_cells": int(one["count"][i])}
+            row["n_inferred"] = int(one["n_inferred"][i])
             rows.append(row | {name: float(one[name][i]) for name in names})
     return rows
 
@@ -169,7 +170,13 @@ def _basin_words(row: Row) -> dict[str, str]:
     words = {"id": _label(row["label"]), "cells": str(row["n_cells"]), "fraction": _with_interval(row)}
     if row["fraction_if_all"] > row["fraction_if_none"]:
         words["with the unfinished"] = f"{row['low_if_none']:.4f} to {row['high_if_all']:.4f}"
-    return words
+    return words | _inferred([row])
+
+
+def _inferred(rows: Sequence[Row]) -> dict[str, str]:
+    """How many cells were not integrated, if any."""
+    n = sum(row["n_inferred"] for row in rows)
+    return {"inferred cells": str(n)} if n else {}
 
 
 def _label_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
@@ -178,6 +185,7 @@ def _label_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> 
         **_ranges(ds, rows, dims),
         "cells": str(sum(r["n_cells"] for r in rows)),
         "max fraction": _largest_share(ds, rows, dims),
+        **_inferred(rows),
     }
 
 
@@ -345,7 +353,7 @@ def _cell_counts(ds: xr.Dataset, start_dims: Sequence[str]) -> list[str]:
     counts: dict[str, int] = {}
     for code, name in zip(codes, names, strict=True):
         n = int((unknown & (status == code)).sum())
-        what = "undecided" if name in ("periodic", "bounded") else name
+        what = "undecided" if name in ("periodic", "bounded", "inferred") else name
         if n:
             counts[what] = counts.get(what, 0) + n
     if not counts:

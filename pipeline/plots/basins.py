@@ -25,6 +25,7 @@ _DARKEST = 0.62
 _OTHERS = -1
 _FIRST_GREY = -2
 _CLOSED_ORBIT = 1  # kind in pipeline.analysis.attractors
+_INFERRED = 7  # code of magpend_core.status
 
 
 def plot_basins(
@@ -47,7 +48,8 @@ def plot_basins(
         Degrees instead of radians.
     n_periods
         Drive periods that each cell took, of the same cube; if given, cells that took longer to close are
-        darker, on a logarithmic scale from the 1st to the 99th percentile.
+        darker, on a logarithmic scale from the 1st to the 99th percentile. Inferred cells took none and
+        keep the plain colour.
 
     Returns
     -------
@@ -136,24 +138,24 @@ def _painted(
     table = np.round(255.0 * _colour_table(cast)).astype(np.uint8)
     picture = table[codes]
     if scale is not None:
-        decided = _closed(data, part)
+        decided = _timed(data, part)
         dark = np.clip(scale(data["n_periods"].values[decided].astype(np.float32)), 0.0, 1.0)
         factor = (1.0 - _DARKEST * np.asarray(dark, np.float32))[:, None]
         picture[decided] = np.round(picture[decided] * factor).astype(np.uint8)
     return np.asarray(picture)
 
 
-def _closed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
-    """Cells on closed orbits: the time that others took is no time to converge."""
+def _timed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
+    """Integrated cells on closed orbits: the time that others took is no time to converge."""
     closed = np.append(part["kind"].values == _CLOSED_ORBIT, False)
-    return np.asarray(closed[data["attractor_id"].values])
+    return np.asarray(closed[data["attractor_id"].values] & (data["status"].values != _INFERRED))
 
 
 def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
     """Scale of the shading, from the times of the cells on closed orbits, without the extremes."""
     if "n_periods" not in data:
         return None
-    times = data["n_periods"].values[_closed(data, part)]
+    times = data["n_periods"].values[_timed(data, part)]
     if not times.size:
         return None
     low, high = (max(float(x), 1.0) for x in np.percentile(times, [1.0, 99.0]))

@@ -30,7 +30,7 @@ OTHERS = "#C8E6C0"
 
 # Codes of magpend_core.status, which is not imported: it would bring the compiler with it.
 UNASSIGNED: dict[str, tuple[int, ...]] = {
-    "undecided": (1, 2),
+    "undecided": (1, 2, 7),
     "diverged": (3,),
     "step limit": (4, 5),
     "pending": (0, 6),

@@ -195,3 +195,11 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
     lines = report.basin_lines(measured, report.basin_rows(measured))
     assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz", lines[3])
     assert lines[4] == "not computed: boundaries: the starts are no grid"
+    assert not any("inferred" in line for line in lines)
+    refined = ds["status"].where(cells == 0, 7).astype(np.int8).assign_attrs(flags)
+    measured = basins_of(cube, ds.assign(status=refined))
+    rows = report.basin_rows(measured)
+    assert [row["n_inferred"] for row in rows] == [row["n_cells"] * (row["label"] == 1) for row in rows]
+    lines = report.basin_lines(measured, rows)
+    assert lines[1].endswith("inferred cells")
+    assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz +14$", lines[3])

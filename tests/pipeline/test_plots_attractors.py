@@ -16,7 +16,7 @@ from pipeline.analysis.sides import Side
 from pipeline.plots import palette, plot_basins, plot_fractions, save_data, save_figure
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
-PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED = range(7)
+PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = range(8)
 
 
 def make_attractors(ids, dims, coords, n=None, status=None):
@@ -145,6 +145,23 @@ def test_plot_basins__shading_by_time(grid):
     fig = plot_basins(grid, n_periods=periods)
     assert [ax.get_xlabel() for ax in fig.axes if ax.get_gid() == "time"] == ["drive periods to converge"]
     assert fig.data["n_periods"].transpose(*GRID).values.tolist() == periods.values.tolist()
+
+
+def test_plot_basins__inferred_cells(grid):
+    """They have their basin's colour, took no time, and are undecided if they belong to nothing."""
+    inferred = grid.copy(deep=True)
+    inferred["status"][1, :2] = INFERRED
+    inferred["status"][2, 1] = INFERRED
+    assert legend_texts(plot_basins(inferred)) == legend_texts(plot_basins(grid))
+    plain = colours_of(plot_basins(inferred))
+    assert (plain == colours_of(plot_basins(grid))).all()
+    periods = xr.full_like(grid["attractor_id"], 100)
+    periods[1, 2:] = 1000
+    periods[1, :2] = 0
+    shaded = colours_of(plot_basins(inferred, n_periods=periods))
+    assert (shaded[1, :2] == plain[1, :2]).all()
+    # not the zeros set the bright end of the scale
+    assert np.allclose(shaded[0], plain[0], atol=0.003)
 
 
 def test_plot_basins__selection(grid):
