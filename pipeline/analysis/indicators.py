@@ -26,6 +26,7 @@ from scipy import fft
 from magpend_core.pendulum import PENDULUM_FITTED
 from magpend_core.status import Status
 from pipeline.analysis.sets import Geometry
+from pipeline.schema import LyapunovFlag
 
 Floats = npt.NDArray[np.float64]
 
@@ -266,9 +267,9 @@ def kaplan_yorke_dimension(
     Parameters
     ----------
     ds
-        Has `name` on `dim`, in any order and unit, and its errors ``<name>_stderr`` if they are known.
-        Of the exponents of the section: without the zero along the flow. If there are fewer than
-        the dim `state` of `ds` has entries, the spectrum is known in part.
+        Has `name` on `dim`, in any order and unit: exponents of the section, without the zero along
+        the flow. If there are fewer than the dim `state` has entries, the spectrum is known in part. If
+        it has their errors ``<name>_stderr`` and the flags ``<name>_flag`` of a cube, they are used.
     name, dim
         Of the exponents.
     zero
@@ -280,8 +281,8 @@ def kaplan_yorke_dimension(
     Dataset
         On the other dims: `kaplan_yorke_dimension` and `kaplan_yorke_dimension_stderr`, the errors of
         the exponents carried over to first order as if they were independent, for fixed j; NaN without
-        them. NaN, too, where a spectrum known in part does not reach a negative sum, or an exponent is
-        NaN.
+        them. NaN, too, where a spectrum known in part does not reach a negative sum, an exponent is
+        NaN, or the flag is not `LyapunovFlag.GOOD`.
 
     Raises
     ------
@@ -315,6 +316,8 @@ def kaplan_yorke_dimension(
     error = np.where(np.isnan(errors).any(axis=-1), np.nan, error)
     unknown = np.isnan(rates).any(axis=-1) | ((j == n) & (n < ds.sizes.get("state", n)))
     dims = exponents.dims[:-1]
+    if f"{name}_flag" in ds:
+        unknown |= ds[f"{name}_flag"].transpose(*dims).values != LyapunovFlag.GOOD
     variables: dict[str, Any] = {}
     for key, values, text in (
         ("kaplan_yorke_dimension", dimension, "Kaplan-Yorke dimension of the section"),
