@@ -13,13 +13,14 @@ import xarray as xr
 from pipeline.analysis.basin_numbers import Interval, basin_fractions
 from pipeline.analysis.basins import DIVERGED, outcomes
 from pipeline.analysis.identify import START_DIMS
+from pipeline.analysis.orbits import DECISIONS
 
 FEW_POINTS = 6
 """Up to so many parameter points get a table each."""
 
 Row = dict[str, Any]
 
-_DECISIONS = ("closed", "certain", "approaching", "same_set")
+_DECISIONS = DECISIONS[1:]
 
 
 def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence: float = 0.95) -> list[Row]:

@@ -93,6 +93,7 @@ from pipeline.analysis.identify import (
 )
 from pipeline.analysis.lifetimes import lifetimes
 from pipeline.analysis.matching import match
+from pipeline.analysis.orbits import DECISIONS
 from pipeline.analysis.sides import Side
 
 __all__ = ["Rule", "hysteresis", "identify", "lifetimes", "match", "parameters_of"]
@@ -174,8 +175,6 @@ def identify(
 
 # ---- result ------------------------------------------------------------------------------------
 
-_DECISIONS = "undecided closed certain approaching same_set run_on"
-
 
 def _flags(words: str) -> dict[str, Any]:
     n = len(words.split())
@@ -214,7 +213,7 @@ def _dataset(
     result["decision"] = (
         cell_dims,
         decisions,
-        {"units": "1", "long_name": "how the cell was decided", **_flags(_DECISIONS)},
+        {"units": "1", "long_name": "how the cell was decided", **_flags(" ".join(DECISIONS))},
     )
     about = {"units": "1", "long_name": "what became of the cell", **ds["status"].attrs}
     result["status"] = (cell_dims, ds["status"].transpose(*cell_dims).values, about)

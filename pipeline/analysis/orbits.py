@@ -39,7 +39,8 @@ RUN_ON_PERIODS, RUN_ON_TOLERANCE, RUN_ON_RTOL = 2000, 1e-5, 1e-8
 MAX_GUESSES = 64
 """Most guesses per parameter point from cells that are not closed."""
 
-UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, RUN_ON = range(6)
+DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "run_on")
+UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, RUN_ON = range(len(DECISIONS))
 """How a cell was decided: values of `decision`."""
 
 

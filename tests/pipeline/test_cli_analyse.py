@@ -71,7 +71,7 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
         one = ds.sel(at).isel(attractor=i)
         assert int(row["n_cells"]) == int(one["n_cells"])
         assert float(row["low"]) < float(row["fraction"]) < float(row["high"])
-        decided = sum(int(row[name]) for name in ("closed", "certain", "approaching", "same_set"))
+        decided = sum(int(row[name]) for name in ("closed", "certain", "approaching", "same_set", "run_on"))
         assert decided == int(row["n_cells"])
         modulus = abs(complex(one["multiplier_real"][0], one["multiplier_imag"][0]))
         assert row["multiplier_modulus"] == ("" if np.isnan(modulus) else repr(modulus))
