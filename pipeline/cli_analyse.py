@@ -85,7 +85,7 @@ BASIN_OPTIONS = (
 )
 
 
-def _takes(*options: inspect.Parameter) -> Callable[[F], F]:
+def takes(*options: inspect.Parameter) -> Callable[[F], F]:
     """Give a command that has ``**options`` these options by name."""
 
     def decorate(function: F) -> F:
@@ -108,7 +108,7 @@ def _directory(context: typer.Context, directory: Directory) -> None:
 
 
 @analyse_app.command(epilog=EXIT_HELP)
-@_takes(*ATTRACTOR_OPTIONS)
+@takes(*ATTRACTOR_OPTIONS)
 def attractors(context: typer.Context, csv: Csv = None, **options: Any) -> None:
     """Find the attractors at every parameter point, and follow them along the axes.
 
@@ -124,7 +124,7 @@ def attractors(context: typer.Context, csv: Csv = None, **options: Any) -> None:
 
 
 @analyse_app.command(epilog=EXIT_HELP)
-@_takes(*BASIN_OPTIONS, *ATTRACTOR_OPTIONS)
+@takes(*BASIN_OPTIONS, *ATTRACTOR_OPTIONS)
 def basins(context: typer.Context, csv: Csv = None, **options: Any) -> None:
     """Measure the basins of a sweep: fractions with intervals, entropy, uncertainty exponent, Wada test.
 
@@ -139,7 +139,7 @@ def basins(context: typer.Context, csv: Csv = None, **options: Any) -> None:
 
 
 @analyse_app.command(epilog=EXIT_HELP)
-@_takes(*ATTRACTOR_OPTIONS)
+@takes(*ATTRACTOR_OPTIONS)
 def hysteresis(context: typer.Context, csv: Csv = None, **options: Any) -> None:
     """Say where a continuation meets other attractors going up than going down, and where it jumps."""
     from pipeline import derived, report

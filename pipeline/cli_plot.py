@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipeline.cli_analyse import ATTRACTOR_OPTIONS, takes
 from pipeline.cli_common import EXIT_HELP, Directory, read_pairs, refusals
 
 if TYPE_CHECKING:
@@ -35,6 +36,14 @@ class Layout(StrEnum):
 
     OVERLAY = "overlay"
     SIDE = "side"
+
+
+class Show(StrEnum):
+    """What a map of regimes tells apart."""
+
+    PERIODS = "periods"
+    ATTRACTORS = "attractors"
+    NUMBER = "number"
 
 
 class Format(StrEnum):
@@ -95,6 +104,7 @@ FileFormat = Annotated[
 
 
 @plot_app.command(epilog=EXIT_HELP)
+@takes(*ATTRACTOR_OPTIONS)
 def basins(
     directory: Directory,
     at: At = None,
@@ -102,6 +112,7 @@ def basins(
     degrees: Degrees = False,
     out: Out = None,
     file_format: FileFormat = None,
+    **options: Any,
 ) -> None:
     """Draw basins of attraction: which attractor each initial state of a grid ends on."""
 
@@ -112,11 +123,14 @@ def basins(
         periods = open_run(directory)["n_periods"] if shade else None
         return plot_basins(found, at=_positions(at, degrees), degrees=degrees, n_periods=periods)
 
-    _draw_attractors(directory, "basins", draw, out, file_format)
+    _draw_attractors(directory, "basins", draw, options, out, file_format)
 
 
 @plot_app.command(epilog=EXIT_HELP)
-def fractions(directory: Directory, at: At = None, out: Out = None, file_format: FileFormat = None) -> None:
+@takes(*ATTRACTOR_OPTIONS)
+def fractions(
+    directory: Directory, at: At = None, out: Out = None, file_format: FileFormat = None, **options: Any
+) -> None:
     """Draw basin fractions over the swept parameter, as stacked bands."""
 
     def draw(found: xr.Dataset) -> DataFigure:
@@ -124,13 +138,77 @@ def fractions(directory: Directory, at: At = None, out: Out = None, file_format:
 
         return plot_fractions(found, at=_positions(at))
 
-    _draw_attractors(directory, "fractions", draw, out, file_format)
+    _draw_attractors(directory, "fractions", draw, options, out, file_format)
+
+
+@plot_app.command(epilog=EXIT_HELP)
+@takes(*ATTRACTOR_OPTIONS)
+def gallery(
+    directory: Directory, at: At = None, out: Out = None, file_format: FileFormat = None, **options: Any
+) -> None:
+    """Draw the attractors of one parameter point: phase portraits and the path of the moving magnet.
+
+    Integrates one period of each, for the portraits.
+    """
+
+    def draw(found: xr.Dataset) -> DataFigure:
+        from pipeline.analysis.portraits import portraits
+        from pipeline.plots import plot_gallery
+
+        return plot_gallery(found, portraits(found, at=_positions(at)))
+
+    _draw_attractors(directory, "gallery", draw, options, out, file_format)
+
+
+@plot_app.command(epilog=EXIT_HELP)
+@takes(*ATTRACTOR_OPTIONS)
+def attractors(
+    directory: Directory,
+    state: Annotated[State, typer.Option(help="What is drawn over the parameter.")] = State.PSI1,
+    at: At = None,
+    degrees: Degrees = False,
+    out: Out = None,
+    file_format: FileFormat = None,
+    **options: Any,
+) -> None:
+    """Draw all coexisting attractors over the swept parameter, with the hysteresis of a continuation."""
+
+    def draw(found: xr.Dataset) -> DataFigure:
+        from pipeline import derived
+        from pipeline.plots import plot_coexisting
+
+        both = "direction" in found.coords and {"up", "down"} == set(found["direction"].values.tolist())
+        loops = derived.hysteresis(directory, echo=typer.echo, **options) if both else None
+        return plot_coexisting(found, state=state.value, at=_positions(at), degrees=degrees, hysteresis=loops)
+
+    _draw_attractors(directory, f"attractors_{state.value}", draw, options, out, file_format)
+
+
+@plot_app.command(epilog=EXIT_HELP)
+@takes(*ATTRACTOR_OPTIONS)
+def regimes(
+    directory: Directory,
+    show: Annotated[Show, typer.Option(help="What is told apart.")] = Show.PERIODS,
+    at: At = None,
+    out: Out = None,
+    file_format: FileFormat = None,
+    **options: Any,
+) -> None:
+    """Draw a map of two swept parameters: which periods or attractors coexist, or how many."""
+
+    def draw(found: xr.Dataset) -> DataFigure:
+        from pipeline.plots import plot_regimes
+
+        return plot_regimes(found, show=show.value, at=_positions(at))
+
+    _draw_attractors(directory, f"regimes_{show.value}", draw, options, out, file_format)
 
 
 def _draw_attractors(
     directory: Path,
     name: str,
     draw: Callable[[xr.Dataset], DataFigure],
+    options: dict[str, Any],
     out: Path | None,
     file_format: Format | None,
 ) -> None:
@@ -139,8 +217,9 @@ def _draw_attractors(
     from pipeline import derived
     from pipeline.plots import save_data, save_figure
 
+    found = derived.attractors(directory, echo=typer.echo, **options)
     with refusals(directory):
-        figure = draw(derived.attractors(directory, echo=typer.echo))
+        figure = draw(found)
     target.parent.mkdir(exist_ok=True)
     typer.echo(f"figure: {save_figure(figure, target)}")
     typer.echo(f"data: {save_data(figure, target)}")

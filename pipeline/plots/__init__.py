@@ -6,8 +6,21 @@ in any thread and without a display.
 
 from pipeline.plots.basins import plot_basins
 from pipeline.plots.bifurcation import plot_bifurcation
+from pipeline.plots.coexisting import plot_coexisting
 from pipeline.plots.fractions import plot_fractions
+from pipeline.plots.gallery import plot_gallery
+from pipeline.plots.regimes import plot_regimes
 from pipeline.plots.style import save_data, save_figure
 from pipeline.plots.trajectory import plot_trajectory
 
-__all__ = ["plot_basins", "plot_bifurcation", "plot_fractions", "plot_trajectory", "save_data", "save_figure"]
+__all__ = [
+    "plot_basins",
+    "plot_bifurcation",
+    "plot_coexisting",
+    "plot_fractions",
+    "plot_gallery",
+    "plot_regimes",
+    "plot_trajectory",
+    "save_data",
+    "save_figure",
+]

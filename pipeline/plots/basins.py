@@ -11,10 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import AutoMinorLocator, LogLocator, NullLocator, ScalarFormatter
-from scipy.ndimage import distance_transform_edt
 
+from pipeline.analysis.selection import choose, start_dims
 from pipeline.plots import palette, style
 
 START_AXES = ("psi1_0", "psi2_0", "psi1_dot_0", "psi2_dot_0")
@@ -64,10 +63,10 @@ def plot_basins(
         does not settle.
     """
     axes = _axes(attractors, at)
-    part = palette.choose(attractors, at, axes, f"an image of basins has the axes {' and '.join(axes)}")
+    part = choose(attractors, at, axes, f"an image of basins has the axes {' and '.join(axes)}")
     data = part[["attractor_id", "status"]].transpose(*reversed(axes))
     if n_periods is not None:
-        data["n_periods"] = palette.choose(
+        data["n_periods"] = choose(
             n_periods.to_dataset(name="attractor_id"), at, axes, "an image of basins has two axes"
         )["attractor_id"].transpose(*reversed(axes))
     cast = palette.cast_of(attractors, part)
@@ -81,7 +80,8 @@ def plot_basins(
     )  # fmt: skip
     image.set_gid("basins")
     _dress(ax, axes, degrees)
-    _write_letters(ax, codes, image.get_extent(), cast)
+    stride = max(1, max(codes.shape) // 400)
+    palette.write_letters(ax, codes[::stride, ::stride], cast.main)
     entries = _entries(cast, counts, codes.size)
     left = _LEFT_IN + _SIDE_IN + 0.18
     palette.legend_column(fig, entries, left, _TOP_IN)
@@ -96,7 +96,7 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
     """Names of the two axes of the image: horizontal, vertical."""
     grid = [d for d in START_AXES if d in attractors["attractor_id"].dims]
     if len(grid) < 2:
-        have = ", ".join(palette.start_dims(attractors)) or "none"
+        have = ", ".join(start_dims(attractors)) or "none"
         raise ValueError(
             f"an image of basins needs a grid over two initial states, and the initial states lie along: "
             f'{have}; run a sweep with initial_conditions kind = "grid"'
@@ -197,44 +197,17 @@ def _dress(ax: Axes, axes: tuple[str, str], degrees: bool) -> None:
             style.set_angle_ticks(ax, low, high, degrees=degrees, axis=axis)
 
 
-def _write_letters(
-    ax: Axes, codes: np.ndarray, extent: tuple[float, float, float, float], cast: palette.Cast
-) -> None:
-    """Write each attractor's letter into the widest place of its basin, if one is wide enough."""
-    stride = max(1, max(codes.shape) // 400)
-    small = codes[::stride, ::stride]
-    padded = np.pad(small, 1, constant_values=np.iinfo(np.int32).min)
-    least = 0.025 * max(small.shape)
-    left, right, bottom, top = extent
-    for number in cast.main:
-        depth = distance_transform_edt(padded == number)[1:-1, 1:-1]
-        row, column = np.unravel_index(int(depth.argmax()), depth.shape)
-        if depth[row, column] < least:
-            continue
-        x = left + (right - left) * (column * stride + 0.5) / codes.shape[1]
-        y = bottom + (top - bottom) * (row * stride + 0.5) / codes.shape[0]
-        ax.text(
-            x, y, palette.letter(number), ha="center", va="center", fontsize=style.LABEL_PT, color="black",
-            path_effects=[withStroke(linewidth=2.0, foreground="white")],
-        )  # fmt: skip
-
-
 def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[tuple[str, str]]:
     """Legend: attractors by falling share, then the others, then what has no attractor."""
     own = sorted((i for i in counts if i >= 0), key=lambda i: (-counts[i], i))
-    entries = [(f"{cast.names[i]}, {_percent(counts[i], total)}", cast.colours[i]) for i in own]
+    entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / total)}", cast.colours[i]) for i in own]
     if _OTHERS in counts:
         n = len(cast.names) - len(cast.main)
-        entries.append((f"{n} others, {_percent(counts[_OTHERS], total)}", palette.OTHERS))
+        entries.append((f"{n} others, {palette.percent(counts[_OTHERS] / total)}", palette.OTHERS))
     for k, name in enumerate(palette.UNASSIGNED):
         if (code := _FIRST_GREY - k) in counts:
-            entries.append((f"{name}, {_percent(counts[code], total)}", palette.GREYS[name]))
+            entries.append((f"{name}, {palette.percent(counts[code] / total)}", palette.GREYS[name]))
     return entries
-
-
-def _percent(count: int, total: int) -> str:
-    share = 100.0 * count / total
-    return f"{share:.1f} %" if share >= 0.05 else "< 0.1 %"
 
 
 def _draw_scale(fig: Figure, scale: LogNorm, left_in: float) -> None:

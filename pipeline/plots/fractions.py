@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import AutoMinorLocator
 
+from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.plots import palette, style
 
-_LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN, _HEIGHT_IN = 0.58, 4.55, 0.5, 0.3, 3.4
+_LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN, _HEIGHT_IN = 0.66, 4.6, 0.5, 0.3, 3.5
 
 
 def plot_fractions(attractors: xr.Dataset, *, at: Mapping[str, float] | None = None) -> style.DataFigure:
@@ -38,17 +39,14 @@ def plot_fractions(attractors: xr.Dataset, *, at: Mapping[str, float] | None = N
         If there is not one swept parameter left.
     """
     parameter = swept_parameter(attractors, at, "fractions")
-    keep = (parameter, *palette.start_dims(attractors))
-    part = palette.choose(attractors, at, keep, f"fractions are drawn over {parameter}")
+    keep = (parameter, *start_dims(attractors))
+    part = choose(attractors, at, keep, f"fractions are drawn over {parameter}")
     cast = palette.cast_of(attractors, part)
     data = _fractions(part, parameter, cast)
-    fig = style.new_data_figure(_HEIGHT_IN + _BOTTOM_IN + _TOP_IN, data)
-    width, height = fig.get_size_inches()
-    ax = fig.add_axes(
-        (_LEFT_IN / width, _BOTTOM_IN / height, (_RIGHT_IN - _LEFT_IN) / width, _HEIGHT_IN / height)
-    )
-    entries = _draw(ax, data, parameter, cast)
-    palette.legend_column(fig, entries[::-1], _RIGHT_IN + 0.15, _TOP_IN)
+    bands = _bands(data, cast)
+    entries = [(band.name, band.colour) for band in reversed(bands)]
+    fig, ax = new_panel(data, entries)
+    _draw(ax, data, parameter, bands)
     n = int(data["n_cells"].max())
     text = ", ".join(filter(None, [palette.caption(part), f"{n} initial states each"]))
     ax.text(0.0, 1.015, text, transform=ax.transAxes, fontsize=style.LEGEND_PT)
@@ -56,9 +54,21 @@ def plot_fractions(attractors: xr.Dataset, *, at: Mapping[str, float] | None = N
     return fig
 
 
+def new_panel(data: xr.Dataset, entries: Sequence[palette.Entry]) -> tuple[style.DataFigure, Axes]:
+    """Make a figure with one panel and a legend beside it, high enough for both."""
+    left = _RIGHT_IN + 0.15
+    panel = max(_HEIGHT_IN, palette.column_height(entries, left) - 0.3)
+    fig = style.new_data_figure(panel + _BOTTOM_IN + _TOP_IN, data)
+    width, height = fig.get_size_inches()
+    ax = fig.add_axes((_LEFT_IN / width, _BOTTOM_IN / height, (_RIGHT_IN - _LEFT_IN) / width, panel / height))
+    style.style_axes(ax)
+    palette.legend_column(fig, entries, left, _TOP_IN)
+    return fig, ax
+
+
 def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what: str) -> str:
     """Return the one swept parameter that `at` leaves."""
-    dims = palette.parameter_dims(attractors)
+    dims = parameter_dims(attractors)
     left = [d for d in dims if d not in (at or {})]
     long = [d for d in left if attractors.sizes[d] > 1]
     chosen = long or left
@@ -110,45 +120,59 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
     )
 
 
-def _draw(ax: Axes, data: xr.Dataset, parameter: str, cast: palette.Cast) -> list[tuple[str, str]]:
-    """Draw the bands from below; return the legend's entries in the same order."""
+@dataclass(frozen=True)
+class _Band:
+    """A band: its name, colour, height at each value of the parameter, and id, -1 for none."""
+
+    name: str
+    colour: str
+    height: np.ndarray
+    attractor: int = -1
+
+
+def _bands(data: xr.Dataset, cast: palette.Cast) -> list[_Band]:
+    """Bands from below: attractors by falling share, the others, cells without an attractor."""
     share = data["fraction"].values
-    edges = style.edges(data[parameter].values.astype(np.float64))
     n = len(cast.names)
     total = share[:, :n].sum(axis=0)
     own = sorted((i for i in cast.main if total[i] > 0), key=lambda i: (-total[i], i))
     rest = [i for i in range(n) if i not in cast.main and total[i] > 0]
-    bands = [(cast.names[i], cast.colours[i], share[:, i], palette.letter(i)) for i in own]
+    bands = [_Band(cast.names[i], cast.colours[i], share[:, i], i) for i in own]
     if rest:
-        bands.append((f"{len(rest)} others", palette.OTHERS, share[:, rest].sum(axis=1), ""))
+        bands.append(_Band(f"{len(rest)} others", palette.OTHERS, share[:, rest].sum(axis=1)))
     for k, name in enumerate(palette.UNASSIGNED):
         if share[:, n + k].any():
-            bands.append((name, palette.GREYS[name], share[:, n + k], ""))
-    floor = np.zeros(len(share))
-    for name, colour, height, mark in bands:
-        looks = {"facecolor": colour, "edgecolor": "none", "linewidth": 0.0}
-        style.fill_columns(ax, edges, floor, floor + height, looks, f"band:{mark or name}")
-        _write_letter(ax, edges, floor, height, mark)
-        floor = floor + height
+            bands.append(_Band(name, palette.GREYS[name], share[:, n + k]))
+    return bands
+
+
+def _draw(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) -> None:
+    edges = style.edges(data[parameter].values.astype(np.float64))
+    floor = np.zeros(edges.size - 1)
+    for band in bands:
+        looks = {"facecolor": band.colour, "edgecolor": "none", "linewidth": 0.0}
+        mark = palette.letter(band.attractor) if band.attractor >= 0 else band.name
+        style.fill_columns(ax, edges, floor, floor + band.height, looks, f"band:{mark}")
+        floor = floor + band.height
+    codes = np.array([band.attractor for band in bands])
+    heights = np.array([band.height for band in bands])
+    rising = slice(None) if edges[-1] > edges[0] else slice(None, None, -1)
+    palette.write_letters(ax, _raster(edges[rising], codes, heights[:, rising]), codes[codes >= 0].tolist())
     ax.set_xlim(float(edges.min()), float(edges.max()))
     ax.set_ylim(0.0, 1.0)
-    style.style_axes(ax)
+    # ticks inside would lie on the bands
     ax.tick_params(which="both", direction="out", top=False, right=False)
     ax.xaxis.set_minor_locator(AutoMinorLocator())
     ax.yaxis.set_minor_locator(AutoMinorLocator(2))
     ax.set_xlabel(style.parameter_label(data[parameter]), fontsize=style.LABEL_PT)
     ax.set_ylabel("basin fraction", fontsize=style.LABEL_PT)
-    return [(name, colour) for name, colour, _, _ in bands]
 
 
-def _write_letter(ax: Axes, edges: np.ndarray, floor: np.ndarray, height: np.ndarray, mark: str) -> None:
-    """Write a letter into the highest column of a band, the middle one of a row of them."""
-    if not mark or height.max() < 0.06:
-        return
-    smooth = np.convolve(np.pad(height, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    best = np.flatnonzero(np.isclose(smooth, smooth.max()))
-    i = int(best[len(best) // 2])
-    ax.text(
-        0.5 * (edges[i] + edges[i + 1]), floor[i] + 0.5 * height[i], mark, ha="center", va="center",
-        fontsize=style.LABEL_PT, path_effects=[withStroke(linewidth=2.0, foreground="white")],
-    )  # fmt: skip
+def _raster(edges: np.ndarray, codes: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """Code of the band at each place of the axes, 300 x 300 from below; -1 for none."""
+    place = (np.arange(300) + 0.5) / 300
+    x = edges[0] + place * (edges[-1] - edges[0])
+    column = np.clip(np.searchsorted(edges, x) - 1, 0, heights.shape[1] - 1)
+    tops = np.cumsum(heights, axis=0)[:, column]
+    band = (place[:, None, None] >= tops[None]).sum(axis=1)
+    return np.asarray(codes[np.minimum(band, len(codes) - 1)], np.int32)

@@ -9,15 +9,20 @@ Comput. Graph. 15, 2009). Letters tell attractors apart where colours do not.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
+from scipy.ndimage import distance_transform_edt
 
 from pipeline.analysis.sides import Side
 from pipeline.plots import style
@@ -38,6 +43,12 @@ UNASSIGNED: dict[str, tuple[int, ...]] = {
 """What a cell without an attractor is called, by its status."""
 
 GREYS = {"undecided": "0.75", "diverged": "0.0", "step limit": "0.45", "pending": "0.95"}
+
+
+_LETTERS_PER_IN = 17.5
+_LINE_IN, _GAP_IN = 0.192, 0.045
+_LETTER_IN = 0.11
+"""Half the height of a letter with some air around it [in]."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +106,7 @@ def describe(one: xr.Dataset) -> str:
         return "absent"
     periods = one["orbit_period"].values.ravel()[present]
     sides = one["side"].values.ravel()[present]
-    return ", ".join(part for part in (_periods(periods), _sides(sides), _turns(one, sides)) if part)
+    return ", ".join(part for part in (_periods(periods), _sides(sides) + _turns(one, sides)) if part)
 
 
 def _periods(periods: np.ndarray) -> str:
@@ -111,7 +122,7 @@ def _periods(periods: np.ndarray) -> str:
 
 def _sides(sides: np.ndarray) -> str:
     found = sorted({int(s) for s in sides} - {int(Side.UNKNOWN), int(Side.UNDECIDED)})
-    return "/".join(Side(s).name.lower() for s in found)
+    return " or ".join(Side(s).name.lower() for s in found)
 
 
 def _turns(one: xr.Dataset, sides: np.ndarray) -> str:
@@ -122,7 +133,8 @@ def _turns(one: xr.Dataset, sides: np.ndarray) -> str:
     links = links[one["kind"].values.ravel() > 0]
     if np.ptp(links, axis=0).max() > 0.05:
         return ""
-    return "({})".format(", ".join(_signed(x) for x in links.mean(axis=0)))
+    # no-break spaces: a legend's line is not folded here
+    return "\u00a0({})".format(",\u00a0".join(_signed(x) for x in links.mean(axis=0)))
 
 
 def _signed(turns: float) -> str:
@@ -132,11 +144,18 @@ def _signed(turns: float) -> str:
     return f"{rounded:+g}".replace("-", "\N{MINUS SIGN}")
 
 
-def legend_column(fig: Figure, entries: list[tuple[str, str]], left_in: float, top_in: float) -> Legend:
-    """Put colour patches with texts in a column, its corner given from the left and the top [in]."""
+Entry = tuple[str, str] | Artist
+"""Line of a legend: a text and the colour of its patch, or an artist with a label."""
+
+
+def legend_column(fig: Figure, entries: Sequence[Entry], left_in: float, top_in: float) -> Legend:
+    """Put a legend into the space right of the axes, its corner given from the left and the top [in]."""
     width, height = fig.get_size_inches()
     handles: list[Any] = [
-        Patch(facecolor=colour, edgecolor="0.4", linewidth=0.3, label=text) for text, colour in entries
+        entry
+        if isinstance(entry, Artist)
+        else Patch(facecolor=entry[1], edgecolor="0.4", linewidth=0.3, label=_folded(entry[0], left_in))
+        for entry in entries
     ]
     return fig.legend(
         handles=handles, loc="upper left", bbox_to_anchor=(left_in / width, 1.0 - top_in / height),
@@ -145,68 +164,57 @@ def legend_column(fig: Figure, entries: list[tuple[str, str]], left_in: float, t
     )  # fmt: skip
 
 
-def parameter_dims(attractors: xr.Dataset) -> list[str]:
-    """Names of the swept parameters."""
-    return [str(d) for d in attractors["kind"].dims if d != "attractor"]
+def column_height(entries: Sequence[Entry], left_in: float) -> float:
+    """Height [in] that a legend column will take."""
+    texts = [str(e.get_label()) if isinstance(e, Artist) else _folded(e[0], left_in) for e in entries]
+    lines = [1 + text.count("\n") for text in texts]
+    return sum(_LINE_IN * n + (_GAP_IN if n > 1 else 0.0) for n in lines)
 
 
-def start_dims(attractors: xr.Dataset) -> list[str]:
-    """Names of the dims that tell the cells of one parameter point apart."""
-    return [str(d) for d in attractors["attractor_id"].dims if d not in parameter_dims(attractors)]
+def _folded(text: str, left_in: float) -> str:
+    letters = int((style.WIDTH_IN - left_in - 0.35) * _LETTERS_PER_IN)
+    return textwrap.fill(text, letters, subsequent_indent="   ", break_long_words=False)
 
 
-def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...], purpose: str) -> xr.Dataset:
-    """Select one value of each axis that a figure has no room for.
+def percent(share: float) -> str:
+    """Write a share as a percentage with one decimal."""
+    text = f"{100.0 * share:.1f}" if share >= 5e-4 or share == 0.0 else "<\u00a00.1"
+    return text + "\u00a0%"
+
+
+def write_letters(ax: Axes, codes: np.ndarray, attractors: Iterable[int]) -> None:
+    """Write each attractor's letter into the widest place of its area, if one is wide enough.
 
     Parameters
     ----------
-    ds
-        With `attractor_id`.
-    at
-        Value by axis; the nearest one on the axis is taken.
-    keep
-        Axes of the figure.
-    purpose
-        What the figure shows, for messages.
-
-    Raises
-    ------
-    ValueError
-        If an axis is unknown, a value lies off its axis, or an axis longer than 1 is left over.
+    ax
+        Axes that the codes fill.
+    codes
+        Ids on a raster of equal cells, rows from below; some 400 each way are enough.
+    attractors
+        Ids to be written.
     """
-    dims = [str(d) for d in ds["attractor_id"].dims]
-    for name, value in (at or {}).items():
-        style.check_choice("axis", name, [d for d in dims if d not in keep])
-        ds = ds.isel({name: _nearest(ds[name], float(value))})
-    left = [d for d in ds["attractor_id"].dims if d not in keep]
-    long = [str(d) for d in left if ds.sizes[d] > 1]
-    if long:
-        axes = ", ".join(f"{d} ({ds.sizes[d]} values)" for d in long)
-        one = ds[long[0]].values[ds.sizes[long[0]] // 2] if long[0] in ds.coords else 0
-        raise ValueError(
-            f"{purpose}, and the dataset also has {axes}: choose a value of each, such as {long[0]}={one:.6g}"
-        )
-    return ds.isel(dict.fromkeys(left, 0))
+    box = ax.get_window_extent()
+    sampling = np.array([box.height / codes.shape[0], box.width / codes.shape[1]]) / ax.figure.dpi
+    padded = np.pad(codes, 1, constant_values=np.iinfo(np.int32).min)
+    for number in attractors:
+        depth = distance_transform_edt(padded == number, sampling=sampling)[1:-1, 1:-1]
+        row, column = np.unravel_index(int(depth.argmax()), depth.shape)
+        if depth[row, column] >= _LETTER_IN:
+            ax.text(
+                (column + 0.5) / codes.shape[1], (row + 0.5) / codes.shape[0], letter(number),
+                transform=ax.transAxes, ha="center", va="center", fontsize=style.LABEL_PT,
+                path_effects=[withStroke(linewidth=2.0, foreground="white")],
+            )  # fmt: skip
 
 
-def _nearest(axis: xr.DataArray, value: float) -> int:
-    values = axis.values.astype(np.float64)
-    index = int(np.abs(values - value).argmin())
-    step = np.diff(values).max() if values.size > 1 else 1e-6 * max(abs(values[0]), 1.0)
-    if not abs(values[index] - value) <= 0.5001 * step:
-        raise ValueError(
-            f"{axis.name} = {value:g} lies off its axis, which runs from {values[0]:g} to {values[-1]:g}"
-        )
-    return index
-
-
-def caption(ds: xr.Dataset) -> str:
-    """Name the values at which a selection was made."""
+def caption(ds: xr.Dataset, *, with_start: bool = True) -> str:
+    """Name the values at which a selection was made: of parameters, and of the initial state."""
     parts = []
     # parameters first, then the initial state
     for name in sorted(map(str, ds.coords), key=lambda name: name.endswith("_0")):
         coordinate = ds.coords[name]
-        if coordinate.ndim or coordinate.dtype.kind != "f":
+        if coordinate.ndim or coordinate.dtype.kind != "f" or (name.endswith("_0") and not with_start):
             continue
         symbol = "$f$" if name == "frequency" else _start_symbol(name)
         unit = coordinate.attrs.get("units", "Hz" if name == "frequency" else "1")

@@ -118,11 +118,11 @@ def _draw_portrait(
     angle, rate = series[f"psi{link}"], series[f"psi{link}_dot"]
     points = np.interp(strobe, time, angle), np.interp(strobe, time, rate)
     turns = bool(np.ptp(angle) >= 2.0 * math.pi)
-    line = _on_circle(angle, rate) if turns else (angle, rate)
+    line = on_circle(angle, rate) if turns else (angle, rate)
     ax.plot(*line, color=_COLOURS[link], linewidth=0.7, gid=f"portrait:psi{link}")
     if strobe.size:
         ax.plot(
-            _wrapped(points[0]) if turns else points[0], points[1],
+            wrapped(points[0]) if turns else points[0], points[1],
             linestyle="none", marker="o", markersize=3.6, color="black",
             markeredgecolor="white", markeredgewidth=0.5, gid=f"section:psi{link}", zorder=3,
         )  # fmt: skip
@@ -138,16 +138,16 @@ def _draw_portrait(
     ax.yaxis.set_minor_locator(AutoMinorLocator(2))
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
+def wrapped(angle: np.ndarray) -> np.ndarray:
     """Bring angles to [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-def _on_circle(angle: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def on_circle(angle: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Wrap the angle and break the line where it leaves one edge and enters at the other."""
-    wrapped = _wrapped(angle)
-    jumps = np.flatnonzero(np.abs(np.diff(wrapped)) > math.pi) + 1
-    return np.insert(wrapped, jumps, np.nan), np.insert(rate, jumps, np.nan)
+    folded = wrapped(angle)
+    jumps = np.flatnonzero(np.abs(np.diff(folded)) > math.pi) + 1
+    return np.insert(folded, jumps, np.nan), np.insert(rate, jumps, np.nan)
 
 
 def _legend(fig: Figure, with_section: bool) -> None:

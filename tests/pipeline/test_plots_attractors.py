@@ -12,8 +12,18 @@ import pytest
 import xarray as xr
 from matplotlib.colors import to_rgb
 
+from pipeline.analysis.hysteresis import hysteresis
 from pipeline.analysis.sides import Side
-from pipeline.plots import palette, plot_basins, plot_fractions, save_data, save_figure
+from pipeline.plots import (
+    palette,
+    plot_basins,
+    plot_coexisting,
+    plot_fractions,
+    plot_gallery,
+    plot_regimes,
+    save_data,
+    save_figure,
+)
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = range(8)
@@ -79,7 +89,9 @@ def colours_of(fig):
 
 
 def legend_texts(fig):
-    return [text.get_text() for legend in fig.legends for text in legend.get_texts()]
+    """Texts of the legend, unfolded."""
+    texts = [text.get_text() for legend in fig.legends for text in legend.get_texts()]
+    return [" ".join(text.split()) for text in texts]
 
 
 def legend_colours(fig):
@@ -250,10 +262,10 @@ def test_describe__periods_sides_turns():
     ds = make_attractors([[0, 0], [0, 0], [0, 0]], ("frequency", "initial_condition"), {}).isel(attractor=0)
     ds["orbit_period"][:] = [1, 2, 0]
     ds["side"][:] = [Side.LEFT, Side.STRADDLING, Side.STRADDLING]
-    assert palette.describe(ds) == "period 1, 2 or not periodic, left/straddling"
+    assert palette.describe(ds) == "period 1, 2 or not periodic, left or straddling"
     ds["side"][:] = Side.ROTATING
     ds["rotation"][:] = [0.0, -0.5]
-    assert palette.describe(ds).endswith("rotating, (0, \N{MINUS SIGN}0.5)")
+    assert palette.describe(ds).endswith("rotating\N{NO-BREAK SPACE}(0,\N{NO-BREAK SPACE}\N{MINUS SIGN}0.5)")
     ds["rotation"][0] = [0.0, 1.0]
     assert palette.describe(ds).endswith("rotating")
 
@@ -339,3 +351,225 @@ def test_plot_fractions__other_parameters_must_be_chosen(sweep):
     with pytest.raises(ValueError, match=r"2 are left of q, frequency; .* such as q=1\.4"):
         plot_fractions(more)
     assert "q = 1.5" in plot_fractions(more, at={"q": 1.5}).axes[0].texts[-1].get_text()
+
+
+def offsets(fig, gid):
+    """Points and diameters [pt] of a scatter, in rising order."""
+    (points,) = [c for c in fig.axes[0].collections if c.get_gid() == gid]
+    where, area = np.asarray(points.get_offsets()), points.get_sizes()
+    order = np.lexsort(where.T[::-1])
+    return where[order], np.sqrt(np.broadcast_to(area, len(where))[order])
+
+
+def test_plot_coexisting__points_and_weights(sweep):
+    """Points are where the attractors are; the larger the basin fraction per point, the larger."""
+    fig = plot_coexisting(sweep, degrees=True)
+    where, diameter = offsets(fig, "points:A")
+    np.testing.assert_allclose(where, [[2.0, np.rad2deg(0.1)], [2.1, np.rad2deg(0.1)]])
+    assert diameter[0] > diameter[1]
+    both, of_b = offsets(fig, "points:B")
+    assert both[:, 0].tolist() == [2.0, 2.1, 2.2]
+    assert of_b.argsort().tolist() == [1, 0, 2]
+    assert fig.axes[0].get_ylabel() == r"$\psi_1$ [deg]"
+    # two points share out the fraction of one
+    sweep["attractor_points"][0, 0, 1] = 0.3
+    halves = offsets(plot_coexisting(sweep), "points:A")[1]
+    least, growth = 1.1**2, 5.0**2
+    np.testing.assert_allclose(
+        halves**2, [least + growth * 0.25, least + growth * 0.25, least + growth * 0.4]
+    )
+
+
+def test_plot_coexisting__angles_on_the_circle_and_unknown_state(sweep):
+    sweep["attractor_points"][:] = sweep["attractor_points"] + 2 * np.pi
+    where, _ = offsets(plot_coexisting(sweep), "points:B")
+    np.testing.assert_allclose(where[:, 1], 0.2)
+    where, _ = offsets(plot_coexisting(sweep, state="psi1_dot"), "points:B")
+    np.testing.assert_allclose(where[:, 1], 0.2 + 2 * np.pi)
+    with pytest.raises(ValueError, match="unknown state 'psi3'"):
+        plot_coexisting(sweep, state="psi3")
+
+
+@pytest.fixture
+def walk():
+    """Up and down over 5 frequencies: up leaves A after the third, down comes back to it at the second."""
+    ids = np.array([[0, 0], [0, 0], [0, 1], [1, 1], [1, 1]], np.int32)
+    coords = {
+        "frequency": ("frequency", [2.0, 2.1, 2.2, 2.3, 2.4], {"units": "Hz"}),
+        "direction": ("branch", ["up", "down"]),
+    }
+    return make_attractors(ids, ("frequency", "branch"), coords)
+
+
+def test_plot_coexisting__directions_and_loops(walk):
+    fig = plot_coexisting(walk, hysteresis=hysteresis(walk, walk))
+    lines = {line.get_gid(): line for line in fig.axes[0].get_lines()}
+    assert {gid: np.round(line.get_xdata(), 9).tolist() for gid, line in lines.items()} == {
+        "points:up:A": [2.0, 2.1, 2.2], "points:down:A": [2.0, 2.1], "points:up:B": [2.3, 2.4],
+        "points:down:B": [2.2, 2.3, 2.4],
+    }  # fmt: skip
+    up, down = lines["points:up:A"], lines["points:down:A"]
+    assert up.get_markersize() < down.get_markersize()
+    assert up.get_zorder() > down.get_zorder()
+    (span,) = [patch for patch in fig.axes[0].patches if patch.get_gid() == "loop"]
+    box = span.get_extents().transformed(fig.axes[0].transData.inverted())
+    assert (box.x0, box.x1) == pytest.approx((2.15, 2.25))
+    assert legend_texts(fig)[-3:] == ["up", "down", "up and down differ"]
+    assert fig.data["present"].sel(direction="up", attractor=0).values.tolist() == [1, 1, 1, 0, 0]
+    assert legend_texts(plot_coexisting(walk))[-2:] == ["up", "down"]
+
+
+@pytest.fixture
+def map_of_two():
+    """2 frequencies x 3 amplitudes, 4 cells: A alone, A + B, B with a cell undecided, ..."""
+    ids = np.array(
+        [[[0] * 4, [0, 0, 1, 1], [1, 1, 1, -1]], [[0] * 4, [0] * 4, [-1] * 4]], np.int32
+    )  # fmt: skip
+    coords = {
+        "frequency": ("frequency", [2.0, 2.2], {"units": "Hz"}),
+        "q": ("q", [1.0, 1.5, 2.0], {"units": "N m", "long_name": "amplitude"}),
+    }
+    ds = make_attractors(ids, ("frequency", "q", "initial_condition"), coords)
+    ds["orbit_period"][..., 1] = 2 * (ds["kind"][..., 1] > 0)
+    return ds
+
+
+def regime_names(fig):
+    """Name of each point of the map, (frequency, second parameter), through colour and legend."""
+    (mesh,) = [c for c in fig.axes[0].collections if c.get_gid() == "regimes"]
+    colours = mesh.to_rgba(mesh.get_array())[..., :3]
+    names = {tuple(np.round(c, 3)): name for name, c in legend_patches(fig).items()}
+    return [[names[tuple(np.round(c, 3))] for c in row] for row in np.swapaxes(colours, 0, 1)]
+
+
+def legend_patches(fig):
+    patches = [h for legend in fig.legends for h in legend.get_patches()]
+    return {" ".join(h.get_label().split()): to_rgb(h.get_facecolor()) for h in patches}
+
+
+def test_plot_regimes__each_point_has_its_regime(map_of_two):
+    fig = plot_regimes(map_of_two)
+    assert regime_names(fig) == [["1", "1 + 2", "2"], ["1", "1", "none"]]
+    assert fig.axes[0].get_xlabel() == "drive frequency [Hz]"
+    assert fig.axes[0].get_ylabel() == "amplitude [N m]"
+    assert fig.axes[0].get_xlim() == pytest.approx((1.9, 2.3))
+    assert fig.axes[0].get_ylim() == pytest.approx((0.75, 2.25))
+    (crosses,) = [line for line in fig.axes[0].get_lines() if line.get_gid() == "without"]
+    assert sorted(map(tuple, crosses.get_xydata())) == [(2.0, 2.0), (2.2, 2.0)]
+    assert regime_names(plot_regimes(map_of_two, show="attractors"))[0] == ["A", "A + B", "B"]
+    assert regime_names(plot_regimes(map_of_two, show="number")) == [["1", "2", "1"], ["1", "1", "0"]]
+    assert fig.data["n_attractors"].transpose("frequency", "q").values.tolist() == [[1, 2, 1], [1, 1, 0]]
+
+
+def test_plot_regimes__not_periodic_and_one_parameter(map_of_two, sweep):
+    map_of_two["orbit_period"][0, 1, 1] = 0
+    assert regime_names(plot_regimes(map_of_two))[0][1] == "1 + not periodic"
+    with pytest.raises(ValueError, match="two swept parameters, and 1 are left of frequency"):
+        plot_regimes(sweep)
+    with pytest.raises(ValueError, match="Did you mean 'periods'"):
+        plot_regimes(map_of_two, show="period")
+
+
+def make_portraits(n, turning=()):
+    """Circles of different size; those named turn over once with link 2."""
+    time = np.linspace(0.0, 1.0, 50)
+    phase = 2 * np.pi * time
+    orbit = np.empty((n, 50, 4))
+    for i in range(n):
+        size = 0.1 * (i + 1)
+        orbit[i] = np.column_stack([size * np.cos(phase)] * 2 + [size * np.sin(phase)] * 2)
+        if i in turning:
+            orbit[i, :, 1] = phase
+    return xr.Dataset(
+        {
+            "orbit": (("attractor", "sample", "state"), orbit),
+            "magnet": (("attractor", "sample", "axis"), orbit[..., :2] - [0.0, 0.35]),
+            "attractor_points": (("attractor", "point", "state"), orbit[:, :1]),
+            "share": ("attractor", 1.0 / (1.0 + np.arange(n)) / 10),
+        },
+        coords={"attractor": np.arange(n), "state": STATES, "axis": ["x", "y"], "frequency": 2.2},
+        attrs={"fixed_magnet_y": -0.37},
+    )
+
+
+def test_plot_gallery__orbits_sections_and_paths():
+    attractors = make_attractors(np.arange(3), ("initial_condition",), {})
+    drawn = make_portraits(3, turning=(2,))
+    fig = plot_gallery(attractors, drawn)
+    lines = {line.get_gid(): line for ax in fig.axes for line in ax.get_lines()}
+    for i, mark in enumerate("AB"):
+        orbit = drawn["orbit"].values[i]
+        np.testing.assert_allclose(lines[f"orbit:{mark}:psi1"].get_xydata(), orbit[:, [0, 2]])
+        np.testing.assert_allclose(lines[f"orbit:{mark}:psi2"].get_xydata(), orbit[:, [1, 3]])
+        np.testing.assert_allclose(lines[f"section:{mark}:psi2"].get_xydata(), orbit[:1, [1, 3]])
+        np.testing.assert_allclose(lines[f"path:{mark}"].get_xydata(), drawn["magnet"].values[i])
+        assert to_rgb(lines[f"path:{mark}"].get_color()) == to_rgb(palette.cast_of(attractors).colours[i])
+    # on the circle, broken where it passes pi
+    angle = lines["orbit:C:psi2"].get_xdata()
+    assert np.nanmin(angle) >= -np.pi
+    assert np.nanmax(angle) <= np.pi
+    assert np.isnan(angle).sum() == 1
+    magnets = [line for ax in fig.axes for line in ax.get_lines() if line.get_gid() == "fixed_magnet"]
+    assert [m.get_xydata().tolist() for m in magnets] == [[[0.0, -0.37]]] * 3
+    titles = [t.get_text().replace("\N{NO-BREAK SPACE}", " ") for ax in fig.axes for t in ax.texts]
+    assert titles[0] == "A: period 1, left, 10.0 % of the cells"
+
+
+def test_plot_gallery__scale_of_the_path_is_equal_and_holds_it():
+    fig = plot_gallery(make_attractors(np.arange(2), ("initial_condition",), {}), make_portraits(2))
+    for ax in fig.axes:
+        path = [line for line in ax.get_lines() if str(line.get_gid()).startswith("path")]
+        if path:
+            box = ax.get_window_extent()
+            (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+            assert (right - left) / box.width == pytest.approx((top - bottom) / box.height)
+            x, y = path[0].get_xydata().T
+            assert left < x.min() < x.max() < right
+            assert bottom < min(y.min(), -0.37) < y.max() < top
+
+
+def test_plot_gallery__largest_shares_are_drawn():
+    attractors = make_attractors(np.arange(11), ("initial_condition",), {})
+    portraits = make_portraits(11)
+    portraits["share"][0] = 0.0
+    fig = plot_gallery(attractors, portraits)
+    assert fig.data["attractor"].values.tolist() == list(range(1, 9))
+    assert any("3 more attractors" in t.get_text() for t in fig.texts)
+    with pytest.raises(ValueError, match="no attractor at this parameter point"):
+        plot_gallery(attractors, portraits.isel(attractor=[]))
+
+
+def in_canvas(fig):
+    """Whether legends and texts lie within the figure."""
+    fig.draw_without_rendering()
+    boxes = [legend.get_window_extent() for legend in fig.legends]
+    boxes += [t.get_window_extent() for ax in fig.axes for t in ax.texts if t.get_text()]
+    width, height = fig.get_size_inches() * fig.dpi
+    return all(b.x0 >= 0 and b.y0 >= 0 and b.x1 <= width and b.y1 <= height for b in boxes)
+
+
+def test_legends__fit_into_the_figure_beside_the_axes():
+    """Twenty attractors with the longest names."""
+    ids = np.tile(np.arange(20), (3, 1))
+    ds = make_attractors(ids, ("frequency", "initial_condition"), {"frequency": [2.0, 2.1, 2.2]})
+    ds["orbit_period"][:] = np.array([11, 13, 0])[:, None]
+    ds["side"][:] = np.array([Side.LEFT, Side.RIGHT, Side.STRADDLING])[:, None]
+    for fig in (plot_fractions(ds), plot_coexisting(ds)):
+        assert in_canvas(fig)
+        assert fig.legends[0].get_window_extent().x0 > fig.axes[0].get_window_extent().x1
+    square = make_attractors(np.arange(16).reshape(4, 4), GRID, grid_coords(4, 4))
+    square["orbit_period"][:] = 16
+    square["side"][:] = Side.STRADDLING
+    assert in_canvas(plot_basins(square, n_periods=xr.ones_like(square["attractor_id"])))
+
+
+def test_save_data__every_figure(sweep, walk, map_of_two, tmp_path):
+    figures = [
+        plot_fractions(sweep), plot_coexisting(sweep), plot_coexisting(walk), plot_regimes(map_of_two),
+        plot_gallery(sweep, make_portraits(2).assign_coords(frequency=2.1)),
+    ]  # fmt: skip
+    for fig in figures:
+        with xr.open_dataset(save_data(fig, tmp_path / "a.svg"), engine="scipy") as stored:
+            assert set(stored.data_vars) == set(fig.data.data_vars)
+            for name in fig.data.data_vars:
+                np.testing.assert_allclose(stored[name], fig.data[name])

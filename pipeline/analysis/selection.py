@@ -1,0 +1,67 @@
+"""Select from the attractors of a run what an analysis or a figure is about."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+
+
+def parameter_dims(attractors: xr.Dataset) -> list[str]:
+    """Names of the swept parameters."""
+    return [str(d) for d in attractors["kind"].dims if d != "attractor"]
+
+
+def start_dims(attractors: xr.Dataset) -> list[str]:
+    """Names of the dims that tell the cells of one parameter point apart."""
+    return [str(d) for d in attractors["attractor_id"].dims if d not in parameter_dims(attractors)]
+
+
+def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...], purpose: str) -> xr.Dataset:
+    """Select one value of each axis that is not to be kept.
+
+    Parameters
+    ----------
+    ds
+        With `attractor_id`.
+    at
+        Value by axis; the nearest one on the axis is taken.
+    keep
+        Axes to keep.
+    purpose
+        What is made of it, for messages.
+
+    Raises
+    ------
+    ValueError
+        If an axis is unknown, a value lies off its axis, or an axis longer than 1 is left over.
+    """
+    dims = [str(d) for d in ds["attractor_id"].dims]
+    for name, value in (at or {}).items():
+        allowed = [d for d in dims if d not in keep]
+        if name not in allowed:
+            raise ValueError(
+                f"unknown axis {name!r}; values can be chosen of: {', '.join(allowed) or 'none'}"
+            )
+        ds = ds.isel({name: _nearest(ds[name], float(value))})
+    left = [d for d in ds["attractor_id"].dims if d not in keep]
+    long = [str(d) for d in left if ds.sizes[d] > 1]
+    if long:
+        axes = ", ".join(f"{d} ({ds.sizes[d]} values)" for d in long)
+        one = ds[long[0]].values[ds.sizes[long[0]] // 2] if long[0] in ds.coords else 0
+        raise ValueError(
+            f"{purpose}, and the dataset also has {axes}: choose a value of each, such as {long[0]}={one:.6g}"
+        )
+    return ds.isel(dict.fromkeys(left, 0))
+
+
+def _nearest(axis: xr.DataArray, value: float) -> int:
+    values = axis.values.astype(np.float64)
+    index = int(np.abs(values - value).argmin())
+    step = np.diff(values).max() if values.size > 1 else 1e-6 * max(abs(values[0]), 1.0)
+    if not abs(values[index] - value) <= 0.5001 * step:
+        raise ValueError(
+            f"{axis.name} = {value:g} lies off its axis, which runs from {values[0]:g} to {values[-1]:g}"
+        )
+    return index

@@ -1,0 +1,202 @@
+"""Diagram of all coexisting attractors: each id in its colour over the swept parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import AutoMinorLocator
+
+from pipeline.analysis.selection import choose, start_dims
+from pipeline.plots import palette, style
+from pipeline.plots.fractions import new_panel, swept_parameter
+from pipeline.plots.trajectory import wrapped
+
+_LEAST_PT, _GROWTH_PT = 1.1, 5.0
+_UP_PT, _DOWN_PT, _TINT = 1.5, 4.2, 0.55
+_SPAN: dict[str, Any] = {"facecolor": "0.9", "edgecolor": "none", "linewidth": 0.0}
+
+
+def plot_coexisting(
+    attractors: xr.Dataset,
+    *,
+    state: str = "psi1",
+    at: Mapping[str, float] | None = None,
+    degrees: bool = False,
+    hysteresis: xr.Dataset | None = None,
+) -> style.DataFigure:
+    """Draw the section points of all attractors over the swept parameter.
+
+    Parameters
+    ----------
+    attractors
+        Result of `pipeline.analysis.attractors.match` over one parameter or more.
+    state
+        ``psi1``, ``psi2``, ``psi1_dot`` or ``psi2_dot``.
+    at
+        Values of the other swept parameters; the nearest ones are drawn.
+    degrees
+        Degrees instead of radians.
+    hysteresis
+        Result of `pipeline.analysis.hysteresis.hysteresis`; its loops are shaded.
+
+    Returns
+    -------
+    DataFigure
+        7 in wide. In a sweep the area of the points of an attractor shares out its basin fraction. In a
+        continuation in both directions small dark points are met upwards, large light ones downwards.
+        A bounded set is drawn by the points of it that are stored. Its `data` hold ``value`` and what
+        decides the look of each point: ``share``, or ``present`` for each direction.
+
+    Raises
+    ------
+    ValueError
+        For an unknown state, and if there is not one swept parameter left.
+    """
+    style.check_choice("state", state, [str(name) for name in attractors["state"].values])
+    parameter = swept_parameter(attractors, at, "attractors")
+    keep = (parameter, *start_dims(attractors))
+    part = choose(attractors, at, keep, f"attractors are drawn over {parameter}")
+    cast = palette.cast_of(attractors, part)
+    data = _points(part, parameter, state, degrees)
+    loops = _loops(hysteresis, part, parameter) if hysteresis is not None else []
+    both = "direction" in data.dims
+    fig, ax = new_panel(data, _entries(data, cast, both, bool(loops)))
+    for low, high in loops:
+        ax.axvspan(low, high, gid="loop", zorder=0.5, **_SPAN)
+    for number in sorted(range(len(cast.names)), key=lambda i: float(data["share"].isel(attractor=i).sum())):
+        (_draw_directions if both else _draw_weighted)(ax, data.isel(attractor=number), parameter, cast)
+    _dress(ax, data, parameter, state, degrees)
+    ax.text(0.0, 1.015, palette.caption(part), transform=ax.transAxes, fontsize=style.LEGEND_PT)
+    style.style_text(fig)
+    return fig
+
+
+def _points(part: xr.Dataset, parameter: str, state: str, degrees: bool) -> xr.Dataset:
+    """Values to draw, with what decides their look."""
+    values = part["attractor_points"].sel(state=state, drop=True).transpose(parameter, "attractor", "point")
+    if style.is_angle(state):
+        values = values.copy(data=wrapped(values.values))
+    units = style.state_label(state, degrees).rpartition("[")[2].rstrip("]")
+    shown = values.copy(data=np.rad2deg(values.values)) if degrees else values
+    data = xr.Dataset(
+        {
+            "value": shown.assign_attrs(units=units, long_name=f"{state} at the section"),
+            "share": part["share"].transpose(parameter, "attractor"),
+        }
+    )
+    if "branch" in part["attractor_id"].dims and "direction" in part.coords:
+        words = part["direction"].values.astype(str)
+        names = [d for d in ("up", "down") if d in words]
+        cells = part["attractor_id"].transpose(parameter, "branch").values
+        ids = part["attractor"].values
+        present = [(cells[:, words == d, None] == ids).any(axis=1) for d in names]
+        data["present"] = (
+            (parameter, "direction", "attractor"),
+            np.stack(present, axis=1).astype(np.int8),
+            {"units": "1", "long_name": "whether a branch of the direction is on it"},
+        )
+        data = data.assign_coords(direction=names)
+    data = data.drop_vars([k for k in data.coords if data[k].dtype == object])
+    data.attrs = {"title": "coexisting attractors"}
+    return data
+
+
+def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[float, float]]:
+    """Limits of the loops at the chosen values of the other parameters: half a step beyond their points."""
+    axis = part[parameter].values.astype(np.float64)
+    edges = style.edges(axis)
+    here = np.ones(found.sizes["loop"], bool)
+    for name in found.data_vars:
+        other = str(name).removeprefix("loop_at_")
+        if other != name and other in part.coords:
+            here &= np.isclose(found[name].values, float(part[other]))
+    limits = []
+    for a, b in zip(found["loop_from"].values[here], found["loop_to"].values[here], strict=True):
+        first, last = (int(np.abs(axis - x).argmin()) for x in (a, b))
+        limits.append((float(edges[first]), float(edges[last + 1])))
+    return limits
+
+
+def _spread(one: xr.Dataset, parameter: str, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, value and index along the parameter of an attractor's points, where chosen."""
+    values = one["value"].transpose(parameter, "point").values
+    row, column = np.nonzero(np.isfinite(values) & chosen[:, None])
+    return one[parameter].values[row].astype(np.float64), values[row, column], row
+
+
+def _draw_weighted(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast) -> None:
+    share = one["share"].values
+    x, y, row = _spread(one, parameter, share > 0)
+    number = int(one["attractor"])
+    size = _diameter(share[row] / np.bincount(row)[row]) ** 2 if row.size else 1.0
+    ax.scatter(
+        x, y, s=size, c=cast.colours[number], linewidths=0.0, rasterized=True,
+        gid=f"points:{palette.letter(number)}",
+    )  # fmt: skip
+
+
+def _diameter(share: Any) -> Any:
+    """Diameter of a point [pt]: its area grows with the basin fraction that falls to it."""
+    return np.sqrt(_LEAST_PT**2 + _GROWTH_PT**2 * np.asarray(share))
+
+
+def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast) -> None:
+    """Draw large light points below small dark ones, so that both are seen where they coincide."""
+    number = int(one["attractor"])
+    for word in one["direction"].values[::-1]:
+        chosen = one["present"].sel(direction=word).values > 0
+        x, y, _ = _spread(one, parameter, chosen)
+        up = word == "up"
+        ax.plot(
+            x, y, linestyle="none", marker="o", markersize=_UP_PT if up else _DOWN_PT, markeredgewidth=0.0,
+            color=cast.colours[number] if up else _tinted(cast.colours[number]), zorder=2.2 if up else 2.0,
+            rasterized=True, gid=f"points:{word}:{palette.letter(number)}",
+        )  # fmt: skip
+
+
+def _tinted(colour: str) -> tuple[float, float, float]:
+    red, green, blue = (c + (1.0 - c) * _TINT for c in to_rgb(colour))
+    return red, green, blue
+
+
+def _dress(ax: Axes, data: xr.Dataset, parameter: str, state: str, degrees: bool) -> None:
+    edges = style.edges(data[parameter].values.astype(np.float64))
+    ax.set_xlim(float(edges.min()), float(edges.max()))
+    ax.margins(y=0.05)
+    ax.autoscale_view(scalex=False)
+    ax.set_xlabel(style.parameter_label(data[parameter]), fontsize=style.LABEL_PT)
+    ax.set_ylabel(style.state_label(state, degrees), fontsize=style.LABEL_PT, labelpad=2.0)
+    if style.is_angle(state):
+        style.set_angle_ticks(ax, *ax.get_ylim(), degrees=degrees)
+    ax.xaxis.set_minor_locator(AutoMinorLocator())
+    ax.yaxis.set_minor_locator(AutoMinorLocator(2))
+
+
+def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> list[palette.Entry]:
+    total = data["share"].values.sum(axis=0)
+    ranked = sorted((i for i in cast.main if total[i] > 0), key=lambda i: (-total[i], i))
+    entries: list[palette.Entry] = [(cast.names[i], cast.colours[i]) for i in ranked]
+    rest = sum(total[i] > 0 for i in cast.names if i not in cast.main)
+    if rest:
+        entries.append((f"{rest} others", palette.OTHERS))
+    if both:
+        entries += [_dot(_UP_PT, "0.0", "up"), _dot(_DOWN_PT, _tinted("0.0"), "down")]
+    else:
+        sizes = ((1.0, "basin fraction per point 1"), (0.1, "0.1"), (0.0, "below 0.01"))
+        entries += [_dot(float(_diameter(share)), "0.3", text) for share, text in sizes]
+    if loops:
+        entries.append(Patch(label="up and down differ", **_SPAN))
+    return entries
+
+
+def _dot(size: float, colour: Any, label: str) -> Line2D:
+    return Line2D(
+        [], [], linestyle="none", marker="o", markersize=size, markeredgewidth=0, color=colour, label=label
+    )
