@@ -43,6 +43,9 @@ Each lies within the tolerance of its orbit, or within twice that on the slow sp
 NOT_COMPUTED, NO_ORBIT = -2, -1
 """Classes of cells that are no orbit: not integrated, and integrated without closing."""
 
+WORK = ("n_periods", "n_steps", "n_rejected")
+"""Variables that count what was integrated: 0 where a cell is inferred."""
+
 Integrate = Callable[[np.ndarray], Mapping[str, np.ndarray]]
 
 
@@ -126,8 +129,8 @@ def infer(
     Returns
     -------
     dict
-        Arrays over all cells in flat order. An inferred cell has the status ``INFERRED``, the section,
-        period and turns of the first corner of its box, and nothing integrated.
+        Arrays over all cells in flat order. An inferred cell has the status ``INFERRED``, no work, and
+        all that says where it ends (section, period, turns, exponents) from the first corner of its box.
     """
     orbits = Orbits(SAME * closure_tolerance, system)
     values: dict[str, np.ndarray] = {}
@@ -143,8 +146,8 @@ def infer(
 
     source = refine(shape, stride, classes_of).ravel()
     inferred = np.flatnonzero(source != np.arange(n_cells))
-    for name in ("section", "orbit_period", "turns"):
-        values[name][inferred] = values[name][source[inferred]]
+    for name, array in values.items():
+        array[inferred] = 0 if name in WORK else array[source[inferred]]
     values["status"][inferred] = Status.INFERRED
     return values
 

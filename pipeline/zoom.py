@@ -15,6 +15,7 @@ from pipeline.problems import SpecError
 from pipeline.spec import FREQUENCY, STATES, GridStarts, RandomStarts, Range, Spec, load_spec, parse_spec
 
 MARK = "(zoom)"
+_ORDER = ("parameters", "axes", "initial_conditions", "continuation", "integration", "products", "execution")
 STATE_KEYS = (*STATES, *(f"{state}_deg" for state in STATES))
 _ROUNDING = 1e-9
 """Relative amount by which a range may pass the old one's end without a note: degrees are converted."""
@@ -239,16 +240,16 @@ def _put(data: dict[str, Any], key: str, value: Any) -> None:
 def to_toml(spec: Spec) -> str:
     """Return a specification as a TOML text that reads back as the same.
 
-    A writer for what specifications hold: tables of numbers, texts, truth values, lists, and tables of
-    numbers within a line.
+    A writer for what specifications hold: tables of numbers, texts, truth values, lists, and tables within
+    a line.
     """
     data = spec.as_dict()
-    order = ("parameters", "axes", "initial_conditions", "continuation", "integration", "execution")
     lines = [f"{key} = {_value(data[key])}" for key in ("kind", "title") if data[key]]
-    for name in order:
-        # pydantic leaves out what is not set; a table without keys says nothing
-        table = {k: v for k, v in data.get(name, {}).items() if v != {}}
-        if table or name == "continuation" in data:
+    names = [name for name in data if isinstance(data[name], dict)]
+    for name in sorted(names, key=lambda n: _ORDER.index(n) if n in _ORDER else len(_ORDER)):
+        # an empty table says nothing
+        table = {key: value for key, value in data[name].items() if value != {}}
+        if table:
             lines += ["", f"[{name}]", *(f"{_key(k)} = {_value(v)}" for k, v in table.items())]
     text = "\n".join(lines) + "\n"
     assert parse_spec(tomllib.loads(text)) == spec

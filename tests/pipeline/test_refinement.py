@@ -264,6 +264,30 @@ def test_infer__duffing_against_the_full_grid():
     assert (orbits.classes(as_closed) != labels).mean() < 1e-3
 
 
+def test_infer__carries_all_but_the_work():
+    def integrate(cells):
+        n = len(cells)
+        return {
+            "section": np.full((n, 1, 4), 0.5), "status": np.full(n, Status.PERIODIC, np.int8),
+            "orbit_period": np.ones(n, np.int16), "turns": np.full((n, 2), 3, np.int32),
+            "n_periods": cells + 1, "n_steps": cells + 1, "n_rejected": cells + 1,
+            "lyapunov": np.stack([cells, -cells - 1.0], axis=1),
+        }  # fmt: skip
+
+    found = infer((9, 5), 4, integrate, closure_tolerance=1e-4, system=PENDULUM_FITTED)
+    inferred = found["status"] == Status.INFERRED
+    assert inferred.sum() == 45 - 6
+    assert (found["section"] == 0.5).all()
+    assert (found["turns"] == 3).all()
+    assert (found["orbit_period"] == 1).all()
+    for name in ("n_periods", "n_steps", "n_rejected"):
+        assert ((found[name] == 0) == inferred).all()
+    # rows 0 to 4 of the first box, 5 to 8 of the second: first corners are cells 0 and 20
+    expected = np.repeat([0, 20], [25, 20])
+    assert (found["lyapunov"][:, 0][inferred] == expected[inferred]).all()
+    assert (found["lyapunov"][:, 1] == -found["lyapunov"][:, 0] - 1.0).all()
+
+
 # ---- runs --------------------------------------------------------------------------------------
 
 

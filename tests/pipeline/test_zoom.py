@@ -48,6 +48,7 @@ def differing(old, new):
 
 def test_to_toml__reads_back(sweep, walk):
     specs = [sweep, walk, parse_spec(tomllib.loads(LIST))]
+    specs += [parse_spec(tomllib.loads(f"{LIST}\n[products.lyapunov]\nn_exponents = 2"))]
     specs += [load_spec(path) for path in shipped_workflows().values()]
     for spec in specs:
         text = to_toml(spec)
