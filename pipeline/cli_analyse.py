@@ -47,16 +47,16 @@ class Metric(StrEnum):
 
 def _option(name: str, default: Any, text: str) -> inspect.Parameter:
     """Option of an analysis; the bounds in the text are checked by `pipeline.derived`."""
-    kind: Any = float | None if default is None else type(default)
+    kind: Any = type(default)
     annotation = Annotated[kind, typer.Option(help=text)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 ATTRACTOR_OPTIONS = (
     _option(
-        "tolerance", None,
-        "Scaled distance (1 rad, 10 rad/s) within which a closed cell belongs to an orbit; above 0. "
-        "Default: ten times the run's closure tolerance, at least 1e-4.",
+        "tolerance", 0.0,
+        "Scaled distance (1 rad, 10 rad/s) within which a closed cell belongs to an orbit; 0 takes ten times "
+        "the run's closure tolerance, at least 1e-4.",
     ),
     _option("polish", True, "Refine orbits by Newton's method, which integrates a point per orbit."),
     _option("residual", 1e-10, "Scaled residual that Newton's method is to reach; above 0."),
@@ -82,6 +82,14 @@ BASIN_OPTIONS = (
     _option("metric", Metric.TAXICAB, "Wada test: distance between cells."),
     _option("resamples", 200, "Samples of each bootstrap; 2 or more."),
     _option("seed", 0, "Seed of the bootstraps."),
+)
+
+SETTLING_OPTIONS = (
+    _option("n_sample", 32, "Cells of each bounded set that are run on; 1 or more."),
+    _option("n_periods", 1024, "Drive periods that they are run on; 1 or more."),
+    _option("confidence", 0.95, "Level of the intervals; between 0 and 1."),
+    _option("rtol", 0.0, "Relative tolerance; 0 takes that of the run."),
+    _option("atol", 0.0, "Absolute tolerance; 0 takes that of the run."),
 )
 
 
@@ -147,6 +155,20 @@ def hysteresis(context: typer.Context, csv: Csv = None, **options: Any) -> None:
     ds = _derive(context, derived.hysteresis, csv, options)
     rows = report.jump_rows(ds)
     _tell(report.hysteresis_lines(ds, rows), rows, csv, ds)
+
+
+@analyse_app.command(epilog=EXIT_HELP)
+@takes(*SETTLING_OPTIONS, *ATTRACTOR_OPTIONS)
+def settling(context: typer.Context, csv: Csv = None, **options: Any) -> None:
+    """Run a sample of every bounded set on: does it stay, or was it a transient, and where does it go?
+
+    This integrates, for minutes if there are many sets. Lifetimes are in drive periods.
+    """
+    from pipeline import derived, report
+
+    ds = _derive(context, derived.settling, csv, options)
+    rows = report.settling_rows(ds)
+    _tell(report.settling_lines(ds, rows), rows, csv, ds)
 
 
 @analyse_app.command(epilog=EXIT_HELP)

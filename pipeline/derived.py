@@ -310,6 +310,44 @@ def hysteresis(directory: Source, *, echo: Echo | None = None, **options: Any) -
     )
 
 
+def settling(directory: Source, *, echo: Echo | None = None, **options: Any) -> xr.Dataset:
+    """Transient or attractor: a sample of every bounded set is run on.
+
+    Parameters
+    ----------
+    directory, echo
+        As in `attractors`.
+    options
+        Those of `attractors` and of `pipeline.analysis.lifetimes.lifetimes`.
+
+    Returns
+    -------
+    Dataset
+        See `pipeline.analysis.lifetimes`.
+
+    Raises
+    ------
+    SpecError
+        If an option is unknown or out of bounds.
+    """
+    from pipeline.analysis.lifetimes import lifetimes
+
+    wanted = _with_defaults("settling", options, settling_defaults())
+    shared = {name: wanted[name] for name in attractor_defaults()}
+    own = {name: wanted[name] for name in _defaults_of(lifetimes)}
+    return derive(
+        directory, "settling", wanted,
+        lambda s: lifetimes(s.open(), attractors(s, echo=echo, **shared), **own), echo,
+    )  # fmt: skip
+
+
+def settling_defaults() -> dict[str, Any]:
+    """Options of `settling` with their defaults."""
+    from pipeline.analysis.lifetimes import lifetimes
+
+    return {**attractor_defaults(), **_defaults_of(lifetimes)}
+
+
 @contextlib.contextmanager
 def _refused(snapshot: Snapshot) -> Iterator[None]:
     """Turn what an analysis refuses into a sentence with the directory's name."""
@@ -330,30 +368,35 @@ def _identify(snapshot: Snapshot, options: Mapping[str, Any]) -> xr.Dataset:
 _NO_OPTIONS = frozenset({"block_bytes"})
 """Parameters that change nothing in a result."""
 
-_OPTIONAL = "float | None"
-"""Annotation of a number that by default follows from the run."""
-
 
 def _defaults_of(function: Callable[..., Any]) -> dict[str, Any]:
     """Options of a function that are numbers or words."""
     return {
         name: parameter.default
         for name, parameter in inspect.signature(function).parameters.items()
-        if (isinstance(parameter.default, (bool, int, float, str)) or parameter.annotation == _OPTIONAL)
-        and name not in _NO_OPTIONS
+        if isinstance(parameter.default, (bool, int, float, str)) and name not in _NO_OPTIONS
     }
 
 
-_POSITIVE = ("tolerance", "residual", "mirror_threshold", "threshold", "rule_box", "rule_same_share")
-_AT_LEAST_ONE = ("max_orbit_period", "n_points", "look_back", "rule_n_anchors", "rule_n_rounds")
+_NOT_NEGATIVE = ("tolerance", "rtol", "atol")
+_POSITIVE = ("residual", "mirror_threshold", "threshold", "rule_box", "rule_same_share")
+_AT_LEAST_ONE = (
+    "n_sample",
+    "n_periods",
+    "max_orbit_period",
+    "n_points",
+    "look_back",
+    "rule_n_anchors",
+    "rule_n_rounds",
+)
 
 
 def _with_defaults(product: str, options: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """All options of a product, checked, numbers in the type of their default; None asks for the default."""
+    """All options of a product, checked, numbers in the type of their default."""
     problems = [unknown_key(f"{product}.{name}", name, defaults) for name in options if name not in defaults]
     found = dict(defaults)
-    for name in {n for n, value in options.items() if n in defaults and value is not None}:
-        kind = float if defaults[name] is None else type(defaults[name])
+    for name in options.keys() & defaults.keys():
+        kind = type(defaults[name])
         try:
             found[name] = kind(options[name])
         except (TypeError, ValueError):
@@ -363,6 +406,12 @@ def _with_defaults(product: str, options: Mapping[str, Any], defaults: Mapping[s
             problems.append(f"{name} = {options[name]!r}: must be {words[kind]}.")
         elif name in _POSITIVE and not found[name] > 0:
             problems.append(f"{name} = {options[name]!r} is out of bounds: it must be greater than 0.")
+        elif name in _NOT_NEGATIVE and found[name] < 0:
+            problems.append(
+                f"{name} = {options[name]!r} is out of bounds: it must be 0 (default) or greater."
+            )
+        elif name == "confidence" and not 0 < found[name] < 1:
+            problems.append(f"{name} = {options[name]!r} is out of bounds: it must lie between 0 and 1.")
         elif name in _AT_LEAST_ONE and found[name] < 1:
             problems.append(f"{name} = {options[name]!r} is out of bounds: it must be 1 or more.")
         elif name == "rule_same_share" and found[name] > 1:

@@ -13,14 +13,11 @@ import xarray as xr
 from pipeline.analysis.basin_numbers import Interval, basin_fractions
 from pipeline.analysis.basins import DIVERGED, outcomes
 from pipeline.analysis.identify import START_DIMS
-from pipeline.analysis.orbits import DECISIONS
 
 FEW_POINTS = 6
 """Up to so many parameter points get a table each."""
 
 Row = dict[str, Any]
-
-_DECISIONS = DECISIONS[1:]
 
 
 def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence: float = 0.95) -> list[Row]:
@@ -30,6 +27,7 @@ def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence:
     are no sample of initial conditions, so they have none.
     """
     dims, start_dims = _dims(ds)
+    words = _words(ds["decision"])
     fractions = None
     if start_dims and start_dims != ("branch",):
         fractions = basin_fractions(
@@ -41,14 +39,14 @@ def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence:
         at = dict(zip(dims, index, strict=True))
         one = ds.isel(at)
         cells = one["attractor_id"].values.ravel()
-        decisions = np.zeros((len(_DECISIONS) + 1, ds.sizes["attractor"]), np.int64)
+        decisions = np.zeros((len(words), ds.sizes["attractor"]), np.int64)
         np.add.at(decisions, (one["decision"].values.ravel()[cells >= 0], cells[cells >= 0]), 1)
         for i in np.flatnonzero(one["kind"].values > 0):
             row = {**_where(ds, at), **_attractor(one.isel(attractor=i))}
             if fractions is not None:
                 own = fractions.isel(at).sel(label=i)
                 row |= {name: float(own[name]) for name in ("fraction", "low", "high")}
-            rows.append(row | {name: int(decisions[k + 1, i]) for k, name in enumerate(_DECISIONS)})
+            rows.append(row | {f"by_{name}": int(decisions[k, i]) for k, name in enumerate(words) if k})
     return rows
 
 
@@ -88,7 +86,7 @@ def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
 
 def _attractor_words(row: Row) -> dict[str, str]:
     turns = [v for k, v in row.items() if k.startswith("rotation_")]
-    decided = ", ".join(f"{row[d]} {d.replace('_', ' ')}" for d in _DECISIONS if row[d])
+    decided = ", ".join(f"{n} {k[3:].replace('_', ' ')}" for k, n in row.items() if k.startswith("by_") and n)
     words = {
         "id": str(row["attractor_id"]),
         "kind": row["kind"].replace("_", " "),
@@ -257,6 +255,44 @@ def _loop_words(loop: xr.Dataset) -> dict[str, str]:
         met = ", ".join(f"{i} ({counts[i]} points)" for i in np.flatnonzero(counts))
         words[name.replace("_", " ")] = met or "-"
     return others | words | {"points": str(int(loop["loop_points"]))}
+
+
+# ---- settling ----------------------------------------------------------------------------------
+
+
+def settling_rows(ds: xr.Dataset) -> list[Row]:
+    """Return a row per bounded set and parameter point: what became of the sample that was run on."""
+    dims = [str(d) for d in ds["verdict"].dims if d != "attractor"]
+    words, n = _words(ds["verdict"]), ds.sizes["attractor"]
+    rows = []
+    for *index, i in np.argwhere(ds["verdict"].values > 0).tolist():
+        at = dict(zip(dims, index, strict=True))
+        one = ds.isel(at).isel(attractor=i)
+        row: Row = {**_where(ds, at), "attractor_id": i, "verdict": words[int(one["verdict"])]}
+        row |= {name: int(one[name]) for name in ("n_sampled", "n_left", "n_leaving")}
+        row |= {name: float(one[name]) for name in ("mean_lifetime", "lifetime_low", "lifetime_high")}
+        to = [(f"orbit of period {int(one['new_orbit_period'][k - n])}" if k >= n else str(k), c)
+              for k, c in enumerate(one["n_to"].values.tolist()) if c]  # fmt: skip
+        rows.append(row | {"to": ", ".join(f"{name} ({count})" for name, count in to)})
+    return rows
+
+
+def settling_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
+    """Return the table of bounded sets."""
+    n = ds.attrs["lifetimes_n_periods"]
+    lines = [f"bounded sets: {len(rows) or 'none'}; run on for {n} drive periods, which lifetimes are in"]
+    dims = [str(d) for d in ds["verdict"].dims if d != "attractor"]
+    table = []
+    for row in rows:
+        where = {f"{d}{_unit(ds, d)}": f"{row[d]:g}" for d in dims}
+        low, high = (_number(row[name], ".0f") for name in ("lifetime_low", "lifetime_high"))
+        lifetime = f"above {low}"
+        if row["n_left"]:
+            lifetime = f"{row['mean_lifetime']:.0f} ({low} to {high})"
+        counts = {"sampled": str(row["n_sampled"]), "left": str(row["n_left"])}
+        told = {"id": str(row["attractor_id"]), "verdict": row["verdict"]}
+        table.append(where | told | counts | {"mean lifetime": lifetime, "to": row["to"] or "-"})
+    return lines + _table(table)
 
 
 # ---- shared ------------------------------------------------------------------------------------

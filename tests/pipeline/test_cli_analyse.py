@@ -11,7 +11,7 @@ import xarray as xr
 
 from pipeline import derived, report
 from pipeline.analysis.basins import basins as basins_of
-from pipeline.cli_analyse import ATTRACTOR_OPTIONS, BASIN_OPTIONS
+from pipeline.cli_analyse import ATTRACTOR_OPTIONS, BASIN_OPTIONS, SETTLING_OPTIONS
 from pipeline.exits import Exit
 
 SPIRALS = """
@@ -49,6 +49,8 @@ def test_options__are_those_of_the_analyses():
     assert {
         name: str(v) if isinstance(v, str) else v for name, v in shown.items()
     } == derived.basin_defaults()
+    settling = {p.name: p.default for p in (*ATTRACTOR_OPTIONS, *SETTLING_OPTIONS)}
+    assert settling == derived.settling_defaults()
     assert derived.attractor_defaults().keys() == {p.name for p in ATTRACTOR_OPTIONS}
 
 
@@ -71,7 +73,7 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
         one = ds.sel(at).isel(attractor=i)
         assert int(row["n_cells"]) == int(one["n_cells"])
         assert float(row["low"]) < float(row["fraction"]) < float(row["high"])
-        decided = sum(int(row[name]) for name in ("closed", "certain", "approaching", "same_set", "run_on"))
+        decided = sum(int(count) for name, count in row.items() if name.startswith("by_"))
         assert decided == int(row["n_cells"])
         modulus = abs(complex(one["multiplier_real"][0], one["multiplier_imag"][0]))
         assert row["multiplier_modulus"] == ("" if np.isnan(modulus) else repr(modulus))
@@ -98,6 +100,27 @@ def test_basins__fractions_and_boundaries(main, spirals, tmp_path):
     code, out, _ = main(*arguments, "--box", "3")
     assert "attractors: taken from" in out
     assert "basins: computed" in out
+
+
+def test_settling__says_what_stays(main, spirals, tmp_path):
+    arguments = ("--n-sample", "4", "--n-periods", "64", "--csv", tmp_path / "s.csv")
+    code, out, err = main("analyse", spirals, "settling", *arguments)
+    assert (code, err) == (0, "")
+    ds = derived.settling(spirals, n_sample=4, n_periods=64)
+    n_sets = int((ds["verdict"] > 0).sum())
+    assert n_sets > 0
+    assert f"bounded sets: {n_sets}; run on for 64 drive periods" in out
+    with (tmp_path / "s.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert sum(int(row["n_sampled"]) for row in rows) == int(ds["n_sampled"].sum())
+    for row in rows:
+        words = (
+            "attractor"
+            if int(ds["verdict"].sel(frequency=float(row["frequency"]))[int(row["attractor_id"])]) == 1
+            else "transient"
+        )
+        assert row["verdict"] == words
+    assert re.search(r"frequency Hz +id +verdict +sampled +left +mean lifetime +to", out)
 
 
 def test_hysteresis__loops_and_jumps(main, write_spec, walk_text, tmp_path):
@@ -137,7 +160,10 @@ def test_analyse__incomplete_run_and_prune(main, made):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["attractors", "--tolerance", "0"], "tolerance = 0.0 is out of bounds: it must be greater than 0."),
+        (["attractors", "--tolerance", "-1"], "tolerance = -1.0 is out of bounds: it must be 0 (default) or"),
+        (["attractors", "--threshold", "0"], "threshold = 0.0 is out of bounds: it must be greater than 0."),
+        (["settling", "--n-sample", "0"], "n_sample = 0 is out of bounds: it must be 1 or more."),
+        (["settling", "--confidence", "1"], "confidence = 1.0 is out of bounds: it must lie"),
         (["attractors", "--look-back", "0"], "look_back = 0 is out of bounds: it must be 1 or more."),
         (["basins", "--rule-same-share", "1.5"], "rule_same_share = 1.5 is out of bounds: it must be at"),
         (["basins", "--confidence", "nan"], "confidence = nan: must be a number."),
@@ -165,12 +191,17 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
     cells[4:, :3] = 1
     cells[5, :8] = 1
     nan = np.full((n, 2), np.nan)
+    cells_of = ("frequency", "initial_condition")
     flags = {"flag_values": [0, 1, 2], "flag_meanings": "pending periodic bounded"}
     ds = xr.Dataset(
         {
-            "attractor_id": (("frequency", "initial_condition"), cells),
-            "decision": (("frequency", "initial_condition"), np.ones_like(cells, np.int8)),
-            "status": (("frequency", "initial_condition"), np.ones_like(cells, np.int8), flags),
+            "attractor_id": (cells_of, cells),
+            "decision": (
+                cells_of,
+                np.ones_like(cells, np.int8),
+                {"flag_meanings": "undecided closed run_on"},
+            ),
+            "status": (cells_of, np.ones_like(cells, np.int8), flags),
             "kind": (("frequency", "attractor"), kind, {"flag_meanings": "absent closed_orbit bounded_set"}),
             "orbit_period": (("frequency", "attractor"), kind * np.array([1, 2])),
             "side": (("frequency", "attractor"), 0 * kind, {"flag_meanings": "unknown left right"}),
