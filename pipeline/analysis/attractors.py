@@ -103,7 +103,7 @@ def identify(
     ds: xr.Dataset,
     *,
     parameters: Parameters | np.ndarray | None = None,
-    tolerance: float = 0.0,
+    tolerance: float | None = None,
     polish: bool = True,
     residual: float = 1e-10,
     max_orbit_period: int = 16,
@@ -123,7 +123,7 @@ def identify(
         What was integrated; by default as `ds.attrs` say. Axes of the cube replace the values of the
         same name. With another `system`, its packed vector.
     tolerance
-        Scaled distance within which a closed cell belongs to an orbit; 0 takes ten times the
+        Scaled distance within which a closed cell belongs to an orbit; by default ten times the
         attribute ``closure_tolerance`` of `ds`, and 1e-4 at least: a slow spiral can be eight times
         the closure tolerance away (`magpend_core.observers.closed_period`). Above 1e-3 the run is
         taken as loosely closed, see `pipeline.analysis.attractors`.
@@ -155,10 +155,10 @@ def identify(
     ValueError
         If a variable or the parameters are missing.
     """
-    if tolerance == 0.0:
+    if tolerance is None:
         tolerance = max(1e-4, 10.0 * float(ds.attrs.get("closure_tolerance", 1e-5)))
     elif not tolerance > 0.0:
-        raise ValueError(f"tolerance = {tolerance!r} is out of bounds: it must be 0 (default) or greater.")
+        raise ValueError(f"tolerance = {tolerance!r} is out of bounds: it must be greater than 0.")
     missing = [name for name in ("section", "status", "orbit_period") if name not in ds]
     if missing:
         raise ValueError(f"The dataset has no {', '.join(missing)}; give the dataset of pipeline.open_run.")
