@@ -204,6 +204,47 @@ def regimes(
     _draw_attractors(directory, f"regimes_{show.value}", draw, options, out, file_format)
 
 
+class Per(StrEnum):
+    """Units of exponents."""
+
+    S = "s"
+    PERIOD = "period"
+
+
+@plot_app.command(epilog=EXIT_HELP)
+def lyapunov(
+    directory: Directory,
+    spectrum: Annotated[
+        bool, typer.Option("--spectrum", help="All stored exponents, not the largest alone.")
+    ] = False,
+    as_map: Annotated[
+        bool, typer.Option("--map", help="A map over two parameters instead of a diagram over one.")
+    ] = False,
+    per: Annotated[Per, typer.Option(help="Exponents per second or per drive period.")] = Per.S,
+    state: Annotated[State, typer.Option(help="State of the diagram above.")] = State.PSI1,
+    degrees: Degrees = False,
+    at: At = None,
+    out: Out = None,
+    file_format: FileFormat = None,
+) -> None:
+    """Draw Lyapunov exponents, under the bifurcation diagram or as a map over two parameters."""
+    from pipeline import open_run
+    from pipeline.plots import plot_lyapunov, plot_lyapunov_map, save_data, save_figure
+
+    target = figure_target(directory, "lyapunov_map" if as_map else "lyapunov", out, file_format)
+    ds, chosen = open_run(directory), _positions(at)
+    with refusals(directory):
+        if as_map:
+            figure = plot_lyapunov_map(ds, per=per.value, at=chosen)
+        else:
+            figure = plot_lyapunov(
+                ds, spectrum=spectrum, per=per.value, state=state.value, degrees=degrees, at=chosen
+            )
+    target.parent.mkdir(exist_ok=True)
+    typer.echo(f"figure: {save_figure(figure, target)}")
+    typer.echo(f"data: {save_data(figure, target)}")
+
+
 def _draw_attractors(
     directory: Path,
     name: str,

@@ -9,6 +9,7 @@ from pipeline.plots.bifurcation import plot_bifurcation
 from pipeline.plots.coexisting import plot_coexisting
 from pipeline.plots.fractions import plot_fractions
 from pipeline.plots.gallery import plot_gallery
+from pipeline.plots.lyapunov import plot_lyapunov, plot_lyapunov_map
 from pipeline.plots.regimes import plot_regimes
 from pipeline.plots.style import save_data, save_figure
 from pipeline.plots.trajectory import plot_trajectory
@@ -19,6 +20,8 @@ __all__ = [
     "plot_coexisting",
     "plot_fractions",
     "plot_gallery",
+    "plot_lyapunov",
+    "plot_lyapunov_map",
     "plot_regimes",
     "plot_trajectory",
     "save_data",

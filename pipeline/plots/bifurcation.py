@@ -35,7 +35,7 @@ LAYOUTS = ("overlay", "side")
 _DRAWN = (1, 2, 7)
 _ABSENT = {"pending": (0,), "failed": (3, 4, 5), "not reached": (6,)}
 
-_SIDE_COLOURS = {
+SIDE_COLOURS = {
     Side.LEFT: style.BLUE,
     Side.RIGHT: style.VERMILLION,
     Side.STRADDLING: style.GREEN,
@@ -200,13 +200,46 @@ def plot_bifurcation(
     return fig
 
 
+def draw_diagram(ax: Axes, ds: xr.Dataset, *, state: str = "psi1", degrees: bool = False) -> list[Any]:
+    """Draw a diagram into axes of another figure, without a strip for absent cells.
+
+    Parameters
+    ----------
+    ax
+        Gets its limits, ticks and the label of its y axis here; the x axis stays without one.
+    ds, state, degrees
+        As for `plot_bifurcation`.
+
+    Returns
+    -------
+    list
+        Handles for a legend.
+
+    Raises
+    ------
+    ValueError
+        As `plot_bifurcation`.
+    """
+    view = _view(ds, state, degrees)
+    survey = _survey(view)
+    limits = _y_limits(view, survey)
+    style.style_axes(ax)
+    _dress(ax, view, limits)
+    ax.set_ylabel(style.state_label(state, degrees), fontsize=style.LABEL_PT)
+    if survey.empty:
+        _say_empty(ax, survey)
+    else:
+        _draw_points([(ax, None, tuple(range(len(view.directions))))], view, survey, limits)
+    return _handles(view, survey, "overlay")
+
+
 # ---------------------------------------------------------------- what is in the cube
 
 
 def _view(ds: xr.Dataset, state: str, degrees: bool) -> _View:
     states = [str(name) for name in ds["state"].values]
     style.check_choice("state", state, [name for name in style.STATE_SYMBOLS if name in states])
-    parameter = _parameter(ds)
+    parameter = swept_parameter(ds)
     directions: tuple[str, ...] = ("",)
     if "branch" in ds["section"].dims and "direction" in ds.coords:
         present = {str(name) for name in ds["direction"].values}
@@ -215,9 +248,14 @@ def _view(ds: xr.Dataset, state: str, degrees: bool) -> _View:
     return _View(ds.assign_coords(_position=position), state, degrees, parameter, directions)
 
 
-def _parameter(ds: xr.Dataset) -> str:
-    """Return the one swept parameter of a cube."""
-    outer = [str(dim) for dim in ds["section"].dims if dim not in (*_CELL_DIMS, *_INNER_DIMS)]
+def swept_parameters(ds: xr.Dataset) -> list[str]:
+    """Return the swept parameters of a cube."""
+    return [str(dim) for dim in ds["status"].dims if dim not in _CELL_DIMS]
+
+
+def swept_parameter(ds: xr.Dataset) -> str:
+    """Return the one swept parameter of a cube; raises ValueError if there is none or more than one."""
+    outer = swept_parameters(ds)
     long = [dim for dim in outer if ds.sizes[dim] > 1]
     if len(long) > 1:
         first = long[1] if long[0] == "frequency" else long[0]
@@ -454,7 +492,7 @@ def _draw_markers(panels: Sequence[Panel], view: _View, limits: tuple[float, flo
     position, value, label, direction = (np.concatenate([getattr(p, name) for p in parts]) for name in names)
     for ax, _, shown in panels:
         for i, look in reversed(_looks(view, shown).items()):
-            for kind, colour in _SIDE_COLOURS.items():
+            for kind, colour in SIDE_COLOURS.items():
                 chosen = (direction == i) & (label == kind)
                 if not chosen.any():
                     continue
@@ -530,7 +568,7 @@ def _paint(picture: np.ndarray, counts: Mapping[Side, np.ndarray], look: _Look) 
     most = np.zeros(picture.shape[:2], dtype=np.uint32)
     winner = np.zeros(picture.shape[:2], dtype=np.uint8)
     for kind, grid in counts.items():
-        colours[kind] = _tinted(_SIDE_COLOURS[kind], look.tint)
+        colours[kind] = _tinted(SIDE_COLOURS[kind], look.tint)
         spread = _dilate(grid, dot)
         np.copyto(winner, np.uint8(kind), where=spread > most)
         np.maximum(most, spread, out=most)
@@ -573,9 +611,19 @@ def _dilate(grid: np.ndarray, dot: Sequence[tuple[int, int]]) -> np.ndarray:
 
 
 def _legend(fig: Figure, view: _View, survey: _Survey, layout: str) -> None:
+    handles = _handles(view, survey, layout)
+    if handles:
+        fig.legend(
+            handles=handles, loc="lower right", bbox_to_anchor=(0.98, 0.925), ncols=len(handles),
+            frameon=False, fontsize=style.LEGEND_PT, handletextpad=0.3, columnspacing=1.1,
+            borderpad=0.2, handlelength=1.3,
+        )  # fmt: skip
+
+
+def _handles(view: _View, survey: _Survey, layout: str) -> list[Any]:
     kinds = {kind for _, kind in survey.classes}
     handles: list[Any] = [
-        _dot(colour, 5.0, kind.name.lower()) for kind, colour in _SIDE_COLOURS.items() if kind in kinds
+        _dot(colour, 5.0, kind.name.lower()) for kind, colour in SIDE_COLOURS.items() if kind in kinds
     ]
     if layout == "overlay" and len(view.directions) > 1 and not survey.empty:
         sizes = _looks(view, range(len(view.directions)))
@@ -584,12 +632,7 @@ def _legend(fig: Figure, view: _View, survey: _Survey, layout: str) -> None:
     for name, counts in survey.absent.items():
         if counts.any():
             handles.append(Patch(label=name, **_ABSENT_LOOKS[name]))
-    if handles:
-        fig.legend(
-            handles=handles, loc="lower right", bbox_to_anchor=(0.98, 0.925), ncols=len(handles),
-            frameon=False, fontsize=style.LEGEND_PT, handletextpad=0.3, columnspacing=1.1,
-            borderpad=0.2, handlelength=1.3,
-        )  # fmt: skip
+    return handles
 
 
 def _dot(colour: Any, size: float, label: str) -> Line2D:
