@@ -57,7 +57,7 @@ def _computed(ds: xr.Dataset, geometry: Geometry) -> xr.DataArray:
         )
     if "status" not in ds:
         return section
-    return section.where(ds["status"].isin((Status.PERIODIC, Status.BOUNDED)))
+    return section.where(ds["status"].isin((Status.PERIODIC, Status.BOUNDED, Status.INFERRED)))
 
 
 # ---- 0-1 test ----------------------------------------------------------------------------------

@@ -93,6 +93,12 @@ def test_zoom__beyond_the_old_range_is_noted(sweep):
         assert all(note.startswith(f"{key}: ") and "beyond the old" in note for note in notes)
 
 
+def test_zoom__old_range_in_radians_new_in_degrees(sweep):
+    radians, _ = zoom(sweep, Changes({"psi1": (-0.5, 0.5)}))
+    assert zoom(radians, Changes({"psi1_deg": (-28, 28)}))[1] == []
+    assert len(zoom(radians, Changes({"psi1_deg": (-29, 0)}))[1]) == 1
+
+
 def test_zoom__a_fixed_state_becomes_a_range(sweep):
     with pytest.raises(SpecError, match="psi1_dot: a range has 2 points or more"):
         zoom(sweep, Changes({"psi1_dot": (0, 1)}))
