@@ -334,8 +334,8 @@ PER_OCTAVE = 4
 """Radii per factor of two."""
 N_OCTAVES = 20
 """Radii reach from the largest distance down by this many factors of two."""
-TOP_OCTAVES = 2
-"""The fit ends at the largest distance over two to this power."""
+MOST_PAIRS = 0.05
+"""Share of the pairs closer than the radius at which the fit ends."""
 LEAST_OCTAVES = 2
 """Shortest range that is fitted."""
 LEAST_NEIGHBOURS = 10
@@ -361,10 +361,11 @@ def correlation_dimension(
     2427, 1986). Distances are the largest scaled difference of a component, angles on their circle.
 
     The range of the fit is a rule, not a choice: from the least radius within which a point has ten
-    others on average, at least `floor`, to a quarter of the largest distance. Above it the edge of the
-    set bends the curve; below it so do the few returns of a quasi-periodic motion. If this is less than
-    two octaves there is no fit. The slope is that of the straight line of least squares through the
-    radii in the range, four per octave.
+    others on average, at least `floor`, to that within which lies a twentieth of all pairs. Above it the
+    edge of the set bends the curve; below it so do the few returns of a quasi-periodic motion. If this
+    is less than two octaves there is no fit: N points do for a dimension of ``log2(N/200)/2`` or less.
+    The slope is that of the straight line of least squares through the radii in the range, four per
+    octave.
 
     Parameters
     ----------
@@ -397,8 +398,8 @@ def correlation_dimension(
         `largest_resolved`, ``2 log N/log(extent/fit_low)``, the bound of Eckmann and Ruelle (Physica D
         56, 185, 1992): a result near it says only that the points are too few. And, with `radius`:
         `log_radius` and `log_correlation_sum`, natural logarithms, NaN where no pair is closer. The
-        dimension is 0 where the set is a point or the curve is flat in the range (closed orbits), NaN
-        where there is no range.
+        dimension is 0 where a twentieth of the pairs lies within `floor` (closed orbits), NaN where there
+        is no range.
 
     Raises
     ------
@@ -471,8 +472,11 @@ def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometr
     radii = extent * 2.0 ** (-np.arange(n_radii)[::-1] / PER_OCTAVE)
     pairs = _Pairs.of(section, radii, theiler, geometry)
     x, y = np.log(radii), _logarithm(pairs.all / pairs.total)
+    share = pairs.all / pairs.total
+    if share[np.searchsorted(radii, floor)] > MOST_PAIRS:
+        return _Curve(x, y, n_points, 0.0, 0.0, 0.0)
     enough = pairs.all >= LEAST_NEIGHBOURS * n_points
-    fit = np.flatnonzero(enough & (radii >= floor) & (radii <= extent / 2.0**TOP_OCTAVES))
+    fit = np.flatnonzero(enough & (radii >= floor) & (share <= MOST_PAIRS))
     if len(fit) < LEAST_OCTAVES * PER_OCTAVE + 1:
         return _Curve(x, y, n_points)
     middle = len(fit) // 2

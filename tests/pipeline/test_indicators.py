@@ -248,8 +248,10 @@ def test_correlation_dimension__henon():
     assert found["correlation_dimension_stderr"].item() < 0.015
     assert abs(found["correlation_dimension_spread"].item()) < 0.06
     assert found["n_points"].item() == 8000
-    # the range is the documented one: ten neighbours, a quarter of the largest distance
-    assert found["fit_high"].item() == pytest.approx(np.ptp(henon(1, 8000)[..., 0]) / 4.0)
+    # the range is the documented one: ten neighbours, a twentieth of the pairs
+    at = int(np.argmin(abs(found["log_radius"].values[0] - np.log(found["fit_high"].item()))))
+    share = np.exp(found["log_correlation_sum"].values[0, at : at + 2])
+    assert share[0] <= 0.05 < share[1]
     at = int(np.argmin(abs(found["log_radius"].values[0] - np.log(found["fit_low"].item()))))
     neighbours = np.exp(found["log_correlation_sum"].values[0, at - 1 : at + 1]) * 8000
     assert neighbours[0] < 10.0 <= neighbours[1] * (1.0 + 1e-3)
@@ -264,7 +266,7 @@ def test_correlation_dimension__henon():
 def test_correlation_dimension__circle_torus_and_square():
     ring = correlation_dimension(cube(circle(4000)), geometry=CIRCLE)
     assert ring["correlation_dimension"].item() == pytest.approx(1.0, abs=0.03)
-    n = np.arange(4000)
+    n = np.arange(6000)
     torus = np.stack([2 * np.pi * np.sqrt(2) * n, 2 * np.pi * np.sqrt(3) * n], axis=-1)
     found = correlation_dimension(cube(torus[None]), geometry=TORUS)
     assert found["correlation_dimension"].item() == pytest.approx(2.0, abs=0.08)
@@ -306,8 +308,8 @@ def test_pairs__without_a_part_are_those_of_the_other_points():
 
 
 def test_correlation_dimension__closed_orbits_points_and_failed_cells():
-    section = henon(5, 1000)
-    section[0] = np.array([[0.1, 0.2], [0.5, -0.3], [-0.2, 0.0]])[np.arange(1000) % 3]
+    section = henon(5, 2000)
+    section[0] = np.array([[0.1, 0.2], [0.5, -0.3], [-0.2, 0.0]])[np.arange(2000) % 3]
     section[1] = 0.3 + 1e-8 * np.random.default_rng(0).normal(size=section[1].shape)
     section[2] = np.nan
     status = [Status.PERIODIC, Status.PERIODIC, Status.DIVERGED, Status.PENDING, Status.BOUNDED]
@@ -316,7 +318,7 @@ def test_correlation_dimension__closed_orbits_points_and_failed_cells():
     assert dimension[:2].tolist() == [0.0, 0.0]
     assert np.isnan(dimension[2:4]).all()
     assert dimension[4] == pytest.approx(1.2, abs=0.1)
-    assert found["n_points"].values.tolist() == [1000, 1000, 0, 0, 1000]
+    assert found["n_points"].values.tolist() == [2000, 2000, 0, 0, 2000]
     # too few points for two octaves: the curve, and no slope
     few = correlation_dimension(cube(henon(1, 60)), geometry=PLANE)
     assert np.isnan(few["correlation_dimension"].item())
@@ -335,7 +337,7 @@ def test_correlation_dimension__pooled_cells_and_sample_bound():
 
 
 def test_correlation_dimension__error_is_the_scatter():
-    found = correlation_dimension(cube(henon(24, 1000)), geometry=PLANE)
+    found = correlation_dimension(cube(henon(16, 2000)), geometry=PLANE)
     scatter = found["correlation_dimension"].values.std(ddof=1)
     stated = found["correlation_dimension_stderr"].values.mean()
     assert 0.5 < stated / scatter < 2.0
