@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cli_analyse import analyse_app
-from pipeline.cli_branches import branches
+from pipeline.cli_branches import branches, draw_branches, draw_curves, draw_multipliers
 from pipeline.cli_common import EXIT_HELP, Directory, read_pairs
 from pipeline.cli_plot import check_figure_path, draw_bifurcation, plot_app
 from pipeline.cli_zoom import zoom
@@ -163,6 +163,9 @@ def simulate(
 
 
 app.command(epilog=EXIT_HELP)(branches)
+plot_app.command("branches", epilog=EXIT_HELP)(draw_branches)
+plot_app.command("multipliers", epilog=EXIT_HELP)(draw_multipliers)
+plot_app.command("curves", epilog=EXIT_HELP)(draw_curves)
 
 
 @app.command(epilog=EXIT_HELP)

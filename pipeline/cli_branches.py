@@ -7,31 +7,42 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli_common import Directory
+from pipeline.cli_common import Directory, refusals
+from pipeline.cli_plot import Degrees, FileFormat, Out, State, figure_target
 
 if TYPE_CHECKING:
     import xarray as xr
 
+Parameter = Annotated[str, typer.Option(help="What is varied: frequency_hz, or a parameter's name.")]
+Low = Annotated[
+    float | None, typer.Option("--from", help="Least value \\[SI]; by default what the run spans.")
+]
+High = Annotated[float | None, typer.Option("--to", help="Largest value \\[SI].")]
+Period = Annotated[int, typer.Option(help="Longest period of a branch \\[drive periods].")]
+Generations = Annotated[int, typer.Option(help="How often branches that spring from branches are followed.")]
+Recurrences = Annotated[
+    int,
+    typer.Option(help="Start also from orbits, up to this period, near close recurrences of bounded cells."),
+]
+
+
+def _options(
+    parameter: str, low: float | None, high: float | None, period: int, generations: int, recurrences: int
+) -> dict[str, Any]:
+    return {
+        "parameter": parameter, "low": low, "high": high, "max_period": period, "generations": generations,
+        "recurrences": recurrences, "echo": typer.echo,
+    }  # fmt: skip
+
 
 def branches(
     directory: Directory,
-    parameter: Annotated[
-        str, typer.Option(help="What is varied: frequency_hz, or a parameter's name.")
-    ] = "frequency_hz",
-    low: Annotated[
-        float | None, typer.Option("--from", help="Least value \\[SI]; by default what the run spans.")
-    ] = None,
-    high: Annotated[float | None, typer.Option("--to", help="Largest value \\[SI].")] = None,
-    period: Annotated[int, typer.Option(help="Longest period of a branch \\[drive periods].")] = 4,
-    generations: Annotated[
-        int, typer.Option(help="How often branches that spring from branches are followed.")
-    ] = 3,
-    recurrences: Annotated[
-        int,
-        typer.Option(
-            help="Start also from orbits, up to this period, near close recurrences of bounded cells."
-        ),
-    ] = 0,
+    parameter: Parameter = "frequency_hz",
+    low: Low = None,
+    high: High = None,
+    period: Period = 4,
+    generations: Generations = 3,
+    recurrences: Recurrences = 0,
     csv: Annotated[Path | None, typer.Option(help="Write the table of bifurcations to this file.")] = None,
 ) -> None:
     """Follow periodic orbits along a parameter, stable or not; locate and name their bifurcations.
@@ -41,14 +52,104 @@ def branches(
     from pipeline import derived_branches
 
     ds = derived_branches.branches(
-        directory, parameter=parameter, low=low, high=high, max_period=period, generations=generations,
-        recurrences=recurrences, echo=typer.echo,
-    )  # fmt: skip
+        directory, **_options(parameter, low, high, period, generations, recurrences)
+    )
     for line in (*_table(ds), "", *_windows(ds)):
         typer.echo(line)
     if csv is not None:
         csv.write_text("\n".join(_csv(ds)) + "\n", "utf-8")
         typer.echo(f"table: {csv}")
+
+
+def draw_branches(
+    directory: Directory,
+    parameter: Parameter = "frequency_hz",
+    low: Low = None,
+    high: High = None,
+    period: Period = 4,
+    generations: Generations = 3,
+    recurrences: Recurrences = 0,
+    over: Annotated[
+        Path | None, typer.Option(help="Run over the same parameter that is drawn below; by default DIR.")
+    ] = None,
+    shown: Annotated[int | None, typer.Option(help="Longest period drawn \\[drive periods].")] = None,
+    state: Annotated[State, typer.Option(help="What is drawn over the parameter.")] = State.PSI1,
+    out: Out = None,
+    degrees: Degrees = False,
+    file_format: FileFormat = None,
+) -> None:
+    """Draw branches of periodic orbits over the bifurcation diagram: solid stable, dashed unstable."""
+    target = figure_target(directory, f"branches_{state.value}", out, file_format)
+    from pipeline import derived_branches, open_run
+    from pipeline.plots import plot_branches, save_figure
+
+    ds = derived_branches.branches(
+        directory, **_options(parameter, low, high, period, generations, recurrences)
+    )
+    cube = open_run(over or directory)
+    axis = "frequency" if parameter == "frequency_hz" else parameter
+    with refusals(directory):
+        below = cube if axis in cube.dims else None
+        figure = plot_branches(ds, below, state=state.value, max_period=shown, degrees=degrees)
+    target.parent.mkdir(exist_ok=True)
+    typer.echo(f"figure: {save_figure(figure, target)}")
+
+
+def draw_multipliers(
+    directory: Directory,
+    branch: Annotated[int, typer.Option(help="Number of the branch, as in the table.")] = 0,
+    parameter: Parameter = "frequency_hz",
+    low: Low = None,
+    high: High = None,
+    period: Period = 4,
+    generations: Generations = 3,
+    recurrences: Recurrences = 0,
+    out: Out = None,
+    file_format: FileFormat = None,
+) -> None:
+    """Draw the Floquet multipliers along a branch in the complex plane, with the unit circle."""
+    target = figure_target(directory, f"multipliers_{branch}", out, file_format)
+    from pipeline import derived_branches
+    from pipeline.plots import plot_multipliers, save_figure
+
+    ds = derived_branches.branches(
+        directory, **_options(parameter, low, high, period, generations, recurrences)
+    )
+    with refusals(directory):
+        figure = plot_multipliers(ds, branch)
+    target.parent.mkdir(exist_ok=True)
+    typer.echo(f"figure: {save_figure(figure, target)}")
+
+
+def draw_curves(
+    directory: Directory,
+    second: Annotated[str, typer.Option(help="Second parameter's name, such as q.")],
+    second_low: Annotated[float, typer.Option("--second-from", help="Its least value \\[SI].")],
+    second_high: Annotated[float, typer.Option("--second-to", help="Its largest value \\[SI].")],
+    curve_period: Annotated[int, typer.Option(help="Longest period of the orbits \\[drive periods].")] = 1,
+    parameter: Parameter = "frequency_hz",
+    low: Low = None,
+    high: High = None,
+    period: Period = 4,
+    generations: Generations = 3,
+    recurrences: Recurrences = 0,
+    out: Out = None,
+    file_format: FileFormat = None,
+) -> None:
+    """Draw curves of folds, period doublings and Neimark-Sacker points in the plane of two parameters.
+
+    Continues the points that `magpend branches` locates; the curves are kept in DIR/derived.
+    """
+    target = figure_target(directory, f"curves_{second}", out, file_format)
+    from pipeline import derived_branches
+    from pipeline.plots import plot_curves, save_figure
+
+    options = _options(parameter, low, high, period, generations, recurrences)
+    ds = derived_branches.curves(
+        directory, second, second_low, second_high, curve_period=curve_period, **options
+    )
+    target.parent.mkdir(exist_ok=True)
+    typer.echo(f"figure: {save_figure(plot_curves(ds), target)}")
 
 
 def _table(ds: xr.Dataset) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
 from pipeline.derived import Echo, Snapshot, Source, attractors, derive
@@ -125,3 +126,76 @@ def _branches(
     if echo is not None:
         echo(f"branches: {len(starts)} starting orbits")
     return dataset_of(explore(starts, Scope(low, high, max_period, generations)), parameter, base)
+
+
+def curves(
+    directory: Source,
+    second: str,
+    low: float,
+    high: float,
+    *,
+    curve_period: int = 1,
+    echo: Echo | None = None,
+    **options: Any,
+) -> xr.Dataset:
+    """Curves of the bifurcations located by `branches`, in the plane of its parameter and a second one.
+
+    Parameters
+    ----------
+    directory
+        Run directory, or a `Snapshot`.
+    second
+        ``frequency_hz`` or a parameter's name.
+    low, high
+        Interval of the second parameter [SI].
+    curve_period
+        Longest period of the orbits taken [drive periods].
+    echo
+        Prints a line.
+    options
+        Those of `branches`.
+
+    Returns
+    -------
+    Dataset
+        As `pipeline.analysis.branches.curves_dataset` says.
+
+    Raises
+    ------
+    SpecError
+        If an option is out of bounds, or the run sweeps the second parameter.
+    """
+    from pipeline.analysis.attractors import parameters_of
+
+    snapshot = Snapshot.of(directory)
+    located = branches(snapshot, echo=echo, **options)
+    first = str(located.attrs["parameter"])
+    if second == first:
+        raise SpecError([f"{second} is the branches' own parameter; give another one."])
+    axis = snapshot.open().coords.get("frequency" if second == "frequency_hz" else second)
+    if axis is not None and axis.ndim > 0 and axis.size > 1:
+        raise SpecError(
+            [f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."]
+        )
+    interval = _interval(snapshot, second, low, high)
+    if second != "frequency_hz":
+        for value in interval:
+            parameters_of(snapshot.open()).replace(**{second: value})
+    if curve_period < 1:
+        raise SpecError([f"curve_period = {curve_period}: must be 1 or more."])
+    wanted = {
+        **json.loads(located.attrs["derived_options"]),
+        "second": second,
+        "second_low": interval[0],
+        "second_high": interval[1],
+        "curve_period": curve_period,
+    }
+
+    def compute(at: Snapshot) -> xr.Dataset:
+        from pipeline.analysis.branches import curves_dataset, curves_from
+
+        base = parameters_of(at.open())
+        bounds = ((wanted["low"], wanted["high"]), interval)
+        return curves_dataset(curves_from(located, base, second, bounds, curve_period), first, second)
+
+    return derive(snapshot, "curves", wanted, compute, echo)

@@ -6,6 +6,7 @@ in any thread and without a display.
 
 from pipeline.plots.basins import plot_basins
 from pipeline.plots.bifurcation import plot_bifurcation
+from pipeline.plots.branches import plot_branches, plot_curves, plot_multipliers
 from pipeline.plots.coexisting import plot_coexisting
 from pipeline.plots.fractions import plot_fractions
 from pipeline.plots.gallery import plot_gallery
@@ -17,11 +18,14 @@ from pipeline.plots.trajectory import plot_trajectory
 __all__ = [
     "plot_basins",
     "plot_bifurcation",
+    "plot_branches",
     "plot_coexisting",
+    "plot_curves",
     "plot_fractions",
     "plot_gallery",
     "plot_lyapunov",
     "plot_lyapunov_map",
+    "plot_multipliers",
     "plot_regimes",
     "plot_trajectory",
     "save_data",

@@ -9,6 +9,7 @@ walks, `bifurcations` notices and locates, `following` makes one branch, `explor
 together.
 """
 
+from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.dataset import dataset_of, table_of, windows_of
 from pipeline.analysis.branches.exploring import Scope, Start, explore
 from pipeline.analysis.branches.starts import attracting, orbits_near, recurrent
@@ -17,6 +18,8 @@ __all__ = [
     "Scope",
     "Start",
     "attracting",
+    "curves_dataset",
+    "curves_from",
     "dataset_of",
     "explore",
     "orbits_near",

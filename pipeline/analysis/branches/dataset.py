@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.parameters import Parameters, describe
+from magpend_core.parameters import Parameters
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.branches.bifurcations import FOLD, KINDS, Bifurcation, multipliers_of, n_unstable
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.problems import FREQUENCY, RTOL
+from pipeline.analysis.branches.units import STATE_UNITS, units_of
 from pipeline.analysis.sides import ARM_LENGTHS, Side
 
 CRITICALITIES = ("", "supercritical", "subcritical")
-STATE_UNITS = "rad, rad, rad/s, rad/s"
 SAMPLES = 64
 """Instants per drive period at which the side of an orbit is judged."""
 
@@ -47,17 +47,9 @@ def dataset_of(branches: Sequence[Branch], parameter: str, parameters: Parameter
     events = [(i, b) for i, branch in enumerate(branches) for b in branch.bifurcations]
     per_branch = _per_branch(branches, events)
     per_event = _per_event(branches, events, longest, n_states, arrays)
-    result = xr.Dataset({**arrays.variables(_units(parameter)), **per_branch, **per_event})
+    result = xr.Dataset({**arrays.variables(units_of(parameter)), **per_branch, **per_event})
     result = result.assign_coords(state=("state", list(names), {"long_name": "component of the state"}))
-    return result.assign_attrs(parameter=parameter, parameter_units=_units(parameter))
-
-
-def _units(parameter: str) -> str:
-    if parameter == FREQUENCY:
-        return "Hz"
-    from magpend_core.parameters import load_preset
-
-    return describe(load_preset()).get(parameter, {"unit": ""})["unit"]
+    return result.assign_attrs(parameter=parameter, parameter_units=units_of(parameter))
 
 
 class _Arrays:

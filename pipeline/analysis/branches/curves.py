@@ -1,0 +1,219 @@
+"""Curves of bifurcations in the plane of two parameters, continued from points located on branches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.parameters import Parameters
+from magpend_core.pendulum import system_of
+from pipeline.analysis.branches.arclength import Point, Settings, Walk, correct, kernel_of, walk
+from pipeline.analysis.branches.bifurcations import KINDS, TORUS, multipliers_of
+from pipeline.analysis.branches.following import opposite
+from pipeline.analysis.branches.lockstep import Steps, run_together
+from pipeline.analysis.branches.problems import FREQUENCY, TESTS, BifurcationProblem, Family
+from pipeline.analysis.branches.units import STATE_UNITS, units_of
+
+CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-8, max_iterations=8)
+"""Steps are longer than on a branch, since nothing is looked for between; the residual, with that of the
+test function in it, is what differences of monodromy matrices allow for."""
+
+CURVE_ENDS = ("bound", "closed", "resonance", "max_points", "stuck")
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One curve of bifurcations: its points, why it ends on both sides, the located point it began with."""
+
+    family: Family
+    kind: str
+    points: list[Point]
+    ends: tuple[str, str]
+    start: int
+
+    @property
+    def values(self) -> np.ndarray:
+        """Both parameters at the points, shape (n, 2)."""
+        return np.array([self.family.values(p.u) for p in self.points])
+
+
+def curves_from(
+    branches: xr.Dataset,
+    parameters: Parameters,
+    second: str,
+    bounds: tuple[tuple[float, float], tuple[float, float]],
+    max_period: int,
+    settings: Settings = CURVE,
+) -> list[Curve]:
+    """Continue the bifurcations located on branches in a second parameter.
+
+    Parameters
+    ----------
+    branches
+        From `dataset_of`.
+    parameters
+        What was integrated; the value of `second` is where the branches lie.
+    second
+        Name of the second parameter.
+    bounds
+        Interval of the branches' parameter, and that of the second.
+    max_period
+        Longest period of the orbits taken.
+    settings
+        How to walk; arclengths are in units of the intervals.
+
+    Returns
+    -------
+    list of Curve
+        By the located point they began with; none twice.
+    """
+    starts = _starts(branches, parameters, second, bounds, max_period)
+    problems = [BifurcationProblem(family, kind) for _, family, kind, _ in starts]
+    firsts = run_together(
+        [_first(problem, u, settings) for problem, (_, _, _, u) in zip(problems, starts, strict=True)]
+    )
+    found = [(s, p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
+    walks = run_together([_follow(p, way, bounds, settings) for _, p, f in found for way in (opposite(f), f)])
+    curves: list[Curve] = []
+    for i, ((number, family, kind, _), _, first) in enumerate(found):
+        back, ahead = walks[2 * i : 2 * i + 2]
+        points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
+        ends = (back.end, ahead.end)
+        if not any(_passes(curve, kind, family, first) for curve in curves):
+            curves.append(Curve(family, kind, points, ends, number))
+    return curves
+
+
+def _starts(
+    ds: xr.Dataset,
+    parameters: Parameters,
+    second: str,
+    bounds: tuple[tuple[float, float], tuple[float, float]],
+    max_period: int,
+) -> list[tuple[int, Family, str, np.ndarray]]:
+    """Located points with their two-parameter families and unknowns."""
+    first = str(ds.attrs["parameter"])
+    scales = tuple(high - low for low, high in bounds)
+    found = []
+    for k in range(ds.sizes["bifurcation"]):
+        branch = int(ds["of_branch"][k])
+        period, kind = int(ds["orbit_period"][branch]), KINDS[int(ds["kind"][k])]
+        if period > max_period or kind not in TESTS:
+            continue
+        frequency = float(ds["frequency_hz"][branch])
+        family = Family(
+            system_of(parameters),
+            period,
+            frequency,
+            parameters.pack(),
+            (first, second),
+            (scales[0], scales[1]),
+        )
+        here = frequency if second == FREQUENCY else parameters.as_dict()[second]
+        state = np.asarray(ds["bifurcation_section"].values[k, 0])
+        found.append((k, family, kind, family.unknowns(state, [float(ds["value"][k]), here])))
+    return found
+
+
+def _first(problem: BifurcationProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
+    normal = np.zeros(problem.size)
+    normal[-1] = 1.0
+    found = yield from correct(problem, u, normal, settings)
+    if found is None:
+        return None
+    tangent = kernel_of(found.value)
+    return replace(found, tangent=tangent * (1.0 if tangent[-1] >= 0.0 else -1.0))
+
+
+def _follow(
+    problem: BifurcationProblem,
+    start: Point,
+    bounds: tuple[tuple[float, float], tuple[float, float]],
+    settings: Settings,
+) -> Steps[Walk]:
+    """One way along a curve; the point beyond a bound is dropped."""
+
+    def stop(points: list[Point]) -> str:
+        here = points[-1]
+        values = problem.family.values(here.u)
+        if any(not low <= v <= high for v, (low, high) in zip(values, bounds, strict=True)):
+            return "bound"
+        if problem.kind == TORUS and not _has_torus(here):
+            return "resonance"
+        step = np.linalg.norm(here.u - points[-2].u)
+        if len(points) > 5 and np.linalg.norm(here.u - points[0].u) < 0.7 * step:
+            return "closed"
+        return ""
+
+    found = yield from walk(problem, start, settings, stop, _anything)
+    if found.end in ("bound", "resonance"):
+        found.points.pop()
+    return found
+
+
+def _anything(a: Point, b: Point) -> Steps[bool]:
+    return True
+    yield  # a computation that asks for nothing
+
+
+def _has_torus(point: Point) -> bool:
+    multipliers = multipliers_of(point)
+    pairs = multipliers[multipliers.imag > 0.0]
+    return bool(len(pairs)) and bool(np.abs(np.abs(pairs) - 1.0).min() < 1e-4)
+
+
+def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
+    """Whether a curve goes through a start, to within what a chord allows for."""
+    if curve.kind != kind or curve.family.period != family.period:
+        return False
+    u = np.array([p.u for p in curve.points])
+    for a, b in pairwise(u):
+        chord = b - a
+        length = float(np.linalg.norm(chord))
+        offset = np.append(family.mismatch(a, family.state(start.u)), start.u[-2:] - a[-2:])
+        share = float(offset @ chord) / length**2
+        if -0.01 <= share <= 1.01 and np.linalg.norm(offset - share * chord) < 0.02 * length + 1e-6:
+            return True
+    return False
+
+
+def curves_dataset(curves: Sequence[Curve], first: str, second: str) -> xr.Dataset:
+    """Return curves as a dataset: dims ``curve``, ``point`` (NaN beyond a curve's own) and ``state``."""
+    n = max((len(c.points) for c in curves), default=0)
+    values = np.full((len(curves), n, 2), np.nan)
+    section = np.full((len(curves), n, curves[0].family.system.n_states if curves else 4), np.nan)
+    residual = np.full((len(curves), n), np.nan)
+    for i, curve in enumerate(curves):
+        values[i, : len(curve.points)] = curve.values
+        section[i, : len(curve.points)] = [curve.family.state(p.u) for p in curve.points]
+        residual[i, : len(curve.points)] = [p.residual for p in curve.points]
+    kinds = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
+    ends = {"flag_values": np.arange(len(CURVE_ENDS), dtype=np.int8), "flag_meanings": " ".join(CURVE_ENDS)}
+    dims = ("curve", "point")
+    one = {"units": "1"}
+
+    def codes(i: int) -> np.ndarray:
+        return np.array([CURVE_ENDS.index(c.ends[i]) for c in curves], np.int8)
+
+    def numbers(values: list[int]) -> np.ndarray:
+        return np.array(values, np.int32)
+
+    return xr.Dataset(
+        {
+            "first": (dims, values[..., 0], {"units": units_of(first), "long_name": first}),
+            "second": (dims, values[..., 1], {"units": units_of(second), "long_name": second}),
+            "section": ((*dims, "state"), section, {"units": STATE_UNITS, "long_name": "a section point"}),
+            "residual": (dims, residual, {**one, "long_name": "largest residual, test function included"}),
+            "kind": ("curve", np.array([KINDS.index(c.kind) for c in curves], np.int8), {**one, **kinds}),
+            "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
+            "start": ("curve", numbers([c.start for c in curves]), {**one, "long_name": "located point"}),
+            "n_points": ("curve", numbers([len(c.points) for c in curves]), one),
+            "first_end": ("curve", codes(0), {**one, **ends}),
+            "last_end": ("curve", codes(1), {**one, **ends}),
+        },
+        attrs={"first_parameter": first, "second_parameter": second},
+    )  # fmt: skip
