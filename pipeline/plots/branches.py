@@ -132,11 +132,11 @@ def _pieces(ds: xr.Dataset, branch: int, state: str) -> Iterator[tuple[np.ndarra
     for first, stop in zip([0, *edges], [*edges, len(is_solid)], strict=True):
         if stop <= first:
             continue
+        solid = bool(is_solid[first])
         for k in range(period):
             values = y[first : stop + 1, k].copy()
-            jumps = np.flatnonzero(np.abs(np.diff(values)) > np.pi) if style.is_angle(state) else []
-            xs = np.insert(x[first : stop + 1], np.asarray(jumps, int) + 1, np.nan)
-            yield xs, np.insert(values, np.asarray(jumps, int) + 1, np.nan), bool(is_solid[first])
+            jumps = np.flatnonzero((np.abs(np.diff(values)) > np.pi) & style.is_angle(state)) + 1
+            yield np.insert(x[first : stop + 1], jumps, np.nan), np.insert(values, jumps, np.nan), solid
 
 
 def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], state: str, factor: float) -> None:

@@ -10,9 +10,10 @@ from scipy.optimize import fsolve
 from magpend_core.jit import inline
 from magpend_core.system import System
 from magpend_core.vecmath import sincos
-from pipeline.analysis.branches import Scope, Start, dataset_of, explore, table_of, windows_of
+from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
 from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.bifurcations import multipliers_of, n_unstable
+from pipeline.analysis.branches.curves import continue_curves
 from pipeline.analysis.branches.following import first_point
 from pipeline.analysis.branches.lockstep import run_alone, run_together
 from pipeline.analysis.branches.problems import (
@@ -251,7 +252,10 @@ def test_explore__neimark_sacker():
     """A forced van der Pol oscillator leaves entrainment through a torus."""
     parameters = [-0.2, 0.2, 1.0, 0.0, 0.4]
     orbits = family(0.16, parameters, "frequency_hz", 0.05)
-    (branch,) = explore([Start(orbits, settled([1.0, 1.5], 0.16, parameters), 0.16)], Scope(0.15, 0.22))
+    (branch,) = explore(
+        [Start(orbits, settled([1.0, 1.5], 0.16, parameters), 0.16)],
+        Scope(0.15, 0.22, settings=Settings(longest_step=0.03)),
+    )
     tori = only(branch, "neimark_sacker")
     assert tori
     for torus in tori:
@@ -288,6 +292,85 @@ def test_explore__symmetry_breaking():
     far = broken.points[-1] if broken.points[0] is pitchfork.point else broken.points[0]
     half, _ = flow(orbits.state(far.u), orbits.frequency_hz, [*parameters[:4], orbits.values(far.u)[0]], 0.5)
     assert np.abs(half + orbits.state(far.u)).max() > 1e-2
+
+
+def test_continue_curves__fold_of_duffing(resonance):
+    """The fold at another amplitude, against scipy."""
+    orbits, branch = resonance
+    family_2 = Family(OSCILLATOR, 1, 0.1, orbits.parameters, ("frequency_hz", "amplitude"), (0.3, 0.2))
+    fold = only(branch, "fold")[0]
+    start = family_2.unknowns(orbits.state(fold.point.u), [orbits.values(fold.point.u)[0], 0.3])
+    (curve,) = continue_curves([(0, family_2, "fold", start)], ((0.1, 0.4), (0.2, 0.4)))
+    assert max(p.residual for p in curve.points) <= 1e-8
+    far = min(curve.points, key=lambda p: abs(family_2.values(p.u)[1] - 0.35))
+    frequency, amplitude = family_2.values(far.u)
+    parameters = [*orbits.parameters[:4], amplitude]
+
+    def equations(unknowns):
+        image, matrix = flow(unknowns[:2], unknowns[2], parameters)
+        return [*(image - unknowns[:2]), fold_test(matrix)]
+
+    there = fsolve(equations, np.append(family_2.state(far.u), frequency) * (1 + 1e-5), xtol=1e-13)
+    assert frequency == pytest.approx(there[2], abs=1e-8)
+    assert abs(frequency - orbits.values(fold.point.u)[0]) > 1e-3
+
+
+@inline
+def _turning_rhs(y, u, c):
+    x, v = y
+    return v, u + c[3] - c[0] * v - c[2] * sincos(x)[0]
+
+
+@inline
+def _turning_jacobian(y, u, c):
+    zero = 0.0 * y[0]
+    return zero, zero + 1.0, -c[2] * sincos(y[0])[1], zero - c[0]
+
+
+@pytest.mark.slow
+def test_explore__rotation():
+    """A pendulum that turns over once per period: closed on its circle, one turn, round a fold."""
+    system = _system(
+        name="branch_turning", is_angle=(True, False), rhs=_turning_rhs, jacobian=_turning_jacobian,
+        parameter_names=("damping", "nothing", "gravity", "torque", "amplitude"),
+    )  # fmt: skip
+    frequency, parameters = 0.32, [0.5, 0.0, 1.0, 1.0, 1.0]
+
+    def rates(t, z):
+        force = parameters[4] * np.cos(2.0 * np.pi * frequency * t) + parameters[3]
+        return [z[1], force - parameters[0] * z[1] - parameters[2] * np.sin(z[0])]
+
+    end = solve_ivp(rates, (0.0, 80 / frequency), [0.0, 2.0], rtol=1e-8, atol=1e-8).y[:, -1]
+    end[0] = np.remainder(end[0], 2.0 * np.pi)
+    orbits = family(frequency, parameters, "amplitude", 1.0, system=system)
+    (branch,) = explore([Start(orbits, end, 1.0)], Scope(0.05, 1.2, max_period=1))
+    folds = only(branch, "fold")
+    assert len(folds) == 1
+    ds = dataset_of([branch], "amplitude", None)
+    assert ds["rotation"].values.tolist() == [[1.0]]
+    parameters[4] = float(branch.values[7])
+    state = orbits.state(branch.points[7].u)
+    image = solve_ivp(rates, (0.0, 1 / frequency), state, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(image - state, [2.0 * np.pi, 0.0], atol=1e-9)
+
+
+def test_orbits_near__chaotic_well():
+    """Recurrences of a chaotic trajectory lead to unstable orbits, each a fixed point by scipy too."""
+    parameters = [0.3, 0, -1.0, 1.0, 0.5]
+    frequency = 1.2 / (2.0 * np.pi)
+    points = [np.array([1.0, 0.0])]
+    for _ in range(150):
+        points.append(settled(points[-1], frequency, parameters, 1))
+    found = orbits_near(np.array(points)[None, 30:], frequency, np.array(parameters), 4, OSCILLATOR)
+    assert len(found) >= 3
+    for state, period in found:
+        image = state
+        matrix = np.eye(2)
+        for k in range(period):
+            image, step = flow(image, frequency, parameters)
+            matrix = step @ matrix
+            assert (np.abs(image - state).max() < 1e-8) == (k == period - 1)
+        assert np.abs(np.linalg.eigvals(matrix)).max() > 1.0
 
 
 def test_run_together__same_bits():

@@ -71,7 +71,19 @@ def curves_from(
     list of Curve
         By the located point they began with; none twice.
     """
-    starts = _starts(branches, parameters, second, bounds, max_period)
+    return continue_curves(_starts(branches, parameters, second, bounds, max_period), bounds, settings)
+
+
+CurveStart = tuple[int, Family, str, np.ndarray]
+"""Number of a located point, its family with two free parameters, its kind, its unknowns."""
+
+
+def continue_curves(
+    starts: Sequence[CurveStart],
+    bounds: tuple[tuple[float, float], tuple[float, float]],
+    settings: Settings = CURVE,
+) -> list[Curve]:
+    """Follow each start both ways until a bound, itself, or a resonance; see `curves_from`."""
     problems = [BifurcationProblem(family, kind) for _, family, kind, _ in starts]
     firsts = run_together(
         [_first(problem, u, settings) for problem, (_, _, _, u) in zip(problems, starts, strict=True)]
@@ -82,9 +94,8 @@ def curves_from(
     for i, ((number, family, kind, _), _, first) in enumerate(found):
         back, ahead = walks[2 * i : 2 * i + 2]
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
-        ends = (back.end, ahead.end)
         if not any(_passes(curve, kind, family, first) for curve in curves):
-            curves.append(Curve(family, kind, points, ends, number))
+            curves.append(Curve(family, kind, points, (back.end, ahead.end), number))
     return curves
 
 
@@ -94,7 +105,7 @@ def _starts(
     second: str,
     bounds: tuple[tuple[float, float], tuple[float, float]],
     max_period: int,
-) -> list[tuple[int, Family, str, np.ndarray]]:
+) -> list[CurveStart]:
     """Located points with their two-parameter families and unknowns."""
     first = str(ds.attrs["parameter"])
     scales = tuple(high - low for low, high in bounds)

@@ -11,6 +11,7 @@ import xarray as xr
 from magpend_core.parameters import Parameters
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
+from magpend_core.variational import with_tangents
 from pipeline.analysis.branches.bifurcations import FOLD, KINDS, Bifurcation, multipliers_of, n_unstable
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.problems import FREQUENCY, RTOL
@@ -181,10 +182,12 @@ def rotation_of(branch: Branch) -> np.ndarray:
     family = branch.family
     if not any(family.system.is_angle):
         return np.zeros(0)
+    n = family.system.n_states
     rows = family.rows(branch.points[0].u[None])
+    # with tangents, since that code is compiled already
     result = run_branches(
-        rows.parameters[:, None], rows.frequency_hz[:, None], rows.states, n_transient=0,
-        n_keep=family.period + 1, rtol=RTOL, atol=RTOL, system=family.system,
+        rows.parameters[:, None], rows.frequency_hz[:, None], np.append(rows.states[0], np.eye(n))[None],
+        n_transient=0, n_keep=family.period + 1, rtol=RTOL, atol=RTOL, system=with_tangents(family.system, n),
     )  # fmt: skip
     return np.asarray(result.turns[0, 0] / family.period, np.float64)
 
