@@ -231,7 +231,8 @@ def attractor_defaults() -> dict[str, Any]:
     from pipeline.analysis.attractors import Rule, identify, match
 
     rule = {f"rule_{name}": value for name, value in asdict(Rule()).items()}
-    return {**_defaults_of(identify), **rule, **_defaults_of(match)}
+    # a product's options are plain values: 0 asks for the tolerance that follows from the run
+    return {**_defaults_of(identify), "tolerance": 0.0, **rule, **_defaults_of(match)}
 
 
 def basins(directory: Source, *, echo: Echo | None = None, **options: Any) -> xr.Dataset:
@@ -362,6 +363,8 @@ def _identify(snapshot: Snapshot, options: Mapping[str, Any]) -> xr.Dataset:
 
     own = {name: value for name, value in options.items() if not name.startswith("rule_")}
     rule = {name.removeprefix("rule_"): value for name, value in options.items() if name not in own}
+    if not own["tolerance"]:
+        del own["tolerance"]
     return identify(snapshot.open(), rule=Rule(**rule), **own)
 
 

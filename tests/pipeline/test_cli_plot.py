@@ -73,3 +73,14 @@ def test_plot__no_run(main, tmp_path, verb):
     assert code == Exit.REFUSED
     assert "Traceback" not in err
     assert not list(tmp_path.iterdir())
+
+
+def test_plot__continuation_with_loops(main, write_spec, walk_text, tmp_path):
+    write_spec(walk_text)
+    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
+    code, out, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
+    assert code == 0, err
+    assert "hysteresis: computed" in out
+    with xr.open_dataset(tmp_path / "run" / "figures" / "attractors_psi1.nc", engine="scipy") as stored:
+        assert {"value", "share", "present"} <= set(stored.data_vars)
+        assert stored["value"].attrs["units"] == "deg"

@@ -450,6 +450,8 @@ def legend_patches(fig):
 def test_plot_regimes__each_point_has_its_regime(map_of_two):
     fig = plot_regimes(map_of_two)
     assert regime_names(fig) == [["1", "1 + 2", "2"], ["1", "1", "none"]]
+    # the most frequent first, then by name; what has no attractor last
+    assert legend_texts(fig)[:4] == ["1", "1 + 2", "2", "none"]
     assert fig.axes[0].get_xlabel() == "drive frequency [Hz]"
     assert fig.axes[0].get_ylabel() == "amplitude [N m]"
     assert fig.axes[0].get_xlim() == pytest.approx((1.9, 2.3))
