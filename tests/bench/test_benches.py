@@ -82,3 +82,10 @@ def test_basins__prints_ratios_and_labels(bench, capsys):
     printed = capsys.readouterr().out
     for text in ("fixed transient", "stopped early", "ratio: periods 0.", "same labels: ", "RK45"):
         assert text in printed
+
+
+def test_tangents__prints_a_ratio_for_each_number_of_exponents(bench, capsys):
+    bench("tangents").main(["--trajectories", "4", "--periods", "16", "--rounds", "1"])
+    printed = capsys.readouterr().out
+    for name in ("plain", "1 exponent ", "2 exponents", "4 exponents"):
+        assert name in printed
