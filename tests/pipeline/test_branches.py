@@ -7,7 +7,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
+from magpend_core import load_preset, run_branches
 from magpend_core.jit import inline
+from magpend_core.orbits import scaled_distance
+from magpend_core.pendulum import PENDULUM_FITTED
 from magpend_core.system import System
 from magpend_core.vecmath import sincos
 from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
@@ -23,6 +26,7 @@ from pipeline.analysis.branches.problems import (
     fold_test,
     torus_test,
 )
+from pipeline.analysis.sides import Side
 
 
 @inline
@@ -392,3 +396,73 @@ def test_torus_test__neutral_saddle():
     """A real pair of product 1 makes the test vanish: what is located there is dropped."""
     assert torus_test(np.diag([2.0, 0.5])) == pytest.approx(0.0)
     assert torus_test(np.diag([2.0, 0.4])) * torus_test(np.diag([2.0, 0.6])) < 0.0
+
+
+# ---- the pendulum ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def right_family():
+    """The right one-sided orbit of period 1 and what hangs on it, around the period halving near 2.5 Hz."""
+    parameters = load_preset()
+    state = [0.01421118, 0.19932267, -2.74881127, 3.65512389]
+    orbits = family(2.2, parameters.pack(), "frequency_hz", 1.0, system=PENDULUM_FITTED)
+    scope = Scope(2.15, 2.55, max_period=2, max_generations=1, settings=Settings(longest_step=0.02))
+    return parameters, orbits, explore([Start(orbits, np.array(state), 2.2)], scope)
+
+
+def test_explore__right_family(right_family):
+    """Where stability ends and comes back: the abrupt end is a subcritical doubling, the halving none."""
+    _, orbits, branches = right_family
+    single, double = branches
+    abrupt, halving = only(single, "period_doubling")
+    assert orbits.values(abrupt.point.u)[0] == pytest.approx(2.3722244, abs=2e-7)
+    assert orbits.values(halving.point.u)[0] == pytest.approx(2.4986082, abs=2e-7)
+    assert (abrupt.criticality, halving.criticality) == ("subcritical", "supercritical")
+    assert abrupt.child is halving.child is double
+    assert double.ends == ("start", "period_halving")
+
+
+def test_explore__brute_force_agrees(right_family):
+    """Inside the stable segments, sections of trajectories lie on the branch to 1e-6."""
+    parameters, _, branches = right_family
+    ds = dataset_of(branches, "frequency_hz", parameters)
+    chosen = [
+        (i, j)
+        for i, branch in enumerate(branches)
+        for j in range(1, len(branch.points), 2)
+        # nearer to a bifurcation the approach takes thousands of periods
+        if np.abs(multipliers_of(branch.points[j])).max() < 0.985
+    ]
+    orbits = [ds["section"].values[i, j, : branches[i].family.period] for i, j in chosen]
+    n = len(chosen)
+    result = run_branches(
+        np.tile(parameters.pack(), (n, 1, 1)), np.array([[branches[i].values[j]] for i, j in chosen]),
+        np.array([orbit[0] for orbit in orbits]) + [1e-3, -1e-3, 1e-2, 1e-2],
+        n_transient=1500, n_keep=4, rtol=1e-9, atol=1e-9, stop_when_closed=True, closure_tolerance=1e-7,
+    )  # fmt: skip
+    assert result.orbit_period[:, 0].tolist() == [branches[i].family.period for i, _ in chosen]
+    for orbit, sections in zip(orbits, result.section[:, 0], strict=True):
+        for section in sections:
+            assert scaled_distance(orbit, section).min() < 1e-6
+    assert {i for i, _ in chosen} == {0, 1}
+    assert n > 15
+    assert set(np.unique(ds["side"].values[:, 0])) == {Side.RIGHT}
+
+
+def test_locate__at_a_velocity_reversal(right_family):
+    """The multipliers next to a located doubling move on smoothly: friction's corner leaves no trace here."""
+    _, orbits, (single, _) = right_family
+    halving = only(single, "period_doubling")[1]
+    at = orbits.values(halving.point.u)[0]
+    tests = []
+    for offset in (-2e-4, -1e-4, 1e-4, 2e-4):
+        u = halving.point.u + offset / halving.point.tangent[-1] * halving.point.tangent
+        u[-1] = at + offset
+        tests.append(
+            doubling_test(run_alone(first_point(OrbitProblem(orbits), u, Settings())).value.monodromy)
+        )
+    left, right = tests[1] - tests[0], tests[3] - tests[2]
+    # the slope changes by its own derivative only: with a corner, the two would differ at any offset
+    assert left == pytest.approx(right, rel=1e-2)
+    assert tests[1] * tests[2] < 0.0

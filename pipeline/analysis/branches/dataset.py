@@ -43,6 +43,7 @@ def dataset_of(branches: Sequence[Branch], parameter: str, parameters: Parameter
     for i, branch in enumerate(branches):
         for j, point in enumerate(branch.points):
             arrays.put(i, j, branch, point)
+        _settle_origin(arrays.n_unstable[i], branch)
         if parameters is not None:
             arrays.side[i, : len(branch.points)] = _sides(branch, parameters)
     events = [(i, b) for i, branch in enumerate(branches) for b in branch.bifurcations]
@@ -51,6 +52,13 @@ def dataset_of(branches: Sequence[Branch], parameter: str, parameters: Parameter
     result = xr.Dataset({**arrays.variables(units_of(parameter)), **per_branch, **per_event})
     result = result.assign_coords(state=("state", list(names), {"long_name": "component of the state"}))
     return result.assign_attrs(parameter=parameter, parameter_units=units_of(parameter))
+
+
+def _settle_origin(counts: np.ndarray, branch: Branch) -> None:
+    """Count at the point where a branch sprang off, with a multiplier on the circle, as at the next one."""
+    for j, point in enumerate(branch.points):
+        if branch.origin is not None and point.u is branch.origin.point.u:
+            counts[j] = counts[j + 1] if j + 1 < len(branch.points) else counts[j - 1]
 
 
 class _Arrays:
