@@ -50,7 +50,10 @@ def branches(
     Starts from the closed orbits that attract cells of the run. The result is kept in DIR/derived.
     """
     from pipeline import derived_branches
+    from pipeline.problems import SpecError
 
+    if csv is not None and not csv.parent.is_dir():
+        raise SpecError([f"{csv.parent}: no such folder; make it first."])
     ds = derived_branches.branches(
         directory, **_options(parameter, low, high, period, generations, recurrences)
     )

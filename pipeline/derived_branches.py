@@ -51,6 +51,8 @@ def branches(
     ------
     SpecError
         If an option is out of bounds.
+    ParameterError
+        If an end of the interval is.
     """
     snapshot = Snapshot.of(directory)
     interval = _interval(snapshot, parameter, low, high)
@@ -100,6 +102,8 @@ def _interval(
         )
     if parameter == "frequency_hz" and chosen[0] <= 0.0:
         raise SpecError([f"--from {chosen[0]}: a drive frequency must be greater than 0."])
+    for value in chosen if parameter != "frequency_hz" else ():
+        parameters_of(ds).replace(**{parameter: value})
     return chosen
 
 
@@ -165,8 +169,6 @@ def curves(
     SpecError
         If an option is out of bounds, or the run sweeps the second parameter.
     """
-    from pipeline.analysis.attractors import parameters_of
-
     snapshot = Snapshot.of(directory)
     located = branches(snapshot, echo=echo, **options)
     first = str(located.attrs["parameter"])
@@ -178,9 +180,6 @@ def curves(
             [f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."]
         )
     interval = _interval(snapshot, second, low, high)
-    if second != "frequency_hz":
-        for value in interval:
-            parameters_of(snapshot.open()).replace(**{second: value})
     if curve_period < 1:
         raise SpecError([f"curve_period = {curve_period}: must be 1 or more."])
     wanted = {
@@ -192,6 +191,7 @@ def curves(
     }
 
     def compute(at: Snapshot) -> xr.Dataset:
+        from pipeline.analysis.attractors import parameters_of
         from pipeline.analysis.branches import curves_dataset, curves_from
 
         base = parameters_of(at.open())
