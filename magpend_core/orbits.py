@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,7 +92,8 @@ def stroboscopic_map(
         See `run_branches`.
     """
     n = system.n_states
-    extended = with_tangents(system, n)
+    # tangents in the error control: near a rest the trajectory alone would allow any step
+    extended = dataclasses.replace(with_tangents(system, n), n_controlled=None)
     identity = np.broadcast_to(np.eye(n).ravel(), (len(points), n * n))
     result = run_branches(
         np.asarray(parameters)[:, None, :],

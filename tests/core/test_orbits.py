@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from magpend_core import load_preset, polish_orbits, run_branches
 from magpend_core.orbits import scaled_distance, stroboscopic_map, wrap_angles
@@ -113,3 +114,16 @@ def test_wrap_angles__cut():
     wrapped = wrap_angles(np.array([np.pi, -np.pi, 7.0, -7.0]))
     np.testing.assert_allclose(wrapped, [np.pi, np.pi, 7.0, -7.0])
     assert scaled_distance([np.pi - 1e-3, 0, 0, 0], [-np.pi + 1e-3, 0, 0, 0]) == pytest.approx(2e-3)
+
+
+@pytest.mark.parametrize("period", [10.0, 100.0])
+def test_stroboscopic_map__derivative_at_rest(duffing, period):
+    # x'' + c x' + k x = 0 at x = 0: the map is exp(A T), whatever the trajectory's step may be
+    c, k = 0.02, 2.0
+    image, derivative = stroboscopic_map(
+        np.array([[c, k, 0.0, 0.0]]), np.array([1.0 / period]), np.zeros((1, 2)), 1, system=duffing
+    )
+    assert (image == 0.0).all()
+    assert derivative[0] == pytest.approx(
+        scipy.linalg.expm(np.array([[0.0, 1.0], [-k, -c]]) * period), abs=1e-8
+    )
