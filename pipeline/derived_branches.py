@@ -135,8 +135,8 @@ def _branches(
 def curves(
     directory: Source,
     second: str,
-    low: float,
-    high: float,
+    second_low: float,
+    second_high: float,
     *,
     curve_period: int = 1,
     echo: Echo | None = None,
@@ -150,7 +150,7 @@ def curves(
         Run directory, or a `Snapshot`.
     second
         ``frequency_hz`` or a parameter's name.
-    low, high
+    second_low, second_high
         Interval of the second parameter [SI].
     curve_period
         Longest period of the orbits taken [drive periods].
@@ -179,7 +179,7 @@ def curves(
         raise SpecError(
             [f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."]
         )
-    interval = _interval(snapshot, second, low, high)
+    interval = _interval(snapshot, second, second_low, second_high)
     if curve_period < 1:
         raise SpecError([f"curve_period = {curve_period}: must be 1 or more."])
     wanted = {

@@ -14,14 +14,15 @@ from magpend_core.pendulum import PENDULUM_FITTED
 from magpend_core.system import System
 from magpend_core.vecmath import sincos
 from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
-from pipeline.analysis.branches.arclength import Settings
-from pipeline.analysis.branches.bifurcations import multipliers_of, n_unstable
+from pipeline.analysis.branches.arclength import Point, Settings
+from pipeline.analysis.branches.bifurcations import Bifurcation, multipliers_of, n_unstable, tell_apart
 from pipeline.analysis.branches.curves import continue_curves
 from pipeline.analysis.branches.following import first_point
 from pipeline.analysis.branches.lockstep import run_alone, run_together
 from pipeline.analysis.branches.problems import (
     Family,
     OrbitProblem,
+    Value,
     doubling_test,
     fold_test,
     torus_test,
@@ -392,10 +393,36 @@ def test_run_together__same_bits():
             np.testing.assert_array_equal(a.value.monodromy, b.value.monodromy)
 
 
-def test_torus_test__neutral_saddle():
-    """A real pair of product 1 makes the test vanish: what is located there is dropped."""
-    assert torus_test(np.diag([2.0, 0.5])) == pytest.approx(0.0)
-    assert torus_test(np.diag([2.0, 0.4])) * torus_test(np.diag([2.0, 0.6])) < 0.0
+def test_watch__neutral_saddle():
+    """A real pair of product 1 makes the torus test vanish and is dropped; a complex pair is kept."""
+    saddle, angle = np.diag([2.0, 0.5]), 1.0
+    torus = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    found = []
+    for matrix in (saddle, torus):
+        assert torus_test(matrix) == pytest.approx(0.0)
+        value = Value(np.zeros(2), np.zeros((2, 3)), np.zeros((1, 2)), matrix)
+        point = Point(np.zeros(3), np.array([0.0, 0.0, 1.0]), value, 0)
+        found.append(Bifurcation("neimark_sacker", point, 0.0, 1, 1, True))
+    assert tell_apart(found, found[0].point) == found[1:]
+
+
+def test_explore__closed_branch():
+    """A weakly forced van der Pol oscillator: the entrained orbits and their saddles form a closed curve."""
+    parameters = [-0.2, 0.2, 1.0, 0.0, 0.1]
+    frequency = 1.0 / (2.0 * np.pi)
+    orbits = family(frequency, parameters, "frequency_hz", 0.02)
+    start = Start(orbits, settled([1.0, 1.5], frequency, parameters, 200), frequency)
+    (branch,) = explore([start], Scope(0.15, 0.17, max_period=1, settings=Settings(longest_step=0.05)))
+    assert branch.ends == ("closed", "closed")
+    assert sorted(b.kind for b in branch.bifurcations) == ["fold", "fold"]
+    assert np.abs(branch.points[-1].u - branch.points[0].u).max() < 0.1
+    # stable from fold to fold, across the start
+    (window,) = windows_of(dataset_of([branch], "frequency_hz", None))
+    folds = sorted(orbits.values(b.point.u)[0] for b in branch.bifurcations)
+    assert [window["from"], window["to"]] == folds
+    # another orbit of it is recognised
+    again = Start(orbits, orbits.state(branch.points[9].u), float(branch.values[9]))
+    assert len(explore([start, again], Scope(0.15, 0.17, max_period=1))) == 1
 
 
 # ---- the pendulum ------------------------------------------------------------------------------

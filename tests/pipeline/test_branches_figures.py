@@ -27,7 +27,8 @@ def made_up():
     after = int(np.flatnonzero(psi > 0)[-1])
     event = {
         "kind": 0, "value": 3.0, "of_branch": 0, "after": after,
-        "n_unstable_before": 0, "n_unstable_after": 1, "critical_real": 1.0, "critical_imag": 0.0, "bifurcation_side": 2,
+        "n_unstable_before": 0, "n_unstable_after": 1, "critical_real": 1.0,
+        "critical_imag": 0.0, "bifurcation_side": 2,
     }  # fmt: skip
     return xr.Dataset(
         {
@@ -135,3 +136,13 @@ def test_branches__command(magpend, tmp_path):
     assert drawn.returncode == 0, drawn.stderr
     assert "taken from" in drawn.stdout
     assert (tmp_path / "run" / "figures" / "branches_psi1.png").stat().st_size > 10_000
+    curved = magpend(
+        "plot", "curves", "run", *options, "--second", "q", "--second-from", 1.5, "--second-to", 1.6
+    )
+    assert curved.returncode == 0, curved.stderr
+    assert (tmp_path / "run" / "figures" / "curves_q.png").stat().st_size > 10_000
+    refused = magpend(
+        "plot", "curves", "run", *options, "--second", "q", "--second-from", 2, "--second-to", 1
+    )
+    assert refused.returncode == 2
+    assert "is empty" in refused.stderr

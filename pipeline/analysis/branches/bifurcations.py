@@ -125,7 +125,7 @@ class Watch:
             if one is not None:
                 one.after = self.n_steps
                 located.append(one)
-        self.found += _tell_apart(located, a)
+        self.found += tell_apart(located, a)
         self.n_steps += 1
         return True
 
@@ -172,7 +172,7 @@ def locate(
     return Bifurcation(kind, nearest[1], float(bracket), n_unstable(low[1]), n_unstable(high[1]), rises)
 
 
-def _tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
+def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
     """Drop neutral saddles and the folds that are branch points; order along the branch."""
     branching = [one.point.u for one in located if one.kind == BRANCHING]
     kept = []
