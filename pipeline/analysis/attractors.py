@@ -39,8 +39,9 @@ variable                 dims                                  dtype, fill  mean
 ``residual``             parameter dims, attractor             float64, NaN certificate of Newton's method
 ``is_stable``            parameter dims, attractor             int8, -1     0 no, 1 yes, -1 not known
 ``is_polished``          parameter dims, attractor             int8, 0      1 if Newton's method converged
-``lyapunov_max``         parameter dims, attractor             float64, NaN largest exponent of a polished
-                                                                            orbit [1/s]
+``lyapunov_max``         parameter dims, attractor             float64, NaN largest exponent [1/s]; of bounded
+                                                                            sets if the cube has the product
+                                                                            ``lyapunov``
 ======================== ===================================== ============ ==================================
 
 `attractor_points` are NaN beyond the attractor's own: a closed orbit's points in the order of time, or a
@@ -82,6 +83,7 @@ from pipeline.analysis.bounded import Rule
 from pipeline.analysis.features import Features
 from pipeline.analysis.hysteresis import hysteresis
 from pipeline.analysis.identify import (
+    BOUNDED_SET,
     BUDGET,
     START_DIMS,
     Found,
@@ -95,6 +97,7 @@ from pipeline.analysis.lifetimes import lifetimes
 from pipeline.analysis.matching import match
 from pipeline.analysis.orbits import DECISIONS
 from pipeline.analysis.sides import Side
+from pipeline.schema import LyapunovFlag
 
 __all__ = ["Rule", "hysteresis", "identify", "lifetimes", "match", "parameters_of"]
 
@@ -170,7 +173,7 @@ def identify(
     found = {}
     for points in slabs(ds, start_dims, base, system, block_bytes):
         found.update(search_all(points, options, system))
-    return _dataset(ds, start_dims, found, options)
+    return _with_exponents(_dataset(ds, start_dims, found, options), ds)
 
 
 # ---- result ------------------------------------------------------------------------------------
@@ -229,6 +232,22 @@ def _dataset(
     return result.assign_attrs({**kept, **settings, "matched": 0})
 
 
+def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
+    """Fill in the largest exponent of bounded sets, the mean over their cells, where the cube has it."""
+    if "lyapunov" not in ds:
+        return result
+    dims = result["attractor_id"].dims
+    rate = ds["lyapunov"].isel(exponent=0, drop=True).transpose(*dims).values
+    good = ds["lyapunov_flag"].transpose(*dims).values == LyapunovFlag.GOOD
+    ids, kind = result["attractor_id"].values, result["kind"].values
+    for index in np.argwhere(kind == BOUNDED_SET):
+        point, i = tuple(index[:-1]), index[-1]
+        own = rate[point][(ids[point] == i) & good[point]]
+        if own.size:  # in rising order, so that the last bit does not depend on that of the cells
+            result["lyapunov_max"].values[tuple(index)] = np.sort(own).mean()
+    return result
+
+
 _STATE_UNITS = "rad, rad, rad/s, rad/s"
 
 _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
@@ -250,7 +269,7 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "residual": ((), "float64", np.nan, "1", "scaled distance of the orbit's first point from its image"),
     "is_stable": ((), "int8", -1, "1", "whether all multipliers lie inside the unit circle, -1 not known"),
     "is_polished": ((), "int8", 0, "1", "whether Newton's method converged"),
-    "lyapunov_max": ((), "float64", np.nan, "1/s", "largest Lyapunov exponent of the orbit"),
+    "lyapunov_max": ((), "float64", np.nan, "1/s", "largest Lyapunov exponent"),
 }  # fmt: skip
 """Own dims, dtype, fill, units and long name of the variables per attractor."""
 
