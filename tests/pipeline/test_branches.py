@@ -180,6 +180,19 @@ def test_explore__folds_of_duffing(resonance):
         assert orbits.values(fold.point.u)[0] == pytest.approx(there, abs=1e-8)
 
 
+def test_explore__starts_on_one_branch(resonance):
+    """All coexisting orbits at one frequency lie on the one bent branch, which is followed once."""
+    orbits, branch = resonance
+    folds = [orbits.values(b.point.u)[0] for b in branch.bifurcations]
+    middle = float(np.mean(folds))
+    crossings = np.flatnonzero(np.diff(branch.values > middle))
+    guesses = [np.append(branch.points[i].u[:2], middle / 0.3) for i in crossings]
+    points = run_together([first_point(OrbitProblem(orbits), u, Settings()) for u in guesses])
+    starts = [Start(orbits, orbits.state(p.u), middle) for p in points]
+    assert len({round(float(s.state[0]), 3) for s in starts}) == 3
+    assert len(explore(starts, Scope(0.1, 0.4, settings=Settings(longest_step=0.03)))) == 1
+
+
 def test_explore__determinant(resonance):
     """Liouville: the flow contracts areas by exp(-damping T), on stable and unstable orbits."""
     _, branch = resonance
