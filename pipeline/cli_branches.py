@@ -166,12 +166,19 @@ def _table(ds: xr.Dataset) -> list[str]:
             (
                 f"{row['value']:.7f}", row["type"], row["criticality"], str(row["period"]), row["side"],
                 _number(row["multiplier"]), f"{row['unstable_below']}, {row['unstable_above']}",
-                f"{row['branch']}{to}",
+                f"{row['branch']}{to}{_at(row)}",
             )
         )  # fmt: skip
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
     return [f"{ds.sizes['bifurcation']} bifurcations on {ds.sizes['branch']} branches", "", *lines]
+
+
+def _at(row: dict[str, Any]) -> str:
+    """The drive's frequency, unless that is what is varied."""
+    import math
+
+    return "" if math.isnan(row["frequency_hz"]) else f" at {row['frequency_hz']:g} Hz"
 
 
 def _number(z: complex) -> str:
@@ -184,7 +191,7 @@ def _windows(ds: xr.Dataset) -> list[str]:
     lines = ["stable segments"]
     for w in windows_of(ds):
         ends = f"{w['from']:.7f} ({w['begins']}) to {w['to']:.7f} ({w['ends']})"
-        lines.append(f"  period {w['period']}, {w['side']}, branch {w['branch']}: {ends}")
+        lines.append(f"  period {w['period']}, {w['side']}, branch {w['branch']}{_at(w)}: {ends}")
     return lines
 
 
@@ -193,7 +200,7 @@ def _csv(ds: xr.Dataset) -> list[str]:
 
     names = (
         "value", "bracket", "type", "criticality", "period", "side", "multiplier_real", "multiplier_imag",
-        "unstable_below", "unstable_above", "branch", "to_branch",
+        "unstable_below", "unstable_above", "frequency_hz", "branch", "to_branch",
     )  # fmt: skip
     rows: list[dict[str, Any]] = [
         {**row, "multiplier_real": row["multiplier"].real, "multiplier_imag": row["multiplier"].imag}

@@ -265,8 +265,8 @@ def words(variable: xr.DataArray) -> list[str]:
 def table_of(ds: xr.Dataset) -> list[dict[str, Any]]:
     """Located bifurcations by rising parameter value, one dict for each.
 
-    ``below`` and ``above`` say how many multipliers are unstable on the two sides of the parameter; at a
-    fold both orbits lie on one side, and ``below`` or ``above`` is None.
+    ``unstable_below`` and ``unstable_above`` say how many multipliers are unstable on the two sides of the
+    parameter; at a fold both orbits lie on one side, and the other says ``none``.
     """
     if not ds.sizes["bifurcation"]:
         return []
@@ -293,6 +293,7 @@ def table_of(ds: xr.Dataset) -> list[dict[str, Any]]:
                 "multiplier": complex(float(one["critical_real"]), float(one["critical_imag"])),
                 "unstable_below": below,
                 "unstable_above": above,
+                "frequency_hz": float(ds["frequency_hz"][int(one["of_branch"])]),
                 "branch": int(one["of_branch"]),
                 "to_branch": int(one["to_branch"]),
             }
@@ -316,6 +317,7 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
                     "ends": ends[1][1],
                     "period": int(ds["orbit_period"][i]),
                     "side": words(ds["side"][i, middle : middle + 1])[0],
+                    "frequency_hz": float(ds["frequency_hz"][i]),
                     "branch": i,
                 }
             )
