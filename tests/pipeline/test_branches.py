@@ -331,6 +331,9 @@ def test_continue_curves__fold_of_duffing(resonance):
     there = fsolve(equations, np.append(family_2.state(far.u), frequency) * (1 + 1e-5), xtol=1e-13)
     assert frequency == pytest.approx(there[2], abs=1e-8)
     assert abs(frequency - orbits.values(fold.point.u)[0]) > 1e-3
+    # a second point of the same curve is recognised
+    both = [(0, family_2, "fold", start), (1, family_2, "fold", far.u)]
+    assert [c.start for c in continue_curves(both, ((0.1, 0.4), (0.2, 0.4)))] == [0]
 
 
 @inline
@@ -381,11 +384,14 @@ def test_orbits_near__chaotic_well():
         points.append(settled(points[-1], frequency, parameters, 1))
     found = orbits_near(np.array(points)[None, 30:], frequency, np.array(parameters), 4, OSCILLATOR)
     assert len(found) >= 3
+    seen = []
     for state, period in found:
+        assert not any(np.abs(state - other).max() < 1e-6 for other in seen)
         image = state
         matrix = np.eye(2)
         for k in range(period):
             image, step = flow(image, frequency, parameters)
+            seen.append(image)
             matrix = step @ matrix
             assert (np.abs(image - state).max() < 1e-8) == (k == period - 1)
         assert np.abs(np.linalg.eigvals(matrix)).max() > 1.0
