@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from pipeline.cli_common import read_pairs
+
 
 def _range(what: str) -> Any:
     return typer.Option(metavar="LOW HIGH", help=f"New range: {what}.")
@@ -71,7 +73,13 @@ def zoom(
     given = {key: pair for key, pair in ranges.items() if pair is not None}
     points = {key: n for key, n in nums.items() if n is not None}
     more, more_points = _axes(axis or [])
-    changes = Changes({**given, **more}, _pins(at or []), num, {**points, **more_points}, samples)
+    changes = Changes(
+        {**given, **more},
+        read_pairs("--at", at or [], "frequency_hz=2.2"),
+        num,
+        {**points, **more_points},
+        samples,
+    )
     for note in write_zoom(read_source(source), changes, out):
         typer.echo(f"note: {note}")
     typer.echo(f"specification: {out}")
@@ -96,19 +104,3 @@ def _axes(texts: list[str]) -> tuple[dict[str, tuple[float, float]], dict[str, i
     if problems:
         raise SpecError(problems)
     return ranges, points
-
-
-def _pins(texts: list[str]) -> dict[str, float]:
-    """Read ``NAME=VALUE``."""
-    from pipeline.problems import SpecError
-
-    pins, problems = {}, []
-    for text in texts:
-        name, _, value = text.partition("=")
-        try:
-            pins[name.strip()] = float(value)
-        except ValueError:
-            problems.append(f"--at {text}: must be NAME=VALUE with a number, such as frequency_hz=2.2.")
-    if problems:
-        raise SpecError(problems)
-    return pins

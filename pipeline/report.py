@@ -12,7 +12,7 @@ import xarray as xr
 
 from pipeline.analysis.basin_numbers import Interval, basin_fractions
 from pipeline.analysis.basins import DIVERGED, outcomes
-from pipeline.analysis.identify import START_DIMS
+from pipeline.analysis.vocabulary import split_dims
 
 FEW_POINTS = 6
 """Up to so many parameter points get a table each."""
@@ -26,7 +26,7 @@ def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence:
     `fraction` is that of the cells whose outcome is known, with its interval; a continuation's branches
     are no sample of initial conditions, so they have none.
     """
-    dims, start_dims = _dims(ds)
+    dims, start_dims = split_dims(ds["attractor_id"])
     words = _words(ds["decision"])
     fractions = None
     if start_dims and start_dims != ("branch",):
@@ -70,7 +70,7 @@ def _attractor(one: xr.Dataset) -> Row:
 
 def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the table per parameter point if there are few, otherwise a line per attractor."""
-    dims, start_dims = _dims(ds)
+    dims, start_dims = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
     lines = [f"{ds.sizes['attractor']} attractors at {n_points} parameter point{'s' * (n_points != 1)}"]
     if n_points > FEW_POINTS:
@@ -122,7 +122,7 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dic
 
 def basin_rows(ds: xr.Dataset) -> list[Row]:
     """Return a row per outcome and parameter point: cells and fraction with its intervals."""
-    dims, _ = _dims(ds)
+    dims, _ = split_dims(ds["attractor_id"])
     names = ("fraction", "low", "high", "fraction_if_none", "fraction_if_all", "low_if_none", "high_if_all")
     rows = []
     for index in np.ndindex(*(ds.sizes[d] for d in dims)):
@@ -137,7 +137,7 @@ def basin_rows(ds: xr.Dataset) -> list[Row]:
 
 def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return fractions and numbers on boundaries: a table per point if there are few, or ranges."""
-    dims, start_dims = _dims(ds)
+    dims, start_dims = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
     seen = [row for row in rows if row["n_cells"]]
     confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
@@ -306,12 +306,6 @@ def write_csv(rows: Sequence[Row], path: Path) -> Path:
         writer.writeheader()
         writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in rows)
     return path
-
-
-def _dims(ds: xr.Dataset) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Parameter dims and start dims."""
-    dims = [str(d) for d in ds["attractor_id"].dims]
-    return tuple(d for d in dims if d not in START_DIMS), tuple(d for d in dims if d in START_DIMS)
 
 
 def _where(ds: xr.Dataset, at: Mapping[str, int]) -> Row:

@@ -83,9 +83,7 @@ from pipeline.analysis.bounded import Rule
 from pipeline.analysis.features import Features
 from pipeline.analysis.hysteresis import hysteresis
 from pipeline.analysis.identify import (
-    BOUNDED_SET,
     BUDGET,
-    START_DIMS,
     Found,
     Options,
     engine_inputs,
@@ -97,6 +95,7 @@ from pipeline.analysis.lifetimes import lifetimes
 from pipeline.analysis.matching import match
 from pipeline.analysis.orbits import DECISIONS
 from pipeline.analysis.sides import Side
+from pipeline.analysis.vocabulary import BOUNDED_SET, split_dims
 from pipeline.schema import LyapunovFlag
 
 __all__ = ["Rule", "hysteresis", "identify", "lifetimes", "match", "parameters_of"]
@@ -169,7 +168,7 @@ def identify(
     options = Options(
         tolerance, polish, residual, max_orbit_period, rule or Rule(), n_points, mirror_threshold
     )
-    start_dims = tuple(str(d) for d in ds["status"].dims if d in START_DIMS)
+    _, start_dims = split_dims(ds["status"])
     found = {}
     for points in slabs(ds, start_dims, base, system, block_bytes):
         found.update(search_all(points, options, system))
@@ -187,7 +186,7 @@ def _flags(words: str) -> dict[str, Any]:
 def _dataset(
     ds: xr.Dataset, start_dims: tuple[str, ...], found: Mapping[tuple[int, ...], Found], options: Options
 ) -> xr.Dataset:
-    dims = tuple(str(d) for d in ds["status"].dims if d not in START_DIMS)
+    dims, _ = split_dims(ds["status"])
     shape = tuple(ds.sizes[d] for d in dims)
     n = max((len(f.features) for f in found.values()), default=0)
     longest = max((len(x.points) for f in found.values() for x in f.features), default=0)

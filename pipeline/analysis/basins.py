@@ -16,12 +16,10 @@ from pipeline.analysis.basin_boundaries import Scaling, basin_entropy, uncertain
 from pipeline.analysis.basin_labels import check_confidence, check_resamples
 from pipeline.analysis.basin_numbers import Interval, basin_fractions
 from pipeline.analysis.basin_wada import Metric, wada_merge_test
-from pipeline.analysis.identify import START_DIMS
+from pipeline.analysis.vocabulary import FAILED, split_dims
 
 DIVERGED = -2
 """Label of the cells that diverged: an outcome like an attractor. -1 is no outcome."""
-
-_FAILED = (Status.STEP_LIMIT, Status.STEP_UNDERFLOW, Status.UNREACHED)
 
 
 def basins(
@@ -85,8 +83,7 @@ def basins(
         metric=metric, resamples=resamples,
     )  # fmt: skip
     check_starts(ds)
-    start_dims = tuple(str(d) for d in ids["attractor_id"].dims if d in START_DIMS)
-    dims = tuple(str(d) for d in ids["attractor_id"].dims if d not in START_DIMS)
+    dims, start_dims = split_dims(ids["attractor_id"])
     cells = ids[["attractor_id", "decision", "status"]].drop_dims("attractor", errors="ignore")
     result = cells.assign(n_periods=ds["n_periods"].transpose(*dims, *start_dims).load())
     labels = outcomes(ids)
@@ -133,7 +130,7 @@ def check_starts(ds: xr.Dataset) -> None:
             'basins need independent initial conditions, a sweep (kind = "sweep"): where a branch of a '
             "continuation starts is the end of its last point."
         )
-    if not any(d in START_DIMS for d in ds["status"].dims):
+    if not split_dims(ds["status"])[1]:
         raise ValueError("basins need several initial conditions per parameter point; this run has one.")
 
 
@@ -148,7 +145,7 @@ def _unfinished(ids: xr.Dataset, start_dims: tuple[str, ...]) -> dict[str, xr.Da
     """Numbers of cells without an outcome, by what became of them."""
     status, unknown = ids["status"], ids["attractor_id"] < 0
     pending = status == Status.PENDING
-    failed = status.isin([int(s) for s in _FAILED])
+    failed = status.isin(FAILED)
     kinds = {
         "n_pending": (pending, "cells not computed"),
         "n_undecided": (unknown & ~pending & ~failed & (status != Status.DIVERGED), "cells on nothing found"),

@@ -43,12 +43,7 @@ from pipeline.analysis.orbits import (
     run_on,
 )
 from pipeline.analysis.sets import Geometry, hashes, order_by_points
-
-START_DIMS = ("initial_condition", "psi1_0", "psi2_0", "psi1_dot_0", "psi2_dot_0", "branch")
-"""Dims of the cube that tell cells of one parameter point apart."""
-
-ABSENT, CLOSED_ORBIT, BOUNDED_SET = range(3)
-"""Values of `kind`."""
+from pipeline.analysis.vocabulary import BOUNDED_SET, CLOSED_ORBIT, START_DIMS
 
 ROUNDS, ROUNDS_LOOSE = 3, 6
 """Most rounds of guessing and polishing, with a strict and a loose tolerance."""

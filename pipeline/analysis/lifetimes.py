@@ -63,7 +63,7 @@ from magpend_core.parameters import Parameters
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from magpend_core.system import System
-from pipeline.analysis.identify import BOUNDED_SET, BUDGET, START_DIMS, Point, engine_inputs, slabs
+from pipeline.analysis.identify import BUDGET, Point, engine_inputs, slabs
 from pipeline.analysis.orbits import (
     REACH,
     Block,
@@ -78,6 +78,7 @@ from pipeline.analysis.orbits import (
     polish,
 )
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.vocabulary import BOUNDED_SET, split_dims
 
 LEG = 64
 """Drive periods between two looks at where the cells are."""
@@ -193,8 +194,7 @@ def lifetimes(
         raise ValueError("attractors and ds have other cells; give what identify made of this cube.")
     base, system = engine_inputs(ds, parameters, system, needed=True)
     tolerances = rtol or float(ds.attrs.get("rtol", 1e-8)), atol or float(ds.attrs.get("atol", 1e-8))
-    start_dims = tuple(str(d) for d in ds["status"].dims if d in START_DIMS)
-    dims = tuple(str(d) for d in ds["status"].dims if d not in START_DIMS)
+    dims, start_dims = split_dims(ds["status"])
     geometry = Geometry.of(system)
     n_legs = -(-n_periods // LEG)
     courses: dict[tuple[int, ...], Courses] = {}

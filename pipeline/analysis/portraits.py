@@ -11,8 +11,8 @@ import xarray as xr
 from magpend_core.parameters import Parameters
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors import parameters_of
-from pipeline.analysis.identify import CLOSED_ORBIT
 from pipeline.analysis.selection import choose, start_dims
+from pipeline.analysis.vocabulary import CLOSED_ORBIT
 
 RTOL = 1e-9
 

@@ -7,15 +7,17 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.vocabulary import split_dims
+
 
 def parameter_dims(attractors: xr.Dataset) -> list[str]:
     """Names of the swept parameters."""
-    return [str(d) for d in attractors["kind"].dims if d != "attractor"]
+    return list(split_dims(attractors["attractor_id"])[0])
 
 
 def start_dims(attractors: xr.Dataset) -> list[str]:
     """Names of the dims that tell the cells of one parameter point apart."""
-    return [str(d) for d in attractors["attractor_id"].dims if d not in parameter_dims(attractors)]
+    return list(split_dims(attractors["attractor_id"])[1])
 
 
 def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...], purpose: str) -> xr.Dataset:

@@ -14,17 +14,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import AutoMinorLocator, LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.selection import choose, start_dims
+from pipeline.analysis.vocabulary import CLOSED_ORBIT, GRID_DIMS, INFERRED
 from pipeline.plots import palette, style
-
-START_AXES = ("psi1_0", "psi2_0", "psi1_dot_0", "psi2_dot_0")
 
 _SIDE_IN = 3.9
 _LEFT_IN, _BOTTOM_IN, _TOP_IN = 0.68, 0.52, 0.3
 _DARKEST = 0.62
 _OTHERS = -1
 _FIRST_GREY = -2
-_CLOSED_ORBIT = 1  # kind in pipeline.analysis.attractors
-_INFERRED = 7  # code of magpend_core.status
 
 
 def plot_basins(
@@ -94,7 +91,7 @@ def plot_basins(
 
 def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, str]:
     """Names of the two axes of the image: horizontal, vertical."""
-    grid = [d for d in START_AXES if d in attractors["attractor_id"].dims]
+    grid = [d for d in GRID_DIMS if d in attractors["attractor_id"].dims]
     if len(grid) < 2:
         have = ", ".join(start_dims(attractors)) or "none"
         raise ValueError(
@@ -147,8 +144,8 @@ def _painted(
 
 def _timed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
     """Integrated cells on closed orbits: the time that others took is no time to converge."""
-    closed = np.append(part["kind"].values == _CLOSED_ORBIT, False)
-    return np.asarray(closed[data["attractor_id"].values] & (data["status"].values != _INFERRED))
+    closed = np.append(part["kind"].values == CLOSED_ORBIT, False)
+    return np.asarray(closed[data["attractor_id"].values] & (data["status"].values != INFERRED))
 
 
 def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:

@@ -23,6 +23,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import AutoMinorLocator
 
+from pipeline.analysis import vocabulary
 from pipeline.analysis.sides import Side, side
 from pipeline.plots import style
 
@@ -31,9 +32,12 @@ MARKER_LIMIT = 200_000
 
 LAYOUTS = ("overlay", "side")
 
-# Codes of magpend_core.status, which is not imported: it would bring the compiler with it.
-_DRAWN = (1, 2, 7)
-_ABSENT = {"pending": (0,), "failed": (3, 4, 5), "not reached": (6,)}
+_DRAWN = (vocabulary.PERIODIC, vocabulary.BOUNDED, vocabulary.INFERRED)
+_ABSENT = {
+    "pending": (vocabulary.PENDING,),
+    "failed": (vocabulary.DIVERGED, vocabulary.STEP_LIMIT, vocabulary.STEP_UNDERFLOW),
+    "not reached": (vocabulary.UNREACHED,),
+}
 
 SIDE_COLOURS = {
     Side.LEFT: style.BLUE,
@@ -53,7 +57,6 @@ _BLOCK_VALUES = 4_000_000
 _SUPERSAMPLING = 2
 _TINT = 0.5
 
-_CELL_DIMS = ("initial_condition", "psi1_0", "psi2_0", "psi1_dot_0", "psi2_dot_0", "branch")
 _INNER_DIMS = ("period_index", "state")
 
 
@@ -250,7 +253,7 @@ def _view(ds: xr.Dataset, state: str, degrees: bool) -> _View:
 
 def swept_parameters(ds: xr.Dataset) -> list[str]:
     """Return the swept parameters of a cube."""
-    return [str(dim) for dim in ds["status"].dims if dim not in _CELL_DIMS]
+    return list(vocabulary.split_dims(ds["status"])[0])
 
 
 def swept_parameter(ds: xr.Dataset) -> str:

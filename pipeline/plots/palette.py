@@ -24,6 +24,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
+from pipeline.analysis import vocabulary
 from pipeline.analysis.sides import Side
 from pipeline.plots import style
 
@@ -33,16 +34,15 @@ COLOURS = (
 )  # fmt: skip
 OTHERS = "#C8E6C0"
 
-# Codes of magpend_core.status, which is not imported: it would bring the compiler with it.
 UNASSIGNED: dict[str, tuple[int, ...]] = {
-    "undecided": (1, 2, 7),
-    "diverged": (3,),
-    "step limit": (4, 5),
-    "pending": (0, 6),
+    "undecided": (vocabulary.PERIODIC, vocabulary.BOUNDED, vocabulary.INFERRED),
+    "diverged": (vocabulary.DIVERGED,),
+    "failed": vocabulary.FAILED,
+    "pending": (vocabulary.PENDING,),
 }
 """What a cell without an attractor is called, by its status."""
 
-GREYS = {"undecided": "0.75", "diverged": "0.0", "step limit": "0.45", "pending": "0.95"}
+GREYS = {"undecided": "0.75", "diverged": "0.0", "failed": "0.45", "pending": "0.95"}
 
 
 _LETTERS_PER_IN = 17.5

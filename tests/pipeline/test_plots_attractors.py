@@ -12,6 +12,8 @@ import pytest
 import xarray as xr
 from matplotlib.colors import to_rgb
 
+from magpend_core.status import Status
+from pipeline.analysis import vocabulary
 from pipeline.analysis.hysteresis import hysteresis
 from pipeline.analysis.sides import Side
 from pipeline.plots import (
@@ -26,7 +28,8 @@ from pipeline.plots import (
 )
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
-PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = range(8)
+PENDING, PERIODIC, BOUNDED, DIVERGED = Status.PENDING, Status.PERIODIC, Status.BOUNDED, Status.DIVERGED
+STEP_LIMIT, INFERRED = Status.STEP_LIMIT, Status.INFERRED
 
 
 def make_attractors(ids, dims, coords, n=None, status=None):
@@ -104,14 +107,14 @@ def test_plot_basins__each_cell_has_the_colour_of_its_legend(grid):
     picture, legend = colours_of(fig), legend_colours(fig)
     assert list(legend) == [
         "A: period 1, left, 50.0 %", "B: period 1, left, 25.0 %", "undecided, 6.2 %", "diverged, 6.2 %",
-        "step limit, 6.2 %", "pending, 6.2 %",
+        "failed, 6.2 %", "pending, 6.2 %",
     ]  # fmt: skip
     expected = np.empty((4, 4, 3))
     expected[:], expected[2:, 2:] = legend["A: period 1, left, 50.0 %"], legend["B: period 1, left, 25.0 %"]
     for cell, name in {
         (3, 0): "diverged",
         (3, 1): "pending",
-        (2, 0): "step limit",
+        (2, 0): "failed",
         (2, 1): "undecided",
     }.items():
         expected[cell] = legend[f"{name}, 6.2 %"]
@@ -575,3 +578,11 @@ def test_save_data__every_figure(sweep, walk, map_of_two, tmp_path):
             assert set(stored.data_vars) == set(fig.data.data_vars)
             for name in fig.data.data_vars:
                 np.testing.assert_allclose(stored[name], fig.data[name])
+
+
+def test_vocabulary__codes_are_those_of_the_kernel():
+    for status in Status:
+        assert getattr(vocabulary, status.name) == status
+    named = [code for codes in palette.UNASSIGNED.values() for code in codes]
+    assert sorted(named) == sorted(Status)
+    assert palette.GREYS.keys() == palette.UNASSIGNED.keys()

@@ -13,7 +13,7 @@ from magpend_core.pendulum import system_of
 from magpend_core.system import System
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.analysis.identify import START_DIMS
+from pipeline.analysis.vocabulary import START_DIMS
 
 CLOSE = 0.1
 """Largest scaled distance of a recurrence that is worth a try."""
