@@ -1,4 +1,4 @@
-"""``magpend analyse``: attractors, basins and hysteresis of a stored cube."""
+"""``magpend analyse``: attractors, basins, hysteresis and chaos of a stored cube."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 analyse_app = typer.Typer(
-    help="Find attractors, basins and hysteresis in a stored cube; results are kept in DIR/derived.",
+    help="Find attractors, basins, hysteresis and chaos in a stored cube; results are kept in DIR/derived.",
     no_args_is_help=True,
 )
 
@@ -90,6 +90,14 @@ SETTLING_OPTIONS = (
     _option("confidence", 0.95, "Level of the intervals; between 0 and 1."),
     _option("rtol", 0.0, "Relative tolerance; 0 takes that of the run."),
     _option("atol", 0.0, "Absolute tolerance; 0 takes that of the run."),
+)
+
+CHAOS_OPTIONS = (
+    _option("n_sigma", 3.0, "Standard errors by which an exponent differs from 0; above 0."),
+    _option("least", 0.005, "Least modulus of an exponent that differs from 0 \\[1/s]; 0 or more."),
+    _option("n_frequencies", 100, "0-1 test: number of frequencies; 10 or more."),
+    _option("stride", 1, "0-1 test: use every so many-th section; 1 or more."),
+    _option("seed", 0, "0-1 test: seed of the frequencies; 0 or more."),
 )
 
 
@@ -169,6 +177,21 @@ def settling(context: typer.Context, csv: Csv = None, **options: Any) -> None:
     ds = _derive(context, derived.settling, csv, options)
     rows = report.settling_rows(ds)
     _tell(report.settling_lines(ds, rows), rows, csv, ds)
+
+
+@analyse_app.command(epilog=EXIT_HELP)
+@takes(*CHAOS_OPTIONS)
+def chaos(context: typer.Context, csv: Csv = None, **options: Any) -> None:
+    """Tell regular from chaotic cells: mean Lyapunov exponents, Kaplan-Yorke dimension, 0-1 test.
+
+    A table per parameter point, or with more than six points the ranges in which each kind of motion
+    occurs. Exponents need [products] lyapunov in the run's specification, the 0-1 test 200 sections.
+    """
+    from pipeline import derived, report
+
+    ds = _derive(context, derived.chaos, csv, options)
+    rows = report.chaos_rows(ds)
+    _tell(report.chaos_lines(ds, rows), rows, csv, ds)
 
 
 @analyse_app.command(epilog=EXIT_HELP)

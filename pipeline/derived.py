@@ -349,6 +349,43 @@ def settling_defaults() -> dict[str, Any]:
     return {**attractor_defaults(), **_defaults_of(lifetimes)}
 
 
+def chaos(directory: Source, *, echo: Echo | None = None, **options: Any) -> xr.Dataset:
+    """Chaos of a run's cells: exponents, dimension, 0-1 test, and their means by kind of motion.
+
+    Parameters
+    ----------
+    directory, echo
+        As in `attractors`.
+    options
+        Those of `pipeline.analysis.chaos.chaos`.
+
+    Returns
+    -------
+    Dataset
+        See `pipeline.analysis.chaos.chaos`.
+
+    Raises
+    ------
+    SpecError
+        If an option is unknown or out of bounds, or the cube has neither exponents nor sections enough.
+    """
+    from pipeline.analysis.chaos import chaos as compute
+    from pipeline.analysis.chaos import check_chaos
+
+    snapshot = Snapshot.of(directory)
+    wanted = _with_defaults("chaos", options, chaos_defaults())
+    with _refused(snapshot):
+        check_chaos(snapshot.open(), **wanted)
+    return derive(snapshot, "chaos", wanted, lambda s: compute(s.open(), **wanted), echo)
+
+
+def chaos_defaults() -> dict[str, Any]:
+    """Options of `chaos` with their defaults."""
+    from pipeline.analysis.chaos import chaos as compute
+
+    return _defaults_of(compute)
+
+
 @contextlib.contextmanager
 def _refused(snapshot: Snapshot) -> Iterator[None]:
     """Turn what an analysis refuses into a sentence with the directory's name."""

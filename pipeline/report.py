@@ -12,10 +12,14 @@ import xarray as xr
 
 from pipeline.analysis.basin_numbers import Interval, basin_fractions
 from pipeline.analysis.basins import DIVERGED, outcomes
+from pipeline.analysis.chaos import KINDS
 from pipeline.analysis.vocabulary import split_dims
 
 FEW_POINTS = 6
 """Up to so many parameter points get a table each."""
+
+MOST_RANGES = 6
+"""Up to so many ranges of an axis are listed."""
 
 Row = dict[str, Any]
 
@@ -293,6 +297,154 @@ def settling_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
         told = {"id": str(row["attractor_id"]), "verdict": row["verdict"]}
         table.append(where | told | counts | {"mean lifetime": lifetime, "to": row["to"] or "-"})
     return lines + _table(table)
+
+
+# ---- chaos -------------------------------------------------------------------------------------
+
+
+_COUNTS = ("n_transient", "n_drifting", "n_audit_failed", "n_unresolved", "n_failed")
+_MEANS = (
+    "mean_kaplan_yorke", "mean_kaplan_yorke_stderr", "median_zero_one", "least_zero_one", "largest_zero_one",
+)  # fmt: skip
+_FLAGS = {
+    "n_transient": "transient", "n_drifting": "drifting", "n_audit_failed": "audit failed",
+    "n_unresolved": "unresolved", "n_failed": "failed",
+}  # fmt: skip
+
+
+def chaos_rows(ds: xr.Dataset) -> list[Row]:
+    """Return a row per kind of motion that occurs at a parameter point.
+
+    ``all_chaotic`` has one where both chaotic and hyperchaotic cells are.
+    """
+    dims, _ = split_dims(ds["motion"])
+    rows = []
+    for *index, k in np.argwhere(ds["n_cells"].transpose(*dims, "kind").values > 0).tolist():
+        at = dict(zip(dims, index, strict=True))
+        one = ds.isel(at).isel(kind=k)
+        if KINDS[k] == "all_chaotic" and not _is_mixed(ds.isel(at)):
+            continue
+        row: Row = {**_where(ds, at), "motion": KINDS[k], "n_cells": int(one["n_cells"])}
+        row |= {name: int(one[name]) for name in _COUNTS if name in one}
+        if "mean_lyapunov" in one:
+            for i in range(ds.sizes["exponent"]):
+                e = one.isel(exponent=i)
+                row |= {
+                    f"lyapunov_{i + 1}{end}": float(e[f"mean_lyapunov{end}"])
+                    for end in ("", "_stderr", "_between", "_per_period", "_per_period_stderr")
+                }
+        names = [name for name in _MEANS if name in one]
+        rows.append(row | {name: float(one[name]) for name in names})
+    return rows
+
+
+def _is_mixed(one: xr.Dataset) -> bool:
+    return bool((one["n_cells"].sel(kind=["chaotic", "hyperchaotic"]) > 0).all())
+
+
+def chaos_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
+    """Return tables per parameter point if there are few, otherwise a summary."""
+    dims, _ = split_dims(ds["motion"])
+    n_points = int(np.prod([ds.sizes[d] for d in dims]))
+    lines = [f"motion of {ds['motion'].size} cells at {n_points} parameter point{'s' * (n_points != 1)}"]
+    if n_points > FEW_POINTS:
+        lines += _chaos_summary(ds, rows, dims)
+    else:
+        for index in np.ndindex(*(ds.sizes[d] for d in dims)):
+            place = _where(ds, dict(zip(dims, index, strict=True)))
+            here = [row for row in rows if all(row[k] == v for k, v in place.items())]
+            lines += _heading(ds, place) + _table([_chaos_words(row) for row in here])
+            lines += _exponent_table(here)
+    return lines + [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
+
+
+def _chaos_words(row: Row) -> dict[str, str]:
+    words = {"motion": row["motion"].replace("_", " "), "cells": str(row["n_cells"])}
+    if "lyapunov_1" in row:
+        words["Kaplan-Yorke"] = _with_error(row["mean_kaplan_yorke"], row["mean_kaplan_yorke_stderr"])
+        words["transient"] = f"{row['n_transient'] / row['n_cells']:.0%}"
+    if "median_zero_one" in row:
+        low, high = (_number(row[f"{name}_zero_one"], ".2f") for name in ("least", "largest"))
+        words["0-1 K"] = f"{_number(row['median_zero_one'], '.2f')} ({low} to {high})"
+    flags = [
+        f"{row[name]} {text}" for name, text in _FLAGS.items() if name != "n_transient" and row.get(name)
+    ]
+    return words | {"flags": ", ".join(flags) or "-"}
+
+
+def _exponent_table(rows: Sequence[Row]) -> list[str]:
+    """Exponents per second and per drive period, a line per motion and unit."""
+    lines = []
+    for row in rows:
+        n = sum(f"lyapunov_{i}" in row for i in range(1, 10))
+        for per, end in (("s", ""), ("drive period", "_per_period")):
+            named = {
+                f"exponent {i}": _with_error(row[f"lyapunov_{i}{end}"], row[f"lyapunov_{i}{end}_stderr"])
+                for i in range(1, n + 1)
+            }
+            if n and any(text != "-" for text in named.values()):
+                lines.append({"motion": row["motion"].replace("_", " "), "per": per} | named)
+    return _table(lines)
+
+
+def _with_error(value: float, error: float) -> str:
+    """Value and standard error, both to two digits of the error."""
+    if not np.isfinite(value):
+        return "-"
+    if not (np.isfinite(error) and error > 0.0):
+        return f"{value:.4g}"
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
+
+
+def _chaos_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[str]:
+    """Where each motion occurs, extremes of the largest exponent, counts of flags."""
+    lines = []
+    for kind in KINDS[:-1]:
+        own = [row for row in rows if row["motion"] == kind]
+        if own:
+            words = {
+                "motion": kind.replace("_", " "),
+                "cells": str(sum(r["n_cells"] for r in own)),
+                "points": str(len(own)),
+            }
+            lines.append(
+                words | {f"{d}{_unit(ds, d)}": _axis_ranges(ds, d, own, len(dims) == 1) for d in dims}
+            )
+    extremes = _extremes(ds, rows, dims) if "mean_lyapunov" in ds else []
+    cells = [row for row in rows if row["motion"] != "all_chaotic"]
+    counts = [(text, sum(row.get(name, 0) for row in cells)) for name, text in _FLAGS.items()]
+    flags = ", ".join(f"{n} {text}" for text, n in counts if n)
+    return _table(lines) + extremes + [f"  cells flagged: {flags or 'none'}"]
+
+
+def _axis_ranges(ds: xr.Dataset, dim: str, rows: Sequence[Row], alone: bool) -> str:
+    """Ranges of neighbouring values of the only axis; otherwise, or if they are many, the whole range."""
+    axis = ds[dim].values.astype(np.float64)
+    values = np.array(sorted({row[dim] for row in rows}))
+    places = np.searchsorted(np.sort(axis), values)
+    parts = np.split(values, np.flatnonzero(np.diff(places) > 1) + 1)
+    if not alone or len(parts) > MOST_RANGES:
+        more = f" in {len(parts)} ranges" if alone else ""
+        return f"{values[0]:g} to {values[-1]:g}{more}"
+    return ", ".join(f"{p[0]:g}" if len(p) == 1 else f"{p[0]:g} to {p[-1]:g}" for p in parts)
+
+
+def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[str]:
+    """Largest and smallest mean of the largest exponent, with its place."""
+    known = [row for row in rows if np.isfinite(row["lyapunov_1"])]
+    lines = []
+    for name, choose in (("largest", max), ("smallest", min)):
+        if known:
+            row = choose(known, key=lambda r: float(r["lyapunov_1"]))
+            rate = _with_error(row["lyapunov_1"], row["lyapunov_1_stderr"])
+            period = _with_error(row["lyapunov_1_per_period"], row["lyapunov_1_per_period_stderr"])
+            place = ", ".join(f"{d} {row[d]:g}{_unit(ds, d)}" for d in dims)
+            motion = row["motion"].replace("_", " ")
+            lines.append(
+                f"  {name} mean of exponent 1: {rate} per s, {period} per drive period, {motion}, at {place}"
+            )
+    return lines
 
 
 # ---- shared ------------------------------------------------------------------------------------

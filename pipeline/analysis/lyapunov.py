@@ -1,13 +1,16 @@
 """What stored Lyapunov exponents say: per period, how sure, chaos or not, and whether it lasts.
 
-Works on the variables of ``[products] lyapunov``; integrates nothing.
+Works on the variables of ``[products] lyapunov``; integrates nothing. `spectrum_of_jacobians` gives the
+exponents of any map whose Jacobians are known.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 _PERIODIC = 1  # of magpend_core.status, which would bring the compiler with it
@@ -133,3 +136,87 @@ def _audit(ds: xr.Dataset) -> xr.DataArray:
     if ds.sizes["exponent"] < ds.sizes["state"]:
         total = xr.full_like(total, np.nan)
     return total.assign_attrs(units="1/s", long_name="sum of the exponents minus the divergence")
+
+
+# ---- from Jacobians ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class JacobianSpectrum:
+    """Lyapunov exponents of a map along its trajectories, per iterate.
+
+    Attributes
+    ----------
+    exponents : ndarray, (..., state)
+        In falling order.
+    stderr : ndarray, (..., state)
+        Standard errors by block means.
+    blocks : ndarray, (..., block, state)
+        Mean growth in each block, in the order of `exponents`.
+    """
+
+    exponents: npt.NDArray[np.float64]
+    stderr: npt.NDArray[np.float64]
+    blocks: npt.NDArray[np.float64]
+
+
+def spectrum_of_jacobians(
+    jacobians: npt.ArrayLike, *, n_blocks: int = 16, n_transient: int = 0
+) -> JacobianSpectrum:
+    """Lyapunov spectrum of a map from its Jacobians along trajectories.
+
+    A basis is carried along by the Jacobians and made orthonormal at each by QR; an exponent is the mean
+    logarithm of the diagonal of R (Benettin, Galgani, Giorgilli and Strelcyn, Meccanica 15, 9 and 21,
+    1980; Eckmann and Ruelle, Rev. Mod. Phys. 57, 617, 1985, sec. V). Divided by the time of an iterate they
+    are exponents of the flow: for the stroboscopic map (`magpend_core.orbits.stroboscopic_map`), times
+    the frequency.
+
+    Parameters
+    ----------
+    jacobians
+        ``J[..., i, :, :]`` is the derivative of the map at point i; shape (..., n, state, state).
+    n_blocks
+        Blocks of equal length for the errors, 2 or more. They are right if a block is longer than the
+        motion remembers.
+    n_transient
+        First Jacobians, in which the basis turns into its directions, that are not counted.
+
+    Returns
+    -------
+    JacobianSpectrum
+        -inf where a Jacobian is singular.
+
+    Raises
+    ------
+    ValueError
+        If the shape is another, there is a Jacobian that is not finite, or what is counted is no whole
+        number of blocks.
+    """
+    given = np.asarray(jacobians, np.float64)
+    if given.ndim < 3 or given.shape[-1] != given.shape[-2]:
+        raise ValueError(f"jacobians have shape {given.shape}: give (..., n, state, state)")
+    if not np.isfinite(given).all():
+        raise ValueError("jacobians are not all finite: leave trajectories out that fail")
+    if n_blocks < 2 or n_transient < 0:
+        raise ValueError(f"n_blocks = {n_blocks}, n_transient = {n_transient}: give 2 or more, and 0 or more")
+    n, size = given.shape[-3] - n_transient, given.shape[-1]
+    if n < n_blocks or n % n_blocks:
+        raise ValueError(
+            f"{n} Jacobians after the transient are no whole number of each of {n_blocks} blocks: "
+            f"give {max(n // n_blocks, 1) * n_blocks}, or other n_blocks"
+        )
+    basis = np.broadcast_to(np.eye(size), (*given.shape[:-3], size, size))
+    growth = np.empty((*given.shape[:-3], n, size))
+    for i in range(given.shape[-3]):
+        basis, r = np.linalg.qr(given[..., i, :, :] @ basis)
+        if i >= n_transient:
+            factor = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+            growth[..., i - n_transient, :] = np.log(
+                factor, out=np.full(factor.shape, -np.inf), where=factor > 0.0
+            )
+    blocks = growth.reshape(*growth.shape[:-2], n_blocks, n // n_blocks, size).mean(axis=-2)
+    order = np.argsort(-blocks.mean(axis=-2), axis=-1, kind="stable")
+    blocks = np.take_along_axis(blocks, order[..., None, :], axis=-1)
+    with np.errstate(invalid="ignore"):  # -inf has no error
+        stderr = blocks.std(axis=-2, ddof=1) / np.sqrt(n_blocks)
+    return JacobianSpectrum(blocks.mean(axis=-2), stderr, blocks)

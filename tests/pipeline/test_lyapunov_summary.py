@@ -5,8 +5,9 @@ import pytest
 import xarray as xr
 from matplotlib.collections import PolyCollection
 
-from magpend_core import Status
-from pipeline.analysis.lyapunov import Motion, summarise
+from magpend_core import Status, load_preset, lyapunov_exponents
+from magpend_core.orbits import stroboscopic_map
+from pipeline.analysis.lyapunov import Motion, spectrum_of_jacobians, summarise
 from pipeline.plots import plot_lyapunov, plot_lyapunov_map
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
@@ -96,6 +97,69 @@ def test_summarise__audit(cube):
 def test_summarise__a_cube_without_exponents_is_refused(cube):
     with pytest.raises(ValueError, match=r"no Lyapunov exponents; run it with \[products\]"):
         summarise(cube.drop_vars("lyapunov"))
+
+
+def test_spectrum_of_jacobians__henon():
+    # a = 1.4, b = 0.3: l1 = 0.419 (0.4192), l1 + l2 = ln 0.3
+    n_cells, n_transient, n = 100, 50, 4096
+    x, y = np.random.default_rng(0).uniform(-0.1, 0.1, (2, n_cells))
+    jacobians = np.zeros((n_cells, n_transient + n, 2, 2))
+    jacobians[..., 0, 1], jacobians[..., 1, 0] = 1.0, 0.3
+    for i in range(n_transient + n):
+        jacobians[:, i, 0, 0] = -2.8 * x
+        x, y = 1.0 - 1.4 * x * x + y, 0.3 * x
+    found = spectrum_of_jacobians(jacobians, n_transient=n_transient)
+    assert found.exponents[:, 0].mean() == pytest.approx(0.419, abs=0.001)
+    assert found.exponents.sum(axis=1) == pytest.approx(np.log(0.3), abs=1e-12)
+    # the errors of the trajectories are what they scatter by
+    assert found.exponents[:, 0].std(ddof=1) == pytest.approx(found.stderr[:, 0].mean(), rel=0.25)
+    alone = spectrum_of_jacobians(jacobians[3], n_transient=n_transient)
+    assert alone.exponents == pytest.approx(found.exponents[3], abs=1e-13)
+    assert alone.blocks.mean(axis=0) == pytest.approx(alone.exponents)
+    assert alone.blocks.shape == (16, 2)
+
+
+def test_spectrum_of_jacobians__falling_order_and_singular_maps():
+    # the basis stays where it began: in rising order
+    found = spectrum_of_jacobians(np.tile(np.diag([0.5, 2.0]), (8, 1, 1)), n_blocks=2)
+    assert found.exponents == pytest.approx(np.log([2.0, 0.5]))
+    assert found.stderr == pytest.approx(0.0)
+    flat = spectrum_of_jacobians(np.tile(np.diag([2.0, 0.0]), (8, 1, 1)), n_blocks=2)
+    assert flat.exponents.tolist() == [pytest.approx(np.log(2.0)), -np.inf]
+
+
+@pytest.mark.parametrize(
+    ("shape", "options", "message"),
+    [
+        ((8, 2), {}, "give .*n, state, state"),
+        ((8, 2, 3), {}, "give .*n, state, state"),
+        ((20, 2, 2), {}, "20 Jacobians after the transient .* give 16"),
+        ((20, 2, 2), {"n_transient": 5}, "15 Jacobians"),
+        ((16, 2, 2), {"n_blocks": 1}, "n_blocks = 1, n_transient = 0: give 2 or more"),
+    ],
+)
+def test_spectrum_of_jacobians__mistakes(shape, options, message):
+    with pytest.raises(ValueError, match=message):
+        spectrum_of_jacobians(np.ones(shape), **options)
+    with pytest.raises(ValueError, match="not all finite"):
+        spectrum_of_jacobians(np.full((16, 2, 2), np.nan))
+
+
+def test_spectrum_of_jacobians__is_the_spectrum_of_the_engine():
+    # few periods: chaos separates the two computations
+    start, one, frequency = np.array([[0.5, -0.3, 0.0, 0.0]]), load_preset().pack()[None], np.array([2.4])
+    jacobians, point = [], start
+    for _ in range(26):
+        image, derivative = stroboscopic_map(one, frequency, point, 1, rtol=1e-11)
+        jacobians.append(derivative[0])
+        point = image[:, -1]
+    expected = spectrum_of_jacobians(jacobians, n_blocks=4, n_transient=10)
+    found = lyapunov_exponents(
+        one, frequency, start, n_transient=10, n_periods=16, rtol=1e-11, atol=1e-11, n_blocks=4
+    )
+    assert found.exponents[0] == pytest.approx(expected.exponents * 2.4, abs=1e-4)
+    assert found.blocks[0] == pytest.approx(expected.blocks * 2.4, abs=1e-4)
+    assert found.stderr[0] == pytest.approx(expected.stderr * 2.4, abs=1e-4)
 
 
 def artists(fig, gid):
