@@ -167,8 +167,8 @@ def basin_fractions(
         n_cells=(kept, n_cells),
         n_unfinished=(kept, n_unfinished),
         fraction_unfinished=(kept, n_unfinished / n_cells),
-        unseen_high=(kept, _unseen_bound(np.zeros_like(n_cells), n_cells - n_unfinished, confidence)),
-        unseen_high_if_all=(kept, _unseen_bound(n_unfinished, n_cells, confidence)),
+        unseen_high=(kept, _upper_bound(np.zeros_like(n_cells), n_cells - n_unfinished, confidence)),
+        unseen_high_if_all=(kept, _upper_bound(n_unfinished, n_cells, confidence)),
     )
     if inferred is not None:
         ds["n_inferred"] = ((*kept, "label"), _count_inferred(grid, np.asarray(inferred), shape))
@@ -315,7 +315,7 @@ def _with_intervals(
     }
 
 
-def _unseen_bound(
+def _upper_bound(
     count: npt.NDArray[np.int64], n: npt.NDArray[np.int64], confidence: float
 ) -> npt.NDArray[np.float64]:
     """One-sided upper Clopper-Pearson bound; 1 where all of the `n` are hits, or there is none."""

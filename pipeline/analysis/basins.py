@@ -11,12 +11,12 @@ from typing import Any, get_args
 import numpy as np
 import xarray as xr
 
-from magpend_core.status import Status
+from pipeline.analysis import vocabulary
 from pipeline.analysis.basin_boundaries import Scaling, basin_entropy, uncertainty_exponent
 from pipeline.analysis.basin_labels import check_confidence, check_resamples
 from pipeline.analysis.basin_numbers import Interval, basin_fractions
 from pipeline.analysis.basin_wada import Metric, wada_merge_test
-from pipeline.analysis.vocabulary import FAILED, split_dims
+from pipeline.analysis.vocabulary import split_dims
 
 DIVERGED = -2
 """Label of the cells that diverged: an outcome like an attractor. -1 is no outcome."""
@@ -89,7 +89,7 @@ def basins(
     labels = outcomes(ids)
     fractions = basin_fractions(
         labels, dims=start_dims, ids=ids["attractor"].values.tolist(),
-        inferred=ids["status"] == Status.INFERRED, confidence=confidence, method=interval,
+        inferred=ids["status"] == vocabulary.INFERRED, confidence=confidence, method=interval,
     )  # fmt: skip
     result = result.assign(fractions.data_vars).assign(_unfinished(ids, start_dims))
     result = result.assign_coords(label=fractions["label"])
@@ -137,18 +137,21 @@ def check_starts(ds: xr.Dataset) -> None:
 def outcomes(ids: xr.Dataset) -> xr.DataArray:
     """Label of each cell: its attractor, -2 (`DIVERGED`), or -1 if its outcome is not known."""
     label = ids["attractor_id"].values.copy()
-    label[ids["status"].values == Status.DIVERGED] = DIVERGED
+    label[ids["status"].values == vocabulary.DIVERGED] = DIVERGED
     return ids["attractor_id"].copy(data=label)
 
 
 def _unfinished(ids: xr.Dataset, start_dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
     """Numbers of cells without an outcome, by what became of them."""
     status, unknown = ids["status"], ids["attractor_id"] < 0
-    pending = status == Status.PENDING
-    failed = status.isin(FAILED)
+    pending, diverged = status == vocabulary.PENDING, status == vocabulary.DIVERGED
+    failed = status.isin(vocabulary.FAILED)
     kinds = {
         "n_pending": (pending, "cells not computed"),
-        "n_undecided": (unknown & ~pending & ~failed & (status != Status.DIVERGED), "cells on nothing found"),
+        "n_undecided": (
+            unknown & ~pending & ~failed & ~diverged,
+            "cells on nothing found",
+        ),
         "n_failed": (unknown & failed, "cells that could not be integrated"),
     }
     return {

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoMinorLocator
 
+from pipeline.analysis.basin_numbers import binomial_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.plots import palette, style
 
+MOST_BARS = 60
+"""Most bars that are drawn: more would hide the bands."""
+
+_BAR: dict[str, Any] = {"linewidth": 0.7, "color": "black"}
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN, _HEIGHT_IN = 0.66, 4.6, 0.5, 0.3, 3.5
 
 
@@ -31,7 +38,11 @@ def plot_fractions(attractors: xr.Dataset, *, at: Mapping[str, float] | None = N
     DataFigure
         7 in wide. Bands are stacked, the largest at the bottom; cells without an attractor are grey, at
         the top. Each value of the parameter is a column, for between two of them nothing is known. Its
-        `data` hold ``fraction`` and the number of cells, ``n_cells``.
+        `data` hold ``fraction`` and the number of cells, ``n_cells``; of a sweep also ``low`` and ``high``,
+        the 95 % Wilson interval of each fraction, as if the starts were drawn independently. The widest
+        stands above, and thin bars, `MOST_BARS` at most, show it for what lies below the edge of a band.
+        What the cells in grey may change is not in them. The branches of a continuation are no sample of
+        initial states: their shares have no intervals.
 
     Raises
     ------
@@ -44,11 +55,14 @@ def plot_fractions(attractors: xr.Dataset, *, at: Mapping[str, float] | None = N
     cast = palette.cast_of(attractors, part)
     data = _fractions(part, parameter, cast)
     bands = _bands(data, cast)
-    entries = [(band.name, band.colour) for band in reversed(bands)]
+    entries: list[palette.Entry] = [(band.name, band.colour) for band in reversed(bands)]
+    if bars := "low" in data and 0 < data.sizes[parameter] * (len(bands) - 1) <= MOST_BARS:
+        entries.append(Line2D([], [], label="95 % interval of an edge", **_BAR))
     fig, ax = new_panel(data, entries)
     _draw(ax, data, parameter, bands)
-    n = int(data["n_cells"].max())
-    text = ", ".join(filter(None, [palette.caption(part), f"{n} initial states each"]))
+    if bars:
+        _draw_intervals(ax, data, parameter, bands)
+    text = ", ".join(filter(None, [palette.caption(part), _about(data)]))
     ax.text(0.0, 1.015, text, transform=ax.transAxes, fontsize=style.LEGEND_PT)
     style.style_text(fig)
     return fig
@@ -97,14 +111,18 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
     counts = np.array([np.bincount(row, minlength=width) for row in codes])
     labels = [*(palette.letter(i) for i in range(len(cast.names))), *kinds]
     names = [*cast.names.values(), *kinds]
-    fraction = counts / max(ids.shape[1], 1)
+    branches = "branch" in start_dims(part)
+    of = "branches" if branches else "initial states"
+    shares = {"fraction": (counts / max(ids.shape[1], 1), f"share of the {of}")}
+    if not branches:
+        low, high = binomial_interval(counts, ids.shape[1])
+        shares |= {"low": (low, "95 % interval, low end"), "high": (high, "95 % interval, high end")}
     return xr.Dataset(
         {
-            "fraction": (
-                (parameter, "outcome"),
-                fraction,
-                {"units": "1", "long_name": "share of the initial states"},
-            ),
+            **{
+                variable: ((parameter, "outcome"), values, {"units": "1", "long_name": text})
+                for variable, (values, text) in shares.items()
+            },
             "n_cells": (
                 (parameter,),
                 np.full(n, ids.shape[1], np.int32),
@@ -116,8 +134,18 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
             "outcome": labels,
             "name": ("outcome", names),
         },
-        attrs={"title": "basin fractions"},
+        attrs={"title": f"shares of the {of}" if branches else "basin fractions"},
     )
+
+
+def _about(data: xr.Dataset) -> str:
+    """How many cells there are, and how well they tell the fractions."""
+    n = int(data["n_cells"].max())
+    if "low" not in data:
+        return f"{n} branches each"
+    seen = data["fraction"] > 0
+    half = float((0.5 * (data["high"] - data["low"])).where(seen).max())
+    return f"{n} initial states each, 95 % intervals within ±{half:.2g}"
 
 
 @dataclass(frozen=True)
@@ -165,7 +193,24 @@ def _draw(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) ->
     ax.xaxis.set_minor_locator(AutoMinorLocator())
     ax.yaxis.set_minor_locator(AutoMinorLocator(2))
     ax.set_xlabel(style.parameter_label(data[parameter]), fontsize=style.LABEL_PT)
-    ax.set_ylabel("basin fraction", fontsize=style.LABEL_PT)
+    label = "basin fraction" if "low" in data else "share of the branches"
+    ax.set_ylabel(label, fontsize=style.LABEL_PT)
+
+
+def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) -> None:
+    """Draw the interval of what lies below each edge between bands, side by side in a column."""
+    limits = style.edges(data[parameter].values.astype(np.float64))
+    n = data["n_cells"].values
+    floor = np.zeros(n.size)
+    for k, band in enumerate(bands[:-1]):
+        floor = floor + band.height
+        below = np.rint(floor * n)
+        low, high = binomial_interval(below, n)
+        chosen = (band.height > 0) & (below < n)
+        x = (limits[:-1] + np.diff(limits) * (k + 1) / len(bands))[chosen]
+        mark = palette.letter(band.attractor) if band.attractor >= 0 else band.name
+        for looks in (_BAR | {"linewidth": 1.6, "color": "white"}, _BAR):
+            ax.vlines(x, low[chosen], high[chosen], gid=f"interval:{mark}", **looks)
 
 
 def _raster(edges: np.ndarray, codes: np.ndarray, heights: np.ndarray) -> np.ndarray:

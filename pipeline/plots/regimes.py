@@ -13,6 +13,8 @@ from matplotlib.colors import ListedColormap, to_hex
 from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoMinorLocator
 
+from pipeline.analysis.basin_numbers import basin_fractions, binomial_interval
+from pipeline.analysis.basins import outcomes
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.plots import palette, style
 from pipeline.plots.fractions import new_panel
@@ -42,7 +44,11 @@ def plot_regimes(
     DataFigure
         7 in wide. Of more than twelve regimes the most frequent have own colours. A cross marks points
         where more than `SHARE_LIMIT` of the cells have no attractor, so that one may be missing. Its
-        `data` hold ``regime`` (index of the names in ``label``), ``n_attractors`` and ``share_without``.
+        `data` hold ``regime`` (index of the names in ``label``), ``n_attractors``, ``share_without``, and
+        ``share`` of each attractor. Of a sweep also ``low`` and ``high``, the 95 % Wilson interval of each
+        share, and ``unseen_high``: a basin larger than this shows in one of the cells whose outcome is
+        known with a probability of 95 % or more. The largest such bound, points with a cross left out,
+        stands above the map.
 
     Raises
     ------
@@ -83,8 +89,8 @@ def plot_regimes(
     ax.set_xlabel(style.parameter_label(data[x]), fontsize=style.LABEL_PT)
     ax.set_ylabel(style.parameter_label(data[y]), fontsize=style.LABEL_PT, labelpad=2.0)
     titles = {"periods": "periods of the coexisting attractors", "attractors": "coexisting attractors"}
-    caption = ", ".join(filter(None, [titles.get(show, "number of attractors"), palette.caption(part)]))
-    ax.text(0.0, 1.015, caption, transform=ax.transAxes, fontsize=style.LEGEND_PT)
+    parts = [titles.get(show, "number of attractors"), palette.caption(part), _about(data)]
+    ax.text(0.0, 1.015, ", ".join(filter(None, parts)), transform=ax.transAxes, fontsize=style.LEGEND_PT)
     style.style_text(fig)
     return fig
 
@@ -124,10 +130,35 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
             "regime": ((y, x), regime, attrs),
             "n_attractors": ((y, x), present.sum(axis=-1).astype(np.int32), {"units": "1"}),
             "share_without": ((y, x), without.values, {"units": "1", "long_name": "share without attractor"}),
+            **_numbers(part, x, y),
         },
         coords={x: part[x], y: part[y], "label": ("label", names)},
         attrs={"title": "regimes", "show": show},
     )  # fmt: skip
+
+
+def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
+    """Share of each attractor, its interval, and the bound on what was not seen."""
+    dims = (y, x, "attractor")
+    share = part["share"].transpose(*dims).values
+    numbers: dict[str, Any] = {"share": (dims, share, {"units": "1", "long_name": "share of all cells"})}
+    if "branch" in start_dims(part):
+        return numbers
+    fractions = basin_fractions(outcomes(part), dims=start_dims(part), ids=part["attractor"].values.tolist())
+    low, high = binomial_interval(part["n_cells"].transpose(*dims).values, fractions["n_cells"].max().item())
+    unseen = fractions["unseen_high"].transpose(y, x).values
+    return numbers | {
+        "low": (dims, low, {"units": "1", "long_name": "95 % interval of the share, low end"}),
+        "high": (dims, high, {"units": "1", "long_name": "95 % interval of the share, high end"}),
+        "unseen_high": ((y, x), unseen, {"units": "1", "long_name": "95 % bound on a basin not seen"}),
+    }
+
+
+def _about(data: xr.Dataset) -> str:
+    if "unseen_high" not in data:
+        return ""
+    bound = float(data["unseen_high"].where(data["share_without"] <= SHARE_LIMIT).max())
+    return f"basins below {palette.percent(bound)} may be missing" if np.isfinite(bound) else ""
 
 
 def _label(present: np.ndarray, periods: np.ndarray, show: str) -> str:

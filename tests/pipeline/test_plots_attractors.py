@@ -331,9 +331,16 @@ def test_plot_fractions__bands_are_stacked_and_what_is_not_decided_is_on_top(swe
     assert band(fig, "undecided") == [[2.15, 2.25, 0.8, 1.0]]
     assert band(fig, "diverged") == [[2.05, 2.15, 0.8, 0.9]]
     assert band(fig, "pending") == [[2.05, 2.15, 0.9, 1.0]]
-    assert legend_texts(fig) == ["pending", "diverged", "undecided", "A: period 1, left", "B: period 1, left"]
+    assert legend_texts(fig) == [
+        "pending",
+        "diverged",
+        "undecided",
+        "A: period 1, left",
+        "B: period 1, left",
+        "95 % interval of an edge",
+    ]
     (area,) = [a for a in fig.axes[0].collections if a.get_gid() == "band:A"]
-    assert to_rgb(area.get_facecolor()[0]) == legend_colours(fig)["A: period 1, left"]
+    assert to_rgb(area.get_facecolor()[0]) == legend_patches(fig)["A: period 1, left"]
     assert fig.axes[0].get_xlabel() == "drive frequency [Hz]"
     assert fig.data["fraction"].sel(outcome="A").values.tolist() == [0.5, 0.4, 0.0]
     assert fig.data["fraction"].sum("outcome").values == pytest.approx(1.0)
@@ -342,7 +349,7 @@ def test_plot_fractions__bands_are_stacked_and_what_is_not_decided_is_on_top(swe
 def test_plot_fractions__more_attractors_than_colours():
     ids = np.tile(np.arange(15), (2, 1))
     fig = plot_fractions(make_attractors(ids, ("q", "initial_condition"), {"q": [1.0, 1.1]}))
-    assert len(legend_texts(fig)) == 13
+    assert len(legend_patches(fig)) == 13
     assert legend_texts(fig)[0] == "3 others"
     assert band(fig, "3 others") == [[0.95, 1.15, 0.8, 1.0]]
 
@@ -586,3 +593,52 @@ def test_vocabulary__codes_are_those_of_the_kernel():
     named = [code for codes in palette.UNASSIGNED.values() for code in codes]
     assert sorted(named) == sorted(Status)
     assert palette.GREYS.keys() == palette.UNASSIGNED.keys()
+
+
+def bars(fig, name):
+    """Position, low and high of the bars at the upper edge of a band."""
+    found = [a for a in fig.axes[0].collections if a.get_gid() == f"interval:{name}"]
+    return [[round(float(v), 9) for v in (s[0][0], s[0][1], s[1][1])] for s in found[-1].get_segments()]
+
+
+def test_plot_fractions__intervals(sweep):
+    fig = plot_fractions(sweep)
+    # Wilson's score interval, by its own equation: |p - k/n| = z sqrt(p (1 - p) / n) at both ends
+    for outcome, k in (("A", [5, 4, 0]), ("B", [5, 4, 8]), ("undecided", [0, 0, 2])):
+        one = fig.data.sel(outcome=outcome)
+        for end in ("low", "high"):
+            p, share = one[end].values, np.array(k) / 10
+            inner = (p > 0) & (p < 1)
+            assert np.abs(p - share)[inner] == pytest.approx(1.959964 * np.sqrt(p * (1 - p) / 10)[inner])
+        assert (one["low"] <= one["fraction"]).all()
+        assert (one["fraction"] <= one["high"]).all()
+    b = fig.data.sel(outcome="B")
+    # five bands: the bars of the lowest stand at a fifth of the columns, which are 0.1 Hz wide
+    expected = np.column_stack([[1.97, 2.07, 2.17], b["low"], b["high"]])
+    assert bars(fig, "B") == pytest.approx(expected)
+    # the edge above A is none at the first frequency, where A reaches the top, nor at the last
+    assert [x for x, *_ in bars(fig, "A")] == [2.09]
+    caption = next(t.get_text() for t in fig.axes[0].texts if "states" in t.get_text())
+    # five of ten cells have the widest interval
+    assert caption.endswith(f"±{float(0.5 - b['low'][0]):.2g}")
+    many = sweep.isel(frequency=np.tile(np.arange(3), 7)).assign_coords(frequency=2.0 + 0.1 * np.arange(21))
+    assert not [a for a in plot_fractions(many).axes[0].collections if "interval" in a.get_gid()]
+
+
+def test_plot_fractions__branches_are_no_sample(walk):
+    fig = plot_fractions(walk)
+    assert fig.axes[0].get_ylabel() == "share of the branches"
+    assert "low" not in fig.data
+    assert any("branches each" in text.get_text() for text in fig.axes[0].texts)
+
+
+def test_plot_regimes__shares_and_what_may_be_missing(map_of_two):
+    fig = plot_regimes(map_of_two)
+    here = fig.data.sel(frequency=2.0, q=1.5)
+    assert here["share"].values.tolist() == [0.5, 0.5]
+    assert ((fig.data["low"] <= fig.data["share"]) & (fig.data["share"] <= fig.data["high"])).all()
+    unseen = fig.data["unseen_high"].transpose("frequency", "q").values
+    # (1 - p)^n = 0.05 with n decided cells; nothing is known where none is
+    assert unseen[:, :2] == pytest.approx(1 - 0.05 ** (1 / 4))
+    assert unseen[:, 2].tolist() == pytest.approx([1 - 0.05 ** (1 / 3), 1.0])
+    assert "basins below 52.7" in fig.axes[0].texts[0].get_text()
