@@ -69,7 +69,10 @@ def run(
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")
     ] = False,
-    plot: Annotated[bool, typer.Option("--plot", help="Draw the bifurcation diagram at the end.")] = False,
+    plot: Annotated[
+        bool,
+        typer.Option("--plot", help="Draw the bifurcation diagram of one parameter at the end."),
+    ] = False,
 ) -> None:
     """Compute what a specification asks for, or what is missing of it.
 
@@ -81,12 +84,14 @@ def run(
         for line in runs.describe_plan(spec, out, workers=workers, smoke=smoke):
             typer.echo(line)
         return
+    if plot:
+        runs.check_diagram(spec, smoke=smoke)
     state = runs.run(spec, out, workers=workers, scheduler=scheduler, smoke=smoke, echo=typer.echo)
     typer.echo(f"cube: {state.directory / 'cube.zarr'}")
     if plot:
         typer.echo(f"figure: {draw_bifurcation(state.directory)}")
     else:
-        typer.echo(f"plot it with: magpend plot bifurcation {state.directory}")
+        typer.echo(f"plot it with: magpend plot {runs.first_figure(state.plan)} {state.directory}")
 
 
 @app.command(epilog=EXIT_HELP)

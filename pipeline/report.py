@@ -290,10 +290,11 @@ def settling_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     for row in rows:
         where = {f"{d}{_unit(ds, d)}": f"{row[d]:g}" for d in dims}
         low, high = (_number(row[name], ".0f") for name in ("lifetime_low", "lifetime_high"))
-        lifetime = f"above {low}"
-        if row["n_left"]:
-            lifetime = f"{row['mean_lifetime']:.0f} ({low} to {high})"
-        counts = {"sampled": str(row["n_sampled"]), "left": str(row["n_left"])}
+        lifetime = f"{row['mean_lifetime']:.0f} ({low} to {high})"
+        if not row["n_left"]:
+            lifetime = f"above {low}" if low != "-" else low
+        counts = {"sampled": "n_sampled", "near an orbit": "n_leaving", "left later": "n_left"}
+        counts = {text: str(row[name]) for text, name in counts.items()}
         told = {"id": str(row["attractor_id"]), "verdict": row["verdict"]}
         table.append(where | told | counts | {"mean lifetime": lifetime, "to": row["to"] or "-"})
     return lines + _table(table)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import store
+from pipeline.analysis.vocabulary import GRID_DIMS, START_DIMS
 from pipeline.identity import identity_of
 from pipeline.plan import Plan, make_plan
 from pipeline.problems import SpecError
@@ -222,6 +223,36 @@ def state(directory: str | Path) -> State:
     for commit in commits.values():
         cells.update(commit.status)
     return State(info.directory, info.title, plan, frozenset(commits), dict(cells))
+
+
+def first_figure(plan: Plan) -> str:
+    """Name of the figure of ``magpend plot`` that shows a run as a whole."""
+    swept = [d for d in plan.dims if d not in START_DIMS]
+    long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
+    n_swept, n_grid = (sum(d in names for d in long) for names in (swept, GRID_DIMS))
+    if n_swept >= 2:
+        return "regimes"
+    if n_swept == 0 and n_grid >= 2:
+        return "basins"
+    return "bifurcation" if swept else "gallery"
+
+
+def check_diagram(spec: str | Path, *, smoke: bool = False) -> None:
+    """Refuse a specification whose run is not drawn as a bifurcation diagram.
+
+    Raises
+    ------
+    SpecError
+        Naming the figure that is.
+    """
+    figure = first_figure(make_plan(load_spec(find_spec(spec), smoke=smoke)))
+    if figure != "bifurcation":
+        raise SpecError(
+            [
+                "--plot: a bifurcation diagram is drawn over one parameter; drop it, "
+                f"and use: magpend plot {figure} DIR"
+            ]
+        )
 
 
 def describe_plan(

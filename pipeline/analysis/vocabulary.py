@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import xarray as xr
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 GRID_DIMS = ("psi1_0", "psi2_0", "psi1_dot_0", "psi2_dot_0")
 """Dims of a grid of initial states."""

@@ -265,7 +265,7 @@ def swept_parameter(ds: xr.Dataset) -> str:
         value = np.asarray(ds[first].values)[0]
         raise ValueError(
             f"the cube sweeps {' and '.join(long)}, and a diagram has one axis for them; "
-            f"choose a value first, for instance ds.sel({first}={value})"
+            f"choose a value first, for instance ds.sel({first}={value}), or draw a map of regimes"
         )
     if not outer:
         raise ValueError("the cube sweeps no parameter: there is nothing to draw the sections over")

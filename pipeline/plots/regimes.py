@@ -101,9 +101,10 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
     long = [d for d in left if attractors.sizes[d] > 1]
     chosen = long if len(long) >= 2 else left
     if len(chosen) != 2:
+        left_of = f"{len(chosen)} are left of {', '.join(dims)}" if dims else "this run sweeps none"
         raise ValueError(
-            f"a map of regimes has two swept parameters, and {len(chosen)} are left of "
-            f"{', '.join(dims) or 'none'}; sweep two, and choose values of any others"
+            f"a map of regimes has two swept parameters, and {left_of}; "
+            "sweep two, and choose values of any others"
         )
     return ("frequency", next(d for d in chosen if d != "frequency")) if "frequency" in chosen else (
         chosen[0], chosen[1],

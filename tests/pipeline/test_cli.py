@@ -11,6 +11,9 @@ import pytest
 
 from pipeline import run as runs
 from pipeline.exits import Exit
+from pipeline.plan import make_plan
+from pipeline.run import first_figure
+from pipeline.spec import parse_spec
 
 BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
 
@@ -103,6 +106,33 @@ def test_run__dry_run_creates_nothing(main, write_spec, sweep_text, tmp_path):
     ):
         assert words in out
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("axes", "starts", "figure"),
+    [
+        ({"frequency_hz": 3}, {}, "bifurcation"),
+        ({"frequency_hz": 1}, {"psi1": 2, "psi2": 2}, "basins"),
+        ({"frequency_hz": 3, "q": 1}, {"psi1": 2, "psi2": 2}, "bifurcation"),
+        ({"frequency_hz": 2, "q": 2}, {"psi1": 2}, "regimes"),
+        ({}, {"psi1": 2, "psi2": 2, "psi1_dot": 2}, "basins"),
+        ({}, {"psi1": 2}, "gallery"),
+    ],
+)
+def test_first_figure__fits_the_axes(axes, starts, figure):
+    spec = {"kind": "sweep", "parameters": {} if "frequency_hz" in axes else {"frequency_hz": 2.2}}
+    spec["axes"] = {name: {"values": [1.5 + i for i in range(n)]} for name, n in axes.items()}
+    grid = {name: {"start": 0.0, "stop": 1.0, "num": n} for name, n in starts.items()}
+    spec["initial_conditions"] = {"kind": "grid", "psi1": 0.1, **grid}
+    assert first_figure(make_plan(parse_spec(spec))) == figure
+
+
+def test_run__plot_of_a_map_is_refused_before_it_is_computed(main, write_spec, sweep_text, tmp_path):
+    write_spec(sweep_text)
+    code, _, err = main("run", "spec.toml", "--plot")
+    assert code == Exit.REFUSED
+    assert "magpend plot regimes" in err
+    assert not (tmp_path / "runs").exists()
 
 
 def test_run__status__verify__plot(main, write_spec, walk_text, tmp_path):

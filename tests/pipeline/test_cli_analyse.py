@@ -120,7 +120,7 @@ def test_settling__says_what_stays(main, spirals, tmp_path):
             else "transient"
         )
         assert row["verdict"] == words
-    assert re.search(r"frequency Hz +id +verdict +sampled +left +mean lifetime +to", out)
+    assert re.search(r"frequency Hz +id +verdict +sampled +near an orbit +left later +mean lifetime +to", out)
 
 
 def test_hysteresis__loops_and_jumps(main, write_spec, walk_text, tmp_path):
