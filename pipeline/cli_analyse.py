@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from pipeline.cli_common import EXIT_HELP, Directory, refusals
+from pipeline.cli_common import EXIT_HELP, Directory, read_pairs, refusals
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -98,6 +98,12 @@ CHAOS_OPTIONS = (
     _option("n_frequencies", 100, "0-1 test: number of frequencies; 10 or more."),
     _option("stride", 1, "0-1 test: use every so many-th section; 1 or more."),
     _option("seed", 0, "0-1 test: seed of the frequencies; 0 or more."),
+)
+
+DIMENSION_OPTIONS = (
+    _option("theiler", 1, "Pairs of sections at most so far apart in time are left out; 0 or more."),
+    _option("n_max", 10_000, "Most section points used of a parameter point; 100 or more."),
+    _option("floor", 1e-6, "Scaled distance (1 rad, 10 rad/s) that is not resolved; above 0."),
 )
 
 
@@ -192,6 +198,29 @@ def chaos(context: typer.Context, csv: Csv = None, **options: Any) -> None:
     ds = _derive(context, derived.chaos, csv, options)
     rows = report.chaos_rows(ds)
     _tell(report.chaos_lines(ds, rows), rows, csv, ds)
+
+
+@analyse_app.command(epilog=EXIT_HELP)
+@takes(*DIMENSION_OPTIONS)
+def dimension(
+    context: typer.Context,
+    at: Annotated[
+        list[str] | None,
+        typer.Option("--at", metavar="AXIS=VALUE", help="Value of a swept parameter; by default all."),
+    ] = None,
+    csv: Csv = None,
+    **options: Any,
+) -> None:
+    """Measure the correlation dimension of the chaotic sections of a parameter point, pooled.
+
+    Takes seconds per point, and thousands of sections for two digits.
+    """
+    from pipeline import derived, report
+
+    chosen = read_pairs("--at", at or [], "frequency=2.4")
+    ds = _derive(context, derived.dimension, csv, {"at": chosen, **options})
+    rows = report.dimension_rows(ds)
+    _tell(report.dimension_lines(ds, rows), rows, csv, ds)
 
 
 @analyse_app.command(epilog=EXIT_HELP)

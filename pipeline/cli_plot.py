@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli_analyse import ATTRACTOR_OPTIONS, takes
+from pipeline.cli_analyse import ATTRACTOR_OPTIONS, DIMENSION_OPTIONS, takes
 from pipeline.cli_common import EXIT_HELP, Directory, read_pairs, refusals
 
 if TYPE_CHECKING:
@@ -240,6 +240,52 @@ def lyapunov(
             figure = plot_lyapunov(
                 ds, spectrum=spectrum, per=per.value, state=state.value, degrees=degrees, at=chosen
             )
+    target.parent.mkdir(exist_ok=True)
+    typer.echo(f"figure: {save_figure(figure, target)}")
+    typer.echo(f"data: {save_data(figure, target)}")
+
+
+@plot_app.command(epilog=EXIT_HELP)
+def convergence(
+    directory: Directory,
+    exponent: Annotated[int, typer.Option(help="Which exponent, 1 the largest.")] = 1,
+    per: Annotated[Per, typer.Option(help="Exponents per second or per drive period.")] = Per.S,
+    at: At = None,
+    out: Out = None,
+    file_format: FileFormat = None,
+) -> None:
+    """Draw how the Lyapunov exponents of the cells of one parameter point converge."""
+    from pipeline import open_run
+    from pipeline.plots import plot_convergence, save_data, save_figure
+
+    target = figure_target(directory, f"convergence_{exponent}", out, file_format)
+    chosen, ds = _positions(at), open_run(directory)
+    with refusals(directory):
+        figure = plot_convergence(ds, exponent=exponent, per=per.value, at=chosen)
+    target.parent.mkdir(exist_ok=True)
+    typer.echo(f"figure: {save_figure(figure, target)}")
+    typer.echo(f"data: {save_data(figure, target)}")
+
+
+@plot_app.command(epilog=EXIT_HELP)
+@takes(*DIMENSION_OPTIONS)
+def dimension(
+    directory: Directory, at: At = None, out: Out = None, file_format: FileFormat = None, **options: Any
+) -> None:
+    """Draw the correlation sum of the chaotic sections of one parameter point, with fit and local slope."""
+    target = figure_target(directory, "dimension", out, file_format)
+    from pipeline import derived, open_run
+    from pipeline.analysis.selection import select_points
+    from pipeline.plots import plot_dimension, save_data, save_figure
+
+    chosen = _positions(at)
+    with refusals(directory):
+        select_points(
+            open_run(directory), chosen, purpose="a correlation sum is drawn of one parameter point"
+        )
+    found = derived.dimension(directory, at=chosen, echo=typer.echo, **options)
+    with refusals(directory):
+        figure = plot_dimension(found)
     target.parent.mkdir(exist_ok=True)
     typer.echo(f"figure: {save_figure(figure, target)}")
     typer.echo(f"data: {save_data(figure, target)}")

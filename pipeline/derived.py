@@ -386,6 +386,53 @@ def chaos_defaults() -> dict[str, Any]:
     return _defaults_of(compute)
 
 
+def dimension(
+    directory: Source, *, at: Mapping[str, float] | None = None, echo: Echo | None = None, **options: Any
+) -> xr.Dataset:
+    """Correlation dimension of the chaotic sections of each parameter point.
+
+    Parameters
+    ----------
+    directory, echo
+        As in `attractors`.
+    at
+        Values of swept parameters; all points of the others are taken.
+    options
+        Those of `pipeline.analysis.chaos.section_dimension`.
+
+    Returns
+    -------
+    Dataset
+        See `pipeline.analysis.chaos.section_dimension`.
+
+    Raises
+    ------
+    SpecError
+        If an axis, a value or an option is unknown or out of bounds.
+    """
+    from pipeline.analysis.chaos import check_dimension, section_dimension
+    from pipeline.analysis.selection import select_points
+
+    snapshot = Snapshot.of(directory)
+    wanted = _with_defaults("dimension", options, dimension_defaults())
+    with _refused(snapshot):
+        check_dimension(snapshot.open(), at=at, **wanted)
+        part = select_points(snapshot.open(), at)
+    # the values that the axes have: another spelling of a point is the same product
+    chosen = {name: float(part[name].values[0]) for name in at or {}}
+    return derive(
+        snapshot, "dimension", {"at": chosen, **wanted},
+        lambda s: section_dimension(s.open(), at=chosen, **wanted), echo,
+    )  # fmt: skip
+
+
+def dimension_defaults() -> dict[str, Any]:
+    """Options of `dimension` with their defaults."""
+    from pipeline.analysis.chaos import section_dimension
+
+    return _defaults_of(section_dimension)
+
+
 @contextlib.contextmanager
 def _refused(snapshot: Snapshot) -> Iterator[None]:
     """Turn what an analysis refuses into a sentence with the directory's name."""

@@ -35,8 +35,8 @@ def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        With the specification's TOML text, the settings of the integration by name and the versions
-        that made it in the attributes.
+        With the specification's TOML text, the settings of the integration by name, those of the
+        exponents as ``lyapunov_<name>``, and the versions that made it in the attributes.
 
     Raises
     ------
@@ -73,7 +73,8 @@ def open_committed(
     if "direction" in ds.coords:
         ds = ds.assign_coords(direction=_words(ds.coords["direction"]))
     version = info.versions.get("magpend", "(not installed)")
-    integration = parse_spec(info.spec).integration
+    spec = parse_spec(info.spec)
+    lyapunov = spec.products.lyapunov
     attrs: dict[str, Any] = {
         "title": info.title,
         "source": f"magpend {version}, kernel {info.identity['kernel_version']}",
@@ -82,7 +83,8 @@ def open_committed(
         "digest": info.digest,
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
         # numbers only: netCDF knows no truth values
-        **{name: int(v) if isinstance(v, bool) else v for name, v in integration.model_dump().items()},
+        **{name: int(v) if isinstance(v, bool) else v for name, v in spec.integration.model_dump().items()},
+        **{f"lyapunov_{k}": v for k, v in (lyapunov.model_dump() if lyapunov else {}).items()},
     }
     if plan.path is not None:
         attrs["path"] = plan.dims[plan.path]

@@ -448,6 +448,49 @@ def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[
     return lines
 
 
+# ---- correlation dimension ---------------------------------------------------------------------
+
+_CURVE = (
+    "correlation_dimension", "correlation_dimension_stderr", "correlation_dimension_spread", "fit_low",
+    "fit_high", "largest_resolved",
+)  # fmt: skip
+
+
+def dimension_rows(ds: xr.Dataset) -> list[Row]:
+    """Return a row per parameter point."""
+    rows = []
+    for index in np.ndindex(*ds["n_cells"].shape):
+        at = dict(zip(map(str, ds["n_cells"].dims), index, strict=True))
+        one = ds.isel(at)
+        row: Row = {**_where(ds, at), "n_cells": int(one["n_cells"]), "n_points": int(one["n_points"])}
+        rows.append(row | {name: float(one[name]) for name in _CURVE})
+    return rows
+
+
+def dimension_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
+    """Return a table with a line per parameter point."""
+    lines = ["correlation dimension of the sections of the chaotic cells"]
+    dims = [str(d) for d in ds["n_cells"].dims]
+    found = []
+    for row in rows:
+        place = {f"{d}{_unit(ds, d)}": f"{row[d]:g}" for d in dims}
+        value = _with_error(row["correlation_dimension"], row["correlation_dimension_stderr"])
+        ends = "-"
+        if np.isfinite(row["fit_low"]):
+            ends = f"{row['fit_low']:.3g} to {row['fit_high']:.3g}"
+        elif not row["n_cells"]:
+            value = "no chaotic cell"
+        elif not np.isfinite(row["correlation_dimension"]):
+            value = "no range to fit: too few points"
+        counts = {"cells": str(row["n_cells"]), "points": str(row["n_points"])}
+        spread = _number(row["correlation_dimension_spread"], "+.2f")
+        found.append(
+            place | counts | {"dimension": value, "fitted radii": ends, "lower minus upper half": spread,
+                              "resolvable": _number(row["largest_resolved"], ".1f")}
+        )  # fmt: skip
+    return lines + _table(found)
+
+
 # ---- shared ------------------------------------------------------------------------------------
 
 

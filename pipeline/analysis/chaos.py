@@ -12,16 +12,23 @@ hyperchaotic; a mean over one of the two kinds is then biased by the choice, tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from pipeline.analysis.indicators import SHORTEST, kaplan_yorke_dimension, zero_one_test
-from pipeline.analysis.lyapunov import Motion, summarise
-from pipeline.analysis.vocabulary import PERIODIC, split_dims
+from pipeline.analysis.indicators import (
+    FLOOR,
+    SHORTEST,
+    correlation_dimension,
+    kaplan_yorke_dimension,
+    zero_one_test,
+)
+from pipeline.analysis.lyapunov import Motion, pooled_mean, summarise
+from pipeline.analysis.selection import select_points
+from pipeline.analysis.vocabulary import BOUNDED, PERIODIC, split_dims
 from pipeline.schema import LyapunovFlag
 
 Floats = npt.NDArray[np.float64]
@@ -77,7 +84,7 @@ def chaos(
             errors either way; with these flags.
         ``mean_lyapunov``, ``mean_lyapunov_stderr``, ``mean_lyapunov_between`` (exponent) [1/s]
             Mean over the cells, its standard error, and the standard deviation between cells that their
-            own errors do not explain (see Notes). Exponents after the first: of cells flagged good.
+            own errors do not explain. Exponents after the first: of cells flagged good.
         ``mean_lyapunov_per_period``, ``mean_lyapunov_per_period_stderr`` (exponent) [1]
             The same over the frequency.
         ``mean_kaplan_yorke``, ``mean_kaplan_yorke_stderr``
@@ -94,10 +101,7 @@ def chaos(
 
     Notes
     -----
-    The variance S**2 between m cells contains that within a cell, s_i**2. With T**2 = S**2 - mean(s_i**2)
-    for the part beyond it, 0 if that is negative, the variance of the mean is ``(T**2 + mean(s_i**2))/m``
-    (Hedges and Olkin, Statistical Methods for Meta-Analysis, 1985, ch. 9): the errors within cells
-    while the cells agree, the scatter of the cells where it is larger. One cell has its own error.
+    How errors within and between cells combine is said in `pipeline.analysis.lyapunov.pooled_mean`.
     """
     check_chaos(ds, n_sigma=n_sigma, least=least, n_frequencies=n_frequencies, stride=stride, seed=seed)
     missing = reasons(ds, stride)
@@ -234,7 +238,7 @@ def _by_kind(cells: xr.Dataset, n_sigma: float) -> xr.Dataset:
             count(f"n_{code.name.lower()}", flag == code, f"cells flagged: {code.sentence}")
         _put_exponents(cells, table, is_kind, put)
         value, error = (_beside(table(f"kaplan_yorke_dimension{end}"), dims) for end in ("", "_stderr"))
-        mean, stderr, _ = _pooled(value, error, is_kind)
+        mean, stderr, _ = pooled_mean(value, error, is_kind)
         put("mean_kaplan_yorke", mean, "mean Kaplan-Yorke dimension of the section")
         put("mean_kaplan_yorke_stderr", stderr, "its standard error")
     if "zero_one" in cells:
@@ -252,7 +256,7 @@ def _put_exponents(cells: xr.Dataset, table: Any, is_kind: npt.NDArray[np.bool_]
         columns = []
         for k in range(value.shape[-2]):
             usable = is_kind & np.expand_dims(good, -2) if k else is_kind
-            columns.append(_pooled(value[..., k : k + 1, :], error[..., k : k + 1, :], usable))
+            columns.append(pooled_mean(value[..., k : k + 1, :], error[..., k : k + 1, :], usable))
         mean, stderr, between = (np.stack(part, axis=-1) for part in zip(*columns, strict=True))
         put(f"mean_{name}", mean, f"mean exponents per {per}", units, ["exponent"])
         put(f"mean_{name}_stderr", stderr, "their standard errors", units, ["exponent"])
@@ -266,25 +270,78 @@ def _beside(values: Floats, dims: Sequence[str]) -> Floats:
     return np.expand_dims(values, len(dims))
 
 
-def _pooled(value: Floats, stderr: Floats, which: npt.NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
-    """Mean over the last axis, its standard error, and the deviation between cells (see `chaos`)."""
-    there = which & np.isfinite(value)
-    m = there.sum(-1)
-    mean = _over(np.where(there, value, 0.0).sum(-1), m)
-    apart = np.where(there, value - np.expand_dims(mean, -1), 0.0)
-    scatter = np.where(m > 1, _over((apart**2).sum(-1), m - 1), 0.0)
-    within = _over((np.where(there, stderr, 0.0) ** 2).sum(-1), m)
-    between = np.maximum(scatter - within, 0.0)
-    return mean, np.sqrt(_over(between + within, m)), np.sqrt(between)
-
-
-def _over(values: Any, counts: Any) -> Floats:
-    empty = np.full(np.shape(values), np.nan)
-    return np.asarray(np.divide(values, counts, out=empty, where=np.asarray(counts) > 0))
-
-
 def _quantile(values: Floats, q: float) -> Floats:
     """Quantile over the last axis of what is finite, NaN where nothing is."""
     flat = values.reshape(-1, values.shape[-1])
     found = [np.quantile(row[np.isfinite(row)], q) if np.isfinite(row).any() else np.nan for row in flat]
     return np.asarray(found, np.float64).reshape(values.shape[:-1])
+
+
+# ---- correlation dimension of the chaos of a parameter point ------------------------------------
+
+
+def section_dimension(
+    ds: xr.Dataset, *, at: Mapping[str, float] | None = None, theiler: int = 1, n_max: int = 10_000,
+    floor: float = FLOOR,
+) -> xr.Dataset:  # fmt: skip
+    """Correlation dimension of the pooled sections of the chaotic cells of each parameter point.
+
+    Parameters
+    ----------
+    ds
+        Cube with `section`, `status` and `orbit_period`. Chaotic are, if it has exponents, the cells
+        that `chaos` calls chaotic or hyperchaotic and no transients; otherwise those that do not close.
+    at
+        Values of swept parameters; all points of the others are taken.
+    theiler, n_max, floor
+        See `pipeline.analysis.indicators.correlation_dimension`.
+
+    Returns
+    -------
+    Dataset
+        Of `correlation_dimension`, on the swept parameters, and ``n_cells``, the cells pooled. Cells on
+        several attractors show the largest of their dimensions, if the points of that one are not few.
+
+    Raises
+    ------
+    ValueError
+        If an axis or a value is not the cube's, or an option is out of bounds.
+    """
+    check_dimension(ds, at=at, theiler=theiler, n_max=n_max, floor=floor)
+    part = select_points(ds, at)
+    _, starts = split_dims(part["status"])
+    own = part[["section", "status"]].load()
+    is_chaotic = _is_chaotic(part)
+    own["section"] = own["section"].where(is_chaotic)
+    found = correlation_dimension(own, pool=starts, theiler=theiler, n_max=n_max, floor=floor)
+    n_cells = is_chaotic.sum(starts).assign_attrs(units="1", long_name="cells pooled")
+    return found.assign(n_cells=n_cells).assign_attrs(ds.attrs)
+
+
+def check_dimension(
+    ds: xr.Dataset, *, at: Mapping[str, float] | None, theiler: int, n_max: int, floor: float
+) -> None:
+    """Refuse options of `section_dimension` that are out of bounds.
+
+    Raises
+    ------
+    ValueError
+        Naming all that is wrong, or the first axis or value that is not the cube's.
+    """
+    problems = [
+        f"{name} = {value} is out of bounds: it must be {low} or more."
+        for name, value, low in (("theiler", theiler, 0), ("n_max", n_max, 100))
+        if value < low
+    ]
+    if not floor > 0:
+        problems.append(f"floor = {floor:g} is out of bounds: it must be greater than 0.")
+    if problems:
+        raise ValueError(" ".join(problems))
+    select_points(ds, at)
+
+
+def _is_chaotic(ds: xr.Dataset) -> xr.DataArray:
+    if "lyapunov" not in ds:
+        return (ds["status"] == BOUNDED) & (ds["orbit_period"] == 0)
+    cells = _of_exponents(ds, 3.0, 0.005)
+    return cells["motion"].isin((Motion.CHAOTIC, Motion.HYPERCHAOTIC)) & (cells["is_transient"] != 1)

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-_PERIODIC = 1  # of magpend_core.status, which would bring the compiler with it
+from pipeline.analysis.vocabulary import PERIODIC
+
+Floats = npt.NDArray[np.float64]
 
 GOOD = 1
 """Value of `lyapunov_flag` without objection (see `pipeline.schema.LyapunovFlag`)."""
@@ -100,7 +103,7 @@ def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> xr.DataArray:
     sign = (rate > margin).astype(np.int8) - (rate < -margin).astype(np.int8)
     first = sign.isel(exponent=0, drop=True)
     motion = xr.full_like(ds["lyapunov_flag"], Motion.UNDECIDED)
-    closed = (ds["status"] == _PERIODIC) | (ds["orbit_period"] > 0)
+    closed = (ds["status"] == PERIODIC) | (ds["orbit_period"] > 0)
     motion = motion.where(~((first < 0) | closed), np.int8(Motion.REGULAR))
     motion = motion.where(~((first > 0) & ~closed), np.int8(Motion.CHAOTIC))
     if ds.sizes["exponent"] > 1:
@@ -138,6 +141,44 @@ def _audit(ds: xr.Dataset) -> xr.DataArray:
     return total.assign_attrs(units="1/s", long_name="sum of the exponents minus the divergence")
 
 
+# ---- means over cells --------------------------------------------------------------------------
+
+
+def pooled_mean(value: Floats, stderr: Floats, which: npt.NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
+    """Mean over cells, its standard error, and the standard deviation between cells beyond their errors.
+
+    The variance S**2 between m cells contains that within a cell, s_i**2. With T**2 = S**2 - mean(s_i**2)
+    for the part beyond it, 0 if that is negative, the variance of the mean is ``(T**2 + mean(s_i**2))/m``
+    (Hedges and Olkin, Statistical Methods for Meta-Analysis, 1985, ch. 9): the errors within cells
+    while the cells agree, the scatter of the cells where it is larger. One cell has its own error.
+
+    Parameters
+    ----------
+    value, stderr
+        Values with their standard errors, cells on the last axis; not finite: left out.
+    which
+        Cells that count, of the same shape or one that broadcasts.
+
+    Returns
+    -------
+    tuple of ndarray
+        Without the last axis; NaN where no cell counts.
+    """
+    there = which & np.isfinite(value)
+    m = there.sum(-1)
+    mean = _over(np.where(there, value, 0.0).sum(-1), m)
+    apart = np.where(there, value - np.expand_dims(mean, -1), 0.0)
+    scatter = np.where(m > 1, _over((apart**2).sum(-1), m - 1), 0.0)
+    within = _over((np.where(there, stderr, 0.0) ** 2).sum(-1), m)
+    between = np.maximum(scatter - within, 0.0)
+    return mean, np.sqrt(_over(between + within, m)), np.sqrt(between)
+
+
+def _over(values: Any, counts: Any) -> Floats:
+    empty = np.full(np.shape(values), np.nan)
+    return np.asarray(np.divide(values, counts, out=empty, where=np.asarray(counts) > 0))
+
+
 # ---- from Jacobians ----------------------------------------------------------------------------
 
 
@@ -155,9 +196,9 @@ class JacobianSpectrum:
         Mean growth in each block, in the order of `exponents`.
     """
 
-    exponents: npt.NDArray[np.float64]
-    stderr: npt.NDArray[np.float64]
-    blocks: npt.NDArray[np.float64]
+    exponents: Floats
+    stderr: Floats
+    blocks: Floats
 
 
 def spectrum_of_jacobians(

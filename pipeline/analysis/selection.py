@@ -46,7 +46,7 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
             raise ValueError(
                 f"unknown axis {name!r}; values can be chosen of: {', '.join(allowed) or 'none'}"
             )
-        ds = ds.isel({name: _nearest(ds[name], float(value))})
+        ds = ds.isel({name: nearest(ds[name], float(value))})
     left = [d for d in ds["attractor_id"].dims if d not in keep]
     long = [str(d) for d in left if ds.sizes[d] > 1]
     if long:
@@ -58,7 +58,8 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
     return ds.isel(dict.fromkeys(left, 0))
 
 
-def _nearest(axis: xr.DataArray, value: float) -> int:
+def nearest(axis: xr.DataArray, value: float) -> int:
+    """Return the place on an axis that is nearest to a value; raises ValueError if that lies off the axis."""
     values = axis.values.astype(np.float64)
     index = int(np.abs(values - value).argmin())
     step = np.diff(values).max() if values.size > 1 else 1e-6 * max(abs(values[0]), 1.0)
@@ -67,3 +68,37 @@ def _nearest(axis: xr.DataArray, value: float) -> int:
             f"{axis.name} = {value:g} lies off its axis, which runs from {values[0]:g} to {values[-1]:g}"
         )
     return index
+
+
+def select_points(ds: xr.Dataset, at: Mapping[str, float] | None, *, purpose: str = "") -> xr.Dataset:
+    """Select values of a cube's swept parameters, which stay as dims.
+
+    Parameters
+    ----------
+    ds
+        Cube.
+    at
+        Value by parameter; the nearest one on the axis is taken.
+    purpose
+        If given, one point must be left; says what it is for, in the message.
+
+    Raises
+    ------
+    ValueError
+        If an axis is unknown, a value lies off its axis, or more than one point is left where one must be.
+    """
+    dims, _ = split_dims(ds["status"])
+    for name, value in (at or {}).items():
+        if name not in dims:
+            allowed = ", ".join(dims) or "none"
+            raise ValueError(f"unknown axis {name!r}; values can be chosen of: {allowed}")
+        index = nearest(ds[name], float(value))
+        ds = ds.isel({name: slice(index, index + 1)})
+    long = [d for d in dims if ds.sizes[d] > 1]
+    if purpose and long:
+        axes = ", ".join(f"{d} ({ds.sizes[d]} values)" for d in long)
+        one = float(ds[long[0]].values[ds.sizes[long[0]] // 2])
+        raise ValueError(
+            f"{purpose}, and the run also has {axes}: choose a value of each, such as --at {long[0]}={one:g}"
+        )
+    return ds

@@ -7,6 +7,7 @@ in any thread and without a display.
 from pipeline.plots.basins import plot_basins
 from pipeline.plots.bifurcation import plot_bifurcation
 from pipeline.plots.branches import plot_branches, plot_curves, plot_multipliers
+from pipeline.plots.chaos import plot_convergence, plot_dimension
 from pipeline.plots.coexisting import plot_coexisting
 from pipeline.plots.fractions import plot_fractions
 from pipeline.plots.gallery import plot_gallery
@@ -20,7 +21,9 @@ __all__ = [
     "plot_bifurcation",
     "plot_branches",
     "plot_coexisting",
+    "plot_convergence",
     "plot_curves",
+    "plot_dimension",
     "plot_fractions",
     "plot_gallery",
     "plot_lyapunov",

@@ -11,9 +11,11 @@ import xarray as xr
 
 from magpend_core import Status, load_preset, polish_orbits
 from pipeline import derived, open_run, report
-from pipeline.analysis.chaos import _pooled, chaos
-from pipeline.cli_analyse import CHAOS_OPTIONS
+from pipeline.analysis.chaos import chaos, section_dimension
+from pipeline.analysis.lyapunov import pooled_mean
+from pipeline.cli_analyse import CHAOS_OPTIONS, DIMENSION_OPTIONS
 from pipeline.exits import Exit
+from pipeline.plots import plot_convergence, plot_dimension
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 SPREAD = np.array([0.0, -0.4, -0.9, -1.5])
@@ -63,13 +65,13 @@ def test_chaos__means_by_motion():
     assert chaotic.mean_kaplan_yorke.item() == pytest.approx(np.mean(dimensions))
 
 
-def test_pooled__covers_what_it_says():
+def test_pooled_mean__covers_what_it_says():
     """Standard errors against the scatter of the means of many made-up samples."""
     rng = np.random.default_rng(1)
     for between, within in ((0.0, 0.3), (0.5, 0.3), (0.5, 0.0)):
         errors = within * rng.uniform(0.5, 1.5, (4000, 8))
         values = 2.0 + between * rng.standard_normal((4000, 8)) + errors * rng.standard_normal((4000, 8))
-        mean, stderr, apart = _pooled(values, errors, np.ones((4000, 8), bool))
+        mean, stderr, apart = pooled_mean(values, errors, np.ones((4000, 8), bool))
         assert np.sqrt((stderr**2).mean()) == pytest.approx(mean.std(), rel=0.2 if between == 0 else 0.05)
         if between:
             assert np.sqrt((apart**2).mean()) == pytest.approx(between, rel=0.05)
@@ -226,3 +228,137 @@ def test_analyse_chaos__refused_before_computing(main, made, arguments, message)
     assert (code, out) == (Exit.REFUSED, "")
     assert message in err
     assert not (made.info.directory / "derived").exists()
+
+
+# ---- correlation dimension ---------------------------------------------------------------------
+
+
+def on_a_plane(n_cells=8, n_keep=500):
+    """Chaotic cells whose sections fill a square in (psi1, psi2), and a closed and a regular one."""
+    rng = np.random.default_rng(2)
+    cube = made_up([[0.3] * n_cells + [-0.2, 0.4]], n_keep=n_keep)
+    section = np.zeros(cube.section.shape)
+    section[0, :n_cells, :, :2] = rng.uniform(-1, 1, (n_cells, n_keep, 2))
+    section[0, n_cells:] = rng.uniform(-1, 1, (2, n_keep, 4))
+    cube["section"].values[:] = section
+    cube["lyapunov_blocks"][0, -1, 11:, 0] -= 0.9  # a transient
+    return cube
+
+
+def test_section_dimension__pools_the_chaotic_cells():
+    cube = on_a_plane()
+    found = section_dimension(cube, at={"frequency": 2.0})
+    assert (int(found.n_cells[0]), int(found.n_points[0])) == (8, 4000)
+    assert float(found.correlation_dimension[0]) == pytest.approx(2.0, abs=0.1)
+    # without exponents, the cells that do not close
+    bare = cube[["section", "status", "orbit_period"]]
+    bare["orbit_period"][0, 0] = 1
+    found = section_dimension(bare)
+    assert (int(found.n_cells[0]), int(found.n_points[0])) == (9, 4500)
+
+
+def test_section_dimension__nothing_chaotic():
+    ds = section_dimension(made_up([-0.2, -0.3], n_keep=50))
+    rows = report.dimension_rows(ds)
+    assert (rows[0]["n_cells"], rows[0]["n_points"]) == (0, 0)
+    assert "no chaotic cell" in report.dimension_lines(ds, rows)[2]
+    few = section_dimension(made_up([0.3, 0.3], n_keep=50))
+    assert "too few points" in report.dimension_lines(few, report.dimension_rows(few))[2]
+
+
+def test_dimension_options__are_those_of_the_analysis():
+    assert {p.name: p.default for p in DIMENSION_OPTIONS} == derived.dimension_defaults()
+
+
+def artists(fig, gid):
+    return [a for a in fig.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)]
+
+
+def test_plot_dimension__curve_fit_and_slope():
+    ds = section_dimension(on_a_plane())
+    fig = plot_dimension(ds)
+    (curve,), (slope,), (fit,) = (artists(fig, g) for g in ("correlation_sum", "local_slope", "fit"))
+    one = ds.isel(frequency=0)
+    known = np.isfinite(one.log_correlation_sum.values)
+    assert np.log(curve.get_ydata()) == pytest.approx(one.log_correlation_sum.values[known])
+    low, high = (float(one[name]) for name in ("fit_low", "fit_high"))
+    for span in artists(fig, "fit_range"):
+        assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx((low, high))
+    x, y = np.log(fit.get_xdata()), np.log(fit.get_ydata())
+    assert np.polyfit(x, y, 1)[0] == pytest.approx(float(one.correlation_dimension))
+    radius = np.asarray(slope.get_xdata())
+    inside = (radius >= low) & (radius <= high)
+    assert np.asarray(slope.get_ydata())[inside].mean() == pytest.approx(2.0, abs=0.1)
+    # the line lies on the curve
+    at = np.interp(np.log(radius[inside]), x, y)
+    assert at == pytest.approx(np.log(curve.get_ydata())[inside], abs=0.05)
+    with pytest.raises(ValueError, match="frequency has several"):
+        plot_dimension(xr.concat([ds, ds], "frequency"))
+    with pytest.raises(ValueError, match="no chaotic cell"):
+        plot_dimension(section_dimension(made_up([-0.2])))
+
+
+# ---- convergence -------------------------------------------------------------------------------
+
+
+def test_plot_convergence__lines_bands_and_transients():
+    cube = made_up([[0.3, 0.36, -0.2], [0.1, 0.1, 0.1]], (2.0, 4.0)).assign_attrs(lyapunov_n_periods=320)
+    cube["lyapunov_blocks"][0, 0, 11:, 0] -= 0.8
+    fig = plot_convergence(cube, at={"frequency": 2.0}, per="period")
+    lines = artists(fig, "running:chaotic")
+    assert len(lines) == 2
+    assert lines[0].get_xdata().tolist() == [20.0 * k for k in range(1, 17)]
+    blocks = cube.lyapunov_blocks.values[0, 0, :, 0] / 2.0
+    assert lines[0].get_ydata() == pytest.approx(np.cumsum(blocks) / np.arange(1, 17))
+    band = artists(fig, "band:chaotic")[0]
+    assert band.get_y() + 0.5 * band.get_height() == pytest.approx(0.33 / 2.0)
+    assert band.get_height() == pytest.approx(2 * np.sqrt(0.0018 / 2) / 2.0)
+    assert len(artists(fig, "running:regular")) == 1
+    below = artists(fig, "in_block")
+    assert below[0].get_ydata() == pytest.approx(blocks)
+    assert below[0].get_xdata()[:2].tolist() == [10.0, 30.0]
+    assert fig.axes[0].get_title(loc="left") == "frequency 2 Hz"
+    second = plot_convergence(cube, at={"frequency": 2.0}, exponent=2)
+    assert second.data["exponent_value"].values == pytest.approx([-0.1, -0.04, -0.6])
+
+
+def test_plot_convergence__mistakes():
+    cube = made_up([[0.3], [0.1]], (2.0, 4.0))
+    for options, message in (
+        ({}, r"one parameter point.*frequency \(2 values\).*--at frequency=4"),
+        ({"at": {"q": 1.0}}, "unknown axis 'q'; values can be chosen of: frequency"),
+        ({"at": {"frequency": 9.0}}, "lies off its axis"),
+        ({"at": {"frequency": 2.0}, "exponent": 5}, "exponent is 5, and the cube has 1 to 4"),
+        ({"at": {"frequency": 2.0}, "per": "year"}, "unknown unit"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plot_convergence(cube, **options)
+    with pytest.raises(ValueError, match="no Lyapunov exponents"):
+        plot_convergence(cube.drop_vars("lyapunov"), at={"frequency": 2.0})
+
+
+def test_commands__dimension_and_figures(main, run):
+    code, out, err = main("analyse", run, "dimension", "--at", "frequency=2.4001", "--csv", "d.csv")
+    assert (code, err) == (0, "")
+    assert re.search(r"^  2\.4 +\d +\d+ ", out, re.MULTILINE)
+    assert main("analyse", run, "dimension", "--at", "frequency=2.4")[1].startswith("dimension: taken from")
+    code, out, err = main("plot", "convergence", run, "--at", "frequency=2.4")
+    assert (code, err) == (0, "")
+    with xr.open_dataset(run / "figures" / "convergence_1.nc", engine="scipy") as stored:
+        assert stored["period"].values[-1] == 400.0
+    code, out, err = main("plot", "dimension", run, "--at", "frequency=2.4")
+    assert (code, err) == (0, "")
+    assert out.startswith("dimension: taken from")
+    for arguments, message in (
+        (["plot", "dimension", run], "a correlation sum is drawn of one parameter point"),
+        (["plot", "convergence", run], "convergence is drawn at one parameter point"),
+        (["plot", "dimension", run, "--at", "frequency=2.2"], "no chaotic cell"),
+        (["analyse", run, "dimension", "--theiler", "-1"], "theiler = -1 is out of bounds: it must be 0 or"),
+        (["analyse", run, "dimension", "--n-max", "99"], "n_max = 99 is out of bounds: it must be 100 or"),
+        (["analyse", run, "dimension", "--floor", "0"], "floor = 0 is out of bounds: it must be greater"),
+        (["analyse", run, "dimension", "--at", "q=1"], "unknown axis 'q'"),
+    ):
+        code, _, err = main(*arguments)
+        assert code == Exit.REFUSED
+        assert message in err
+        assert "Traceback" not in err
