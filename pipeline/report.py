@@ -76,7 +76,8 @@ def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the table per parameter point if there are few, otherwise a line per attractor."""
     dims, start_dims = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
-    lines = [f"{ds.sizes['attractor']} attractors at {n_points} parameter point{'s' * (n_points != 1)}"]
+    n = ds.sizes["attractor"]
+    lines = [f"{n} attractor{'s' * (n != 1)} at {n_points} parameter point{'s' * (n_points != 1)}"]
     if n_points > FEW_POINTS:
         lines += _summary(ds, rows, dims, _id_summary)
     else:
@@ -205,7 +206,8 @@ def _boundary_lines(one: xr.Dataset) -> list[str]:
     for name, text in _BOUNDARY.items():
         if name in one and np.isfinite(float(one[name])):
             value, error, low, high = (float(one[f"{name}{end}"]) for end in ("", "_stderr", "_low", "_high"))
-            lines.append(f"  {text}: {value:.4g} ± {error:.2g} ({low:.4g} to {high:.4g})")
+            known = f"± {error:.2g} ({low:.4g} to {high:.4g})"
+            lines.append(f"  {text}: {value:.4g} {known if np.isfinite(error) else '(error not known)'}")
     if int(one.get("above_ln2_surely", -1)) == 1:
         lines.append("  the boundary basin entropy exceeds ln 2: the boundary is fractal")
     if int(one.get("wada", -1)) >= 0:
@@ -241,22 +243,24 @@ def hysteresis_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the loops, then the from-to table."""
     n = ds.sizes["loop"]
     lines = [f"{n or 'no'} loop{'s' * (n != 1)}: neighbouring points where up and down meet other attractors"]
-    lines += _table([_loop_words(ds.isel(loop=i)) for i in range(n)])
+    path = ds.attrs["path"]
+    unit = f"{path}{_unit(ds, path)}" if path in ds.coords else path
+    lines += _table([_loop_words(ds.isel(loop=i), unit) for i in range(n)])
     lines.append(f"jumps of the branches: {sum(row['count'] for row in rows) or 'none'}")
     words = [
-        {"direction": r["direction"], "from": f"{r['from']:g}", "to": f"{r['to']:g}",
+        {"direction": r["direction"], f"from {unit}": f"{r['from']:g}", "to": f"{r['to']:g}",
          "ids": f"{r['from_id']} -> {r['to_id']}", "branches": str(r["count"])}
         for r in rows
     ]  # fmt: skip
     return lines + _table(words)
 
 
-def _loop_words(loop: xr.Dataset) -> dict[str, str]:
+def _loop_words(loop: xr.Dataset, unit: str) -> dict[str, str]:
     others = {str(n).removeprefix("loop_at_"): f"{float(loop[n]):g}" for n in loop if "loop_at_" in str(n)}
-    words = {"from": f"{float(loop['loop_from']):g}", "to": f"{float(loop['loop_to']):g}"}
+    words = {f"from {unit}": f"{float(loop['loop_from']):g}", "to": f"{float(loop['loop_to']):g}"}
     for name in ("only_up", "only_down"):
         counts = loop[name].values
-        met = ", ".join(f"{i} ({counts[i]} points)" for i in np.flatnonzero(counts))
+        met = ", ".join(f"{i} ({counts[i]} point{'s' * int(counts[i] != 1)})" for i in np.flatnonzero(counts))
         words[name.replace("_", " ")] = met or "-"
     return others | words | {"points": str(int(loop["loop_points"]))}
 
@@ -284,7 +288,9 @@ def settling_rows(ds: xr.Dataset) -> list[Row]:
 def settling_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the table of bounded sets."""
     n = ds.attrs["lifetimes_n_periods"]
-    lines = [f"bounded sets: {len(rows) or 'none'}; run on for {n} drive periods, which lifetimes are in"]
+    if not rows:
+        return ["bounded sets: none, so there is nothing to run on"]
+    lines = [f"bounded sets: {len(rows)}; run on for {n} drive periods, which lifetimes are in"]
     dims = [str(d) for d in ds["verdict"].dims if d != "attractor"]
     table = []
     for row in rows:

@@ -196,7 +196,7 @@ def _dataset(
         if "state" in ds.coords
         else [str(i) for i in range(ds.sizes["state"])]
     )
-    n_links = next((x.rotation.shape[0] for f in found.values() for x in f.features), 0)
+    n_links = next((x.rotation.shape[0] for f in found.values() for x in f.features), ds.sizes.get("link", 0))
     table = _Table(
         dims, shape, n, {"point": n_points, "state": len(names), "link": n_links, "multiplier": len(names)}
     )

@@ -50,6 +50,10 @@ class _Boxes(NamedTuple):
     n_finished: Ints
 
 
+FEWEST_DRAWN = 5
+"""Fewest boxes that say something about the error of their mean: a single one is never drawn otherwise."""
+
+
 def basin_entropy(
     labels: npt.ArrayLike | xr.DataArray,
     box: int | Sequence[int] = 5,
@@ -91,7 +95,8 @@ def basin_entropy(
         `entropy` and `boundary_entropy` [nat], each with `_stderr`, `_low`, `_high`; `n_boxes`,
         `n_boundary_boxes`, `n_labels`, `fraction_used`, `fraction_unfinished`; `above_ln2`: the boundary
         entropy exceeds ln 2, `above_ln2_surely`: so does the lower end of its interval. Without a
-        boundary box the boundary entropy is NaN. That the boxes are small against the basins is not
+        boundary box the boundary entropy is NaN. Errors are NaN with fewer than `FEWEST_DRAWN` (boundary)
+        boxes, or squares of them, to draw from. That the boxes are small against the basins is not
         validated.
 
     Raises
@@ -114,7 +119,9 @@ def basin_entropy(
     sums = np.stack([_pool(part, block) for part in (boxes.entropy, used, boundary)])
     value = _entropies(sums.sum(axis=1))
     weights = bootstrap_weights(sums.shape[1], resamples, seed)
-    stderr, low, high = spread(np.array([_entropies(sums @ w) for w in weights]), confidence)
+    errors = np.array(spread(np.array([_entropies(sums @ w) for w in weights]), confidence))
+    errors[:, (sums[1:] > 0).sum(axis=1) < FEWEST_DRAWN] = np.nan
+    stderr, low, high = errors
     ds = xr.Dataset()
     long_names = {"entropy": "basin entropy", "boundary_entropy": "boundary basin entropy"}
     for i, (name, long_name) in enumerate(long_names.items()):

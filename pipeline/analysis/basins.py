@@ -244,7 +244,7 @@ def _boundary(
     else:
         for ours, theirs in (("basin_entropy", "entropy"), ("boundary_basin_entropy", "boundary_entropy")):
             yield from _with_errors(entropy, ours, theirs)
-        if entropy["n_boundary_boxes"] > 0:
+        if np.isfinite(entropy["boundary_entropy_low"]):
             yield "above_ln2_surely", int(entropy["above_ln2_surely"])
     try:
         exponent = uncertainty_exponent(grid, method=scaling, **common)

@@ -37,6 +37,8 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
         ``jump_direction`` (1 up, -1 down), ``jump_from_id``, ``jump_to_id``, ``jump_count`` (branches);
         points where a branch has no id are passed over.
 
+        The attribute ``path`` names the axis.
+
     Raises
     ------
     ValueError
@@ -79,6 +81,7 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
         result.assign(_loops(present, differs, along, order, ids))
         .assign(_jumps(values, direction, along))
         .transpose(*dims, ...)
+        .assign_attrs(path=path)
     )
 
 

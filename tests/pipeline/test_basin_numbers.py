@@ -547,3 +547,21 @@ def test_wada_merge_test__refuses():
         wada_merge_test([[0, 1], [2, 0]], [0, 3])
     with pytest.raises(ValueError, match="'euclidean'"):
         wada_merge_test([[0, 1], [2, 0]], metric="euclidean")
+
+
+def test_basin_entropy__few_boxes_have_no_error():
+    """Three labels in one box exceed ln 2, and one box proves nothing."""
+    one = np.arange(25).reshape(5, 5) % 3
+    found = basin_entropy(one, 5)
+    assert found["above_ln2"]
+    assert not found["above_ln2_surely"]
+    assert np.isnan([found[f"{name}_stderr"] for name in ("entropy", "boundary_entropy")]).all()
+    # twenty boxes, four of them on the boundary
+    four = np.zeros((100, 5), int)
+    four[:20] = np.tile(one, (4, 1))
+    found = basin_entropy(four, 5)
+    assert np.isfinite(found["entropy_stderr"])
+    assert np.isnan(found["boundary_entropy_low"])
+    assert not found["above_ln2_surely"]
+    many = basin_entropy(np.tile(one, (8, 1)), 5)
+    assert many["above_ln2_surely"]
