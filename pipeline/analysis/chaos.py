@@ -38,8 +38,8 @@ _GROUPS = {**{m.name.lower(): (m,) for m in _MOTIONS}, "all_chaotic": (Motion.CH
 KINDS = tuple(_GROUPS)
 """Coordinate `kind`: names of `Motion`, and chaotic or hyperchaotic together."""
 
-FEWEST_BLOCKS = 8
-"""Blocks from which a transient can be told: two in each quarter, so that they have errors."""
+FEWEST_BLOCKS = 12
+"""Blocks from which a transient can be told: three in each quarter, so that they have errors."""
 
 
 def chaos(
@@ -68,9 +68,10 @@ def chaos(
         ``audit`` [1/s]
             As in the cube and in `summarise`.
         ``is_transient``
-            1 if the motion was chaotic and is not any more: the mean of the largest exponent is positive
-            over the first quarter of the blocks and negative over the last, by `n_sigma` standard errors
-            and `least`. 0 if not, -1 if unknown (no exponents, or fewer than 8 blocks).
+            1 if the motion was chaotic and is not any more: the mean of the largest exponent is above
+            `least` over the first quarter of the blocks, below ``-least`` over the last, and the two differ
+            by `n_sigma` standard errors. 0 if not, or if the chaos ended in the last quarter or early in the
+            first; -1 if unknown (no exponents, or fewer than 12 blocks).
         ``kaplan_yorke_dimension``, ``kaplan_yorke_dimension_stderr``
             Of the section, see `kaplan_yorke_dimension`.
         ``zero_one``, ``zero_one_stderr``, ``zero_one_half``, ``zero_one_low``, ``zero_one_high``,
@@ -193,15 +194,11 @@ def _is_transient(blocks: xr.DataArray, known: xr.DataArray, n_sigma: float, lea
     if first.sizes["block"] < FEWEST_BLOCKS:
         return xr.full_like(known, -1, dtype=np.int8).assign_attrs(attrs)
     early, late = first.isel(block=slice(quarter)), first.isel(block=slice(-quarter, None))
-    began = early.mean("block") > _margin(early, n_sigma, least)
-    ended = late.mean("block") < -_margin(late, n_sigma, least)
-    return (began & ended).astype(np.int8).where(known, np.int8(-1)).assign_attrs(attrs)
-
-
-def _margin(blocks: xr.DataArray, n_sigma: float, least: float) -> xr.DataArray:
-    error = blocks.std("block", ddof=1) / np.sqrt(blocks.sizes["block"])
-    margin: xr.DataArray = np.maximum(n_sigma * error, least)
-    return margin
+    before, after = early.mean("block"), late.mean("block")
+    error = np.sqrt((early.var("block", ddof=1) + late.var("block", ddof=1)) / quarter)
+    # not each by its own error: the blocks of an orbit with complex multipliers swing widely
+    ended = (before > least) & (after < -least) & (before - after > n_sigma * error)
+    return ended.astype(np.int8).where(known, np.int8(-1)).assign_attrs(attrs)
 
 
 # ---- means by kind of motion -------------------------------------------------------------------

@@ -97,7 +97,16 @@ def test_chaos__transients_and_drift():
     assert found.is_transient.values.tolist() == [1, 0, 0]
     row = found.sel(kind="chaotic")
     assert (int(row.n_transient), int(row.n_drifting), int(row.n_cells)) == (1, 2, 3)
-    few = chaos(cube.isel(block=slice(0, 7)))
+    # an orbit with complex multipliers, on which chaos ends: means of -0.1 among swings of 0.2
+    cube["lyapunov_blocks"][0, 2, 8:, 0] = -0.1 + 0.2 * np.resize([1.0, -1.0], 8)
+    assert chaos(cube).is_transient.values.tolist() == [[1, 0, 1]]
+    # lasting chaos that is weaker at the end, and an orbit from the beginning
+    cube["lyapunov_blocks"][0, 0, 12:, 0] = 0.02
+    cube["lyapunov_blocks"][0, 2, :, 0] = -0.1 + 0.2 * np.resize([1.0, -1.0], 16)
+    # and one about zero, whose swings are no evidence
+    cube["lyapunov_blocks"][0, 1, :, 0] = np.linspace(0.05, -0.05, 16) + 0.4 * np.resize([1.0, -1.0], 16)
+    assert chaos(cube).is_transient.values.tolist() == [[0, 0, 0]]
+    few = chaos(cube.isel(block=slice(0, 11)))
     assert few.is_transient.values.tolist() == [[-1, -1, -1]]
 
 
@@ -314,6 +323,8 @@ def test_plot_convergence__lines_bands_and_transients():
     assert band.get_y() + 0.5 * band.get_height() == pytest.approx(0.33 / 2.0)
     assert band.get_height() == pytest.approx(2 * np.sqrt(0.0018 / 2) / 2.0)
     assert len(artists(fig, "running:regular")) == 1
+    assert fig.data["exponent_stderr"].values == pytest.approx(0.01)
+    assert artists(fig, "band:regular")[0].get_height() == pytest.approx(2 * 0.01)
     below = artists(fig, "in_block")
     assert below[0].get_ydata() == pytest.approx(blocks)
     assert below[0].get_xdata()[:2].tolist() == [10.0, 30.0]
