@@ -104,7 +104,10 @@ def test_chaos__transients_and_drift():
     cube["lyapunov_blocks"][0, 0, 12:, 0] = 0.02
     cube["lyapunov_blocks"][0, 2, :, 0] = -0.1 + 0.2 * np.resize([1.0, -1.0], 16)
     # and one about zero, whose swings are no evidence
-    cube["lyapunov_blocks"][0, 1, :, 0] = np.linspace(0.05, -0.05, 16) + 0.4 * np.resize([1.0, -1.0], 16)
+    step = np.repeat([0.1, -0.1], 8)  # 2 standard errors of the difference
+    cube["lyapunov_blocks"][0, 1, :, 0] = step + 0.12 * np.resize([1.0, -1.0], 16)
+    # an orbit that is approached along a slower direction first
+    cube["lyapunov_blocks"][0, 0, :, 0] = np.repeat([-0.01, -0.3], 8) + 1e-3 * np.resize([1.0, -1.0], 16)
     assert chaos(cube).is_transient.values.tolist() == [[0, 0, 0]]
     few = chaos(cube.isel(block=slice(0, 11)))
     assert few.is_transient.values.tolist() == [[-1, -1, -1]]
