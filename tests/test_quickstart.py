@@ -14,6 +14,7 @@ import pytest
 import pipeline
 from magpend_core import Status
 from pipeline.analysis.sides import Side, side
+from pipeline.run import shipped_workflows
 
 # see tests/core/data/README.md for where these points come from
 ORBITS = json.loads((Path(__file__).parent / "core" / "data" / "orbits.json").read_text("utf-8"))
@@ -118,7 +119,7 @@ def test_plot__without_kernel(directory, tmp_path):
     assert plotted.read_bytes() == (directory / "figures" / "bifurcation_psi1.png").read_bytes()
 
 
-@pytest.mark.parametrize("name", ["quickstart", "fig12", "fig13", "fig14"])
+@pytest.mark.parametrize("name", shipped_workflows())
 def test_workflow__smoke(name, tmp_path):
     done = magpend("run", name, "--smoke", "--out", tmp_path / name, "--workers", "0")
     assert done.returncode == 0, done.stderr

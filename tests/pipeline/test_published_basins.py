@@ -10,65 +10,13 @@ import xarray as xr
 from scipy.integrate import solve_ivp
 
 from magpend_core import polish_orbits, run_branches
-from magpend_core.jit import inline
-from magpend_core.system import System
-from magpend_core.vecmath import TWO_PI, sincos
+from magpend_core.vecmath import TWO_PI
 from pipeline.analysis.attractors import identify
 from pipeline.analysis.basin_numbers import basin_fractions
 
 UNIT_FREQUENCY = 1.0 / TWO_PI  # forcing cos t
 
 
-@inline
-def _constants(frequency, p, out):
-    out[0] = p[0]
-    out[1] = p[1]
-    out[2] = TWO_PI * frequency
-
-
-@inline
-def _forcing(t, c):
-    return c[1] * sincos(c[2] * t)[1]
-
-
-@inline
-def _rhs(y, u, c):
-    return y[1], u - c[0] * y[1] + y[0] - y[0] * y[0] * y[0]
-
-
-@inline
-def _no_edges(frequency, p, times, half_widths, jumps):
-    return
-
-
-@inline
-def _no_layers(y, dy, c):
-    return ()
-
-
-@inline
-def _jacobian(y, u, c):
-    zero = 0.0 * y[0]
-    return zero, zero + 1.0, 1.0 - 3.0 * y[0] * y[0], zero - c[0]
-
-
-DUFFING = System(
-    name="duffing",
-    state_names=("x", "v"),
-    is_angle=(False, False),
-    scales=(1.0, 1.0),
-    parameter_names=("damping", "amplitude"),
-    n_constants=3,
-    constants=_constants,
-    forcing=_forcing,
-    rhs=_rhs,
-    n_edges=0,
-    edges=_no_edges,
-    layers=_no_layers,
-    jacobian=_jacobian,
-    escape=(1e3, 1e3),
-    has_layers=False,
-)
 TWO_WELLS = np.array([0.15, 0.2])  # x'' = .2 cos t + x - x^3 - .15 x'
 
 # recomputed independently, also in issue 139 of DynamicalSystemsBase.jl
@@ -109,26 +57,26 @@ STARTS = grid(60, (-2.2, 2.2), (-2.2, 2.2))
 
 
 @pytest.fixture(scope="module")
-def two_wells():
+def two_wells(duffing):
     """The starts integrated until their orbits close, as a cube."""
     n = len(STARTS)
     result = run_branches(
-        np.broadcast_to(TWO_WELLS, (n, 1, 2)), np.full((n, 1), UNIT_FREQUENCY), STARTS, system=DUFFING,
+        np.broadcast_to(TWO_WELLS, (n, 1, 2)), np.full((n, 1), UNIT_FREQUENCY), STARTS, system=duffing,
         n_transient=400, n_keep=16, rtol=1e-8, atol=1e-8, stop_when_closed=True, max_orbit_period=4,
     )  # fmt: skip
-    return cube_of(result, DUFFING, UNIT_FREQUENCY)
+    return cube_of(result, duffing, UNIT_FREQUENCY)
 
 
 @pytest.fixture(scope="module")
-def found_wells(two_wells):
-    return identify(two_wells, system=DUFFING, parameters=TWO_WELLS)
+def found_wells(two_wells, duffing):
+    return identify(two_wells, system=duffing, parameters=TWO_WELLS)
 
 
-def test_polish_orbits__duffing_from_sections_of_the_grid(two_wells):
+def test_polish_orbits__duffing_from_sections_of_the_grid(two_wells, duffing):
     guesses = two_wells["section"].values[[0, -1, 1800], -1]
     n = len(guesses)
     orbits = polish_orbits(
-        np.tile(TWO_WELLS, (n, 1)), np.full(n, UNIT_FREQUENCY), guesses, np.ones(n, int), system=DUFFING
+        np.tile(TWO_WELLS, (n, 1)), np.full(n, UNIT_FREQUENCY), guesses, np.ones(n, int), system=duffing
     )
     nearest = np.abs(orbits.section[:, None] - POINTS).max(axis=-1).min(axis=1)
     assert orbits.converged.all()

@@ -13,11 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from magpend_core import Status
-from magpend_core.jit import inline
 from magpend_core.pendulum import PENDULUM_FITTED
 from magpend_core.sections import run_branches
-from magpend_core.system import System
-from magpend_core.vecmath import sincos
 from pipeline import open_run
 from pipeline.cells import CellMap
 from pipeline.identity import identity_of
@@ -179,52 +176,11 @@ def test_orbits__cyclic_sets_on_the_circle_with_turns():
 # ---- Duffing oscillator ------------------------------------------------------------------------
 
 
-@inline
-def _constants(frequency, p, out):
-    out[0] = p[0]
-    out[1] = p[1]
-    out[2] = 2.0 * np.pi * frequency
-
-
-@inline
-def _forcing(t, c):
-    return c[1] * sincos(c[2] * t)[1]
-
-
-@inline
-def _rhs(y, u, c):
-    x, v = y
-    return v, u - c[0] * v + x - x * x * x
-
-
-@inline
-def _no_edges(frequency, p, times, half_widths, jumps):
-    return
-
-
-@inline
-def _no_layers(y, dy, c):
-    return ()
-
-
-@inline
-def _jacobian(y, u, c):
-    zero = 0.0 * y[0]
-    return (zero, zero + 1.0, zero + 1.0 - 3.0 * y[0] * y[0], zero - c[0])
-
-
-TWO_WELLS = System(
-    name="two_wells", state_names=("x", "v"), is_angle=(False, False), scales=(1.0, 1.0),
-    parameter_names=("damping", "amplitude"), n_constants=3, constants=_constants, forcing=_forcing,
-    rhs=_rhs, n_edges=0, edges=_no_edges, layers=_no_layers, jacobian=_jacobian, escape=(1e3, 1e3),
-    has_layers=False,
-)  # fmt: skip
-"""x'' = x - x^3 - damping x' + amplitude cos(2 pi f t): an orbit in each well."""
 TOLERANCE = 1e-4
 
 
-def two_wells(n):
-    """Function that integrates cells of an n x n grid by their flat indices."""
+def two_wells(n, system):
+    """Function that integrates cells of an n x n grid of the Duffing oscillator by their flat indices."""
     x = np.linspace(-2.0, 2.0, n)
     starts = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -232,24 +188,24 @@ def two_wells(n):
         result = run_branches(
             np.broadcast_to([0.25, 0.08], (len(cells), 1, 2)), np.full((len(cells), 1), 0.2), starts[cells],
             n_transient=200, n_keep=4, rtol=1e-6, atol=1e-6, stop_when_closed=True,
-            closure_tolerance=TOLERANCE, max_orbit_period=4, system=TWO_WELLS,
+            closure_tolerance=TOLERANCE, max_orbit_period=4, system=system,
         )  # fmt: skip
         return {v.name: getattr(result, v.name)[:, 0] for v in VARIABLES}
 
     return integrate
 
 
-def test_infer__duffing_against_the_full_grid():
+def test_infer__duffing_against_the_full_grid(duffing):
     n = 96
-    integrate, asked = two_wells(n), []
+    integrate, asked = two_wells(n, duffing), []
 
     def counted(cells):
         asked.extend(cells)
         return integrate(cells)
 
     full = integrate(np.arange(n * n))
-    found = infer((n, n), 8, counted, closure_tolerance=TOLERANCE, system=TWO_WELLS)
-    orbits = Orbits(SAME * TOLERANCE, TWO_WELLS)
+    found = infer((n, n), 8, counted, closure_tolerance=TOLERANCE, system=duffing)
+    orbits = Orbits(SAME * TOLERANCE, duffing)
     labels = orbits.classes(full)
     assert set(np.unique(labels)) == {0, 1}
     inferred = found["status"] == Status.INFERRED
