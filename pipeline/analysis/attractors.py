@@ -186,24 +186,11 @@ def _flags(words: str) -> dict[str, Any]:
 def _dataset(
     ds: xr.Dataset, start_dims: tuple[str, ...], found: Mapping[tuple[int, ...], Found], options: Options
 ) -> xr.Dataset:
+    """Result of `identify`, in the schema of the module."""
     dims, _ = split_dims(ds["status"])
     shape = tuple(ds.sizes[d] for d in dims)
-    n = max((len(f.features) for f in found.values()), default=0)
-    longest = max((len(x.points) for f in found.values() for x in f.features), default=0)
-    n_points = max(options.n_points, longest)
-    names = (
-        [str(s) for s in ds["state"].values]
-        if "state" in ds.coords
-        else [str(i) for i in range(ds.sizes["state"])]
-    )
-    n_links = next((x.rotation.shape[0] for f in found.values() for x in f.features), ds.sizes.get("link", 0))
-    table = _Table(
-        dims, shape, n, {"point": n_points, "state": len(names), "link": n_links, "multiplier": len(names)}
-    )
-    for index, one in found.items():
-        total = one.label.size
-        for i, x in enumerate(one.features):
-            table.fill((*index, i), x, one.counts[i], total)
+    table = _filled(ds, dims, shape, found, options)
+    n = table.n
     result = xr.Dataset(table.variables())
     cell_dims = (*dims, *start_dims)
     cell_shape = (*shape, *(ds.sizes[d] for d in start_dims))
@@ -229,6 +216,30 @@ def _dataset(
         f"identify_{k}": int(v) if isinstance(v, bool) else v for k, v in settings.items() if k != "rule"
     }
     return result.assign_attrs({**kept, **settings, "matched": 0})
+
+
+def _filled(
+    ds: xr.Dataset, dims: tuple[str, ...], shape: tuple[int, ...],
+    found: Mapping[tuple[int, ...], Found], options: Options,
+) -> _Table:  # fmt: skip
+    """Table of the attractors of all parameter points."""
+    n = max((len(f.features) for f in found.values()), default=0)
+    longest = max((len(x.points) for f in found.values() for x in f.features), default=0)
+    n_points = max(options.n_points, longest)
+    names = (
+        [str(s) for s in ds["state"].values]
+        if "state" in ds.coords
+        else [str(i) for i in range(ds.sizes["state"])]
+    )
+    n_links = next((x.rotation.shape[0] for f in found.values() for x in f.features), ds.sizes.get("link", 0))
+    table = _Table(
+        dims, shape, n, {"point": n_points, "state": len(names), "link": n_links, "multiplier": len(names)}
+    )
+    for index, one in found.items():
+        total = one.label.size
+        for i, x in enumerate(one.features):
+            table.fill((*index, i), x, one.counts[i], total)
+    return table
 
 
 def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
@@ -279,7 +290,7 @@ class _Table:
     def __init__(
         self, dims: tuple[str, ...], shape: tuple[int, ...], n: int, sizes: Mapping[str, int]
     ) -> None:
-        self._dims = (*dims, "attractor")
+        self._dims, self.n = (*dims, "attractor"), n
         self.arrays = {
             name: np.full((*shape, n, *(sizes[d] for d in own)), fill, dtype)
             for name, (own, dtype, fill, _, _) in _TABLE.items()
