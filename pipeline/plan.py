@@ -21,8 +21,8 @@ MICROSECONDS_PER_PERIOD, MICROSECONDS_PER_SECOND = 9.0, 21.5
 """Rule of thumb for one trajectory on one core at rtol 1e-8: a period of length T takes
 9 us + 21.5 us T/s (measured between 0.1 and 3 Hz on AVX-512, good to 20 %)."""
 
-TANGENT_COST = 1.9
-"""A period with all tangent vectors in units of one without (1.5 for one vector)."""
+TANGENT_COST = 2.0
+"""A period with all tangent vectors in units of one without (1.6 for one vector)."""
 
 RTOL_OF_RULE = 1e-8
 ROOT = 6

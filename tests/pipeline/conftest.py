@@ -155,6 +155,8 @@ def start(tmp_path, environment):
     import signal
 
     running = []
+    # a shell lets background jobs ignore Ctrl-C, and children inherit that
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def begin(*arguments):
         process = subprocess.Popen(
@@ -170,6 +172,7 @@ def start(tmp_path, environment):
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import tomllib
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magpend_core import Status
@@ -316,6 +316,7 @@ def refined_text(shape, stride, extra=""):
     )
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.integers(16, 70), min_size=1, max_size=4),
     st.sampled_from([2, 4, 8, 16]),
@@ -331,7 +332,8 @@ def test_make_plan__tiles(shape, stride, wanted):
         assert plan.chunks(variable)[: len(plan.block)] == plan.block
     cut = [side for side, n in zip(plan.block[1:], shape, strict=True) if side < n]
     if cut and wanted is None:
-        assert max(cut) <= 2 * min(cut)
+        # sides grow in turns, then are made equal along each axis, in whole strides
+        assert max(cut) <= 2 * min(cut) + stride
 
 
 def test_make_plan__near_square_tiles_of_enough_lattice_cells():
