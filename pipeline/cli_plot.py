@@ -123,7 +123,7 @@ def basins(
         periods = open_run(directory)["n_periods"] if shade else None
         return plot_basins(found, at=_positions(at, degrees), degrees=degrees, n_periods=periods)
 
-    _draw_attractors(directory, "basins", draw, options, out, file_format)
+    _draw_attractors(directory, "basins", draw, options, out, file_format, at)
 
 
 @plot_app.command(epilog=EXIT_HELP)
@@ -138,7 +138,7 @@ def fractions(
 
         return plot_fractions(found, at=_positions(at))
 
-    _draw_attractors(directory, "fractions", draw, options, out, file_format)
+    _draw_attractors(directory, "fractions", draw, options, out, file_format, at)
 
 
 @plot_app.command(epilog=EXIT_HELP)
@@ -157,7 +157,7 @@ def gallery(
 
         return plot_gallery(found, portraits(found, at=_positions(at)))
 
-    _draw_attractors(directory, "gallery", draw, options, out, file_format)
+    _draw_attractors(directory, "gallery", draw, options, out, file_format, at)
 
 
 @plot_app.command(epilog=EXIT_HELP)
@@ -181,7 +181,7 @@ def attractors(
         loops = derived.hysteresis(directory, echo=typer.echo, **options) if both else None
         return plot_coexisting(found, state=state.value, at=_positions(at), degrees=degrees, hysteresis=loops)
 
-    _draw_attractors(directory, f"attractors_{state.value}", draw, options, out, file_format)
+    _draw_attractors(directory, f"attractors_{state.value}", draw, options, out, file_format, at)
 
 
 @plot_app.command(epilog=EXIT_HELP)
@@ -201,7 +201,7 @@ def regimes(
 
         return plot_regimes(found, show=show.value, at=_positions(at))
 
-    _draw_attractors(directory, f"regimes_{show.value}", draw, options, out, file_format)
+    _draw_attractors(directory, f"regimes_{show.value}", draw, options, out, file_format, at)
 
 
 class Per(StrEnum):
@@ -229,9 +229,10 @@ def lyapunov(
 ) -> None:
     """Draw Lyapunov exponents, under the bifurcation diagram or as a map over two parameters."""
     from pipeline import open_run
-    from pipeline.plots import plot_lyapunov, plot_lyapunov_map, save_data, save_figure
+    from pipeline.plots import plot_lyapunov, plot_lyapunov_map
 
-    target = figure_target(directory, "lyapunov_map" if as_map else "lyapunov", out, file_format)
+    name = "lyapunov_map" if as_map else "lyapunov_spectrum" if spectrum else "lyapunov"
+    target = figure_target(directory, name, out, file_format, at)
     ds, chosen = open_run(directory), _positions(at)
     with refusals(directory):
         if as_map:
@@ -240,9 +241,7 @@ def lyapunov(
             figure = plot_lyapunov(
                 ds, spectrum=spectrum, per=per.value, state=state.value, degrees=degrees, at=chosen
             )
-    target.parent.mkdir(exist_ok=True)
-    typer.echo(f"figure: {save_figure(figure, target)}")
-    typer.echo(f"data: {save_data(figure, target)}")
+    _write(figure, target)
 
 
 @plot_app.command(epilog=EXIT_HELP)
@@ -256,15 +255,13 @@ def convergence(
 ) -> None:
     """Draw how the Lyapunov exponents of the cells of one parameter point converge."""
     from pipeline import open_run
-    from pipeline.plots import plot_convergence, save_data, save_figure
+    from pipeline.plots import plot_convergence
 
-    target = figure_target(directory, f"convergence_{exponent}", out, file_format)
+    target = figure_target(directory, f"convergence_{exponent}", out, file_format, at)
     chosen, ds = _positions(at), open_run(directory)
     with refusals(directory):
         figure = plot_convergence(ds, exponent=exponent, per=per.value, at=chosen)
-    target.parent.mkdir(exist_ok=True)
-    typer.echo(f"figure: {save_figure(figure, target)}")
-    typer.echo(f"data: {save_data(figure, target)}")
+    _write(figure, target)
 
 
 @plot_app.command(epilog=EXIT_HELP)
@@ -273,10 +270,10 @@ def dimension(
     directory: Directory, at: At = None, out: Out = None, file_format: FileFormat = None, **options: Any
 ) -> None:
     """Draw the correlation sum of the chaotic sections of one parameter point, with fit and local slope."""
-    target = figure_target(directory, "dimension", out, file_format)
+    target = figure_target(directory, "dimension", out, file_format, at)
     from pipeline import derived, open_run
     from pipeline.analysis.selection import select_points
-    from pipeline.plots import plot_dimension, save_data, save_figure
+    from pipeline.plots import plot_dimension
 
     chosen = _positions(at)
     with refusals(directory):
@@ -286,9 +283,7 @@ def dimension(
     found = derived.dimension(directory, at=chosen, echo=typer.echo, **options)
     with refusals(directory):
         figure = plot_dimension(found)
-    target.parent.mkdir(exist_ok=True)
-    typer.echo(f"figure: {save_figure(figure, target)}")
-    typer.echo(f"data: {save_data(figure, target)}")
+    _write(figure, target)
 
 
 def _draw_attractors(
@@ -298,15 +293,22 @@ def _draw_attractors(
     options: dict[str, Any],
     out: Path | None,
     file_format: Format | None,
+    at: list[str] | None,
 ) -> None:
     """Draw a figure of a run's attractors, finding them first if that was not done, and write its data."""
-    target = figure_target(directory, name, out, file_format)
+    target = figure_target(directory, name, out, file_format, at)
     from pipeline import derived
-    from pipeline.plots import save_data, save_figure
 
     found = derived.attractors(directory, echo=typer.echo, **options)
     with refusals(directory):
         figure = draw(found)
+    _write(figure, target)
+
+
+def _write(figure: DataFigure, target: Path) -> None:
+    """Write a figure and its data, and say where."""
+    from pipeline.plots import save_data, save_figure
+
     target.parent.mkdir(exist_ok=True)
     typer.echo(f"figure: {save_figure(figure, target)}")
     typer.echo(f"data: {save_data(figure, target)}")
@@ -321,11 +323,16 @@ def _positions(at: list[str] | None, degrees: bool = False) -> dict[str, float]:
     return {name: math.radians(value) if name in turned else value for name, value in found.items()}
 
 
-def figure_target(directory: Path, name: str, out: Path | None, file_format: Format | None) -> Path:
-    """Return where a figure goes: `out`, or a file of that name in the run's folder of figures."""
+def figure_target(
+    directory: Path, name: str, out: Path | None, file_format: Format | None, at: list[str] | None = None
+) -> Path:
+    """Return where a figure goes: `out`, or a file in the run's folder of figures, named by what it shows."""
     suffix = f".{(file_format or Format.PNG).value}"
     if out is None:
-        return directory / "figures" / f"{name}{suffix}"
+        chosen = "".join(
+            f"_{axis}_{value:g}" for axis, value in read_pairs("--at", at or [], "q=1.5").items()
+        )
+        return directory / "figures" / f"{name}{chosen}{suffix}"
     target = out.with_name(out.name + suffix) if file_format and out.suffix.lower() != suffix else out
     check_figure_path(target)
     return target

@@ -13,9 +13,12 @@ import xarray as xr
 from scipy.optimize import linear_sum_assignment
 
 from magpend_core.pendulum import PENDULUM_FITTED
-from pipeline.analysis.sets import Geometry, mean_distance, order_by_points
+from pipeline.analysis.sets import Geometry, hausdorff_distance, mean_distance, order_by_points
 
 _PER_ATTRACTOR = "attractor"
+
+OTHER_FAMILY = 3.0
+"""Weight of the distance between orbits whose periods no doubling connects, or an orbit and a bounded set."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,7 @@ class _Seen:
 
     points: np.ndarray
     rotation: np.ndarray
+    family: int
 
 
 def match(
@@ -36,9 +40,12 @@ def match(
     such appearance. The assignment minimises the sum of the distances, a distance beyond the threshold
     (and no partner at all) costing the threshold (Hungarian algorithm). The distance is the mean
     distance of the stored points from those of the other set, the larger of both directions, plus the
-    difference of the mean rotations in turns per drive period. What is not assigned within the
-    threshold gets the next new id; new ids at one point come in lexicographic order of the attractors'
-    least section points. So ids depend on the attractors alone.
+    difference of the mean rotations in turns per drive period. Between a closed orbit and a bounded set,
+    and between orbits whose periods no doubling connects (3 and 7, but not 3 and 6), it is three times
+    the largest distance instead of the mean one: narrow bands of chaos keep the id of the orbit that they
+    sprang from, an orbit inside of wide chaos does not get that of the chaos. What is not assigned within
+    the threshold gets the next new id; new ids at one point come in lexicographic order of the
+    attractors' least section points. So ids depend on the attractors alone.
 
     Parameters
     ----------
@@ -88,7 +95,11 @@ def match(
 
 def _seen(attractors: xr.Dataset, at: tuple[Any, ...]) -> _Seen:
     points = attractors["attractor_points"].values[at]
-    return _Seen(points[np.isfinite(points).all(axis=-1)], attractors["rotation"].values[at])
+    points = points[np.isfinite(points).all(axis=-1)]
+    period = int(attractors["orbit_period"].values[at])
+    # periods p, 2p, 4p ... belong to one cascade: the odd part tells; 0 for bounded sets
+    family = period // (period & -period) if period else 0
+    return _Seen(points, attractors["rotation"].values[at], family)
 
 
 def _known(
@@ -126,8 +137,10 @@ def _assign(
 
 
 def _distance(a: _Seen, b: _Seen, geometry: Geometry) -> float:
-    turned = np.abs(a.rotation - b.rotation)
-    return mean_distance(a.points, b.points, geometry) + float(np.nan_to_num(turned).max(initial=0.0))
+    turned = float(np.nan_to_num(np.abs(a.rotation - b.rotation)).max(initial=0.0))
+    if a.family == b.family:
+        return mean_distance(a.points, b.points, geometry) + turned
+    return OTHER_FAMILY * hausdorff_distance(a.points, b.points, geometry) + turned
 
 
 def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple[str, ...]) -> xr.Dataset:

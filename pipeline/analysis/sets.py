@@ -131,6 +131,11 @@ def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
     return float(max(there.mean(), back.mean()))
 
 
+def hausdorff_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
+    """Largest distance of a state of either set from the other set."""
+    return float(max(nearest_distances(a, b, geometry).max(), nearest_distances(b, a, geometry).max()))
+
+
 def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
     """Canonical order of sets: lexicographic by the rounded least point of each.
 

@@ -243,6 +243,7 @@ def rows(*points, rotation=None):
     return xr.Dataset(
         {
             "kind": (dims, kind),
+            "orbit_period": (dims, (kind == 1).astype(np.int32)),
             "attractor_points": ((*dims, "point", "state"), section),
             "rotation": ((*dims, "link"), turned),
             "mirror_partner": (dims, np.where(kind > 0, np.arange(n)[::-1], -1).astype(np.int32)),
@@ -342,3 +343,35 @@ def test_identify__largest_exponent_of_bounded_sets_is_that_of_their_good_cells(
     assert np.isnan(
         identify(ds.drop_vars("lyapunov"), polish=False, rule=Rule(box=0.5))["lyapunov_max"]
     ).all()
+
+
+@pytest.mark.parametrize(
+    ("periods", "width", "same"),
+    [
+        ((3, 6), 0.2, True),  # a doubling, points up to 0.2 apart
+        ((3, 7), 0.2, False),
+        ((3, 7), 0.05, True),  # three times 0.05 is within the threshold
+        ((3, 0), 0.2, False),  # an orbit inside of wide chaos
+        ((3, 0), 0.05, True),  # narrow bands of chaos
+        ((0, 0), 0.2, True),
+    ],
+)
+def test_match__orbits_that_no_doubling_connects_and_chaos_are_held_farther_apart(periods, width, same):
+    centres = np.array([[0.0, 0.0], [0.4, 1.0], [-0.3, -2.0]])
+    points = np.full((2, 1, 12, 4), np.nan)
+    points[0, 0, :3, :2] = centres
+    points[1, 0, :, :2] = np.repeat(centres, 4, axis=0)
+    points[1, 0, ::4, 0] += width  # a quarter of the points
+    points[..., 2:] = np.where(np.isfinite(points[..., :1]), 0.0, np.nan)
+    ds = xr.Dataset(
+        {
+            "attractor_points": (("frequency", "attractor", "point", "state"), points),
+            "rotation": (("frequency", "attractor", "link"), np.zeros((2, 1, 2))),
+            "kind": (("frequency", "attractor"), [[1], [1 if periods[1] else 2]]),
+            "orbit_period": (("frequency", "attractor"), np.array(periods)[:, None]),
+            "attractor_id": (("frequency", "initial_condition"), np.zeros((2, 1), np.int32)),
+        },
+        coords={"frequency": [2.0, 2.1]},
+    )
+    ds["kind"][0, 0] = 1 if periods[0] else 2
+    assert match(ds).sizes["attractor"] == (1 if same else 2)

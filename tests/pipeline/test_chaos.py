@@ -358,7 +358,7 @@ def test_commands__dimension_and_figures(main, run):
     assert main("analyse", run, "dimension", "--at", "frequency=2.4")[1].startswith("dimension: taken from")
     code, out, err = main("plot", "convergence", run, "--at", "frequency=2.4")
     assert (code, err) == (0, "")
-    with xr.open_dataset(run / "figures" / "convergence_1.nc", engine="scipy") as stored:
+    with xr.open_dataset(run / "figures" / "convergence_1_frequency_2.4.nc", engine="scipy") as stored:
         assert stored["period"].values[-1] == 400.0
     code, out, err = main("plot", "dimension", run, "--at", "frequency=2.4")
     assert (code, err) == (0, "")

@@ -35,12 +35,16 @@ def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
         "basins": [*both, "--degrees", "--shade"], "fractions": one, "gallery": both,
         "attractors": [*one, "--state", "psi2"], "regimes": ["--show", "number"],
     }  # fmt: skip
-    names = {"attractors": "attractors_psi2", "regimes": "regimes_number"}
+    names = {
+        "basins": "basins_q_1.5_frequency_2.6", "fractions": "fractions_q_1.5",
+        "gallery": "gallery_q_1.5_frequency_2.6", "attractors": "attractors_psi2_q_1.5",
+        "regimes": "regimes_number",
+    }  # fmt: skip
     for verb, options in figures.items():
         code, out, err = main("plot", verb, "run", *options)
         assert code == 0, err
         assert ("attractors: computed" in out) == (verb == "basins")
-        name = names.get(verb, verb)
+        name = names[verb]
         assert out.splitlines()[-2:] == [f"figure: run/figures/{name}.png", f"data: run/figures/{name}.nc"]
         assert (tmp_path / "run" / "figures" / f"{name}.png").stat().st_size > 5000
         with xr.open_dataset(tmp_path / "run" / "figures" / f"{name}.nc", engine="scipy") as stored:
