@@ -330,7 +330,7 @@ def figure_target(
     suffix = f".{(file_format or Format.PNG).value}"
     if out is None:
         chosen = "".join(
-            f"_{axis}_{value:g}" for axis, value in read_pairs("--at", at or [], "q=1.5").items()
+            f"_{axis}_{value:g}" for axis, value in read_pairs("--at", at or [], "frequency=2.2").items()
         )
         return directory / "figures" / f"{name}{chosen}{suffix}"
     target = out.with_name(out.name + suffix) if file_format and out.suffix.lower() != suffix else out
