@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.lines import Line2D
-from matplotlib.ticker import AutoMinorLocator
+from matplotlib.ticker import AutoMinorLocator, MaxNLocator
 
 from pipeline.analysis.lyapunov import GOOD
 from pipeline.analysis.sides import side
@@ -262,6 +262,8 @@ def _draw_map(ax: Axes, data: xr.Dataset, part: xr.Dataset, swept: list[str]) ->
     ax.set_ylabel(style.parameter_label(part[swept[1]]), fontsize=style.LABEL_PT)
     bar = fig.colorbar(ScalarMappable(norm, "PuOr_r"), cax=fig.add_axes((0.845, 0.12, 0.022, 0.835)))
     bar.ax.tick_params(labelsize=style.TICK_PT, width=style.LINE_PT)
+    ticks = [MaxNLocator(4).tick_values(*ends) for ends in ((norm.vmin, 0.0), (0.0, norm.vmax))]
+    bar.set_ticks([t for t in np.unique(np.concatenate(ticks)) if norm.vmin <= t <= norm.vmax])
     unit = "drive period" if data["exponent_value"].attrs["per"] == "drive period" else "s"
     bar.set_label(f"largest exponent [1/{unit}]", fontsize=style.LABEL_PT)
 
