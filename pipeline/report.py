@@ -395,12 +395,12 @@ def _exponent_table(rows: Sequence[Row]) -> list[str]:
 
 
 def _with_error(value: float, error: float) -> str:
-    """Value and standard error, both to two digits of the error."""
+    """Value and standard error, both to two digits of the error, of the value six decimals at most."""
     if not np.isfinite(value):
         return "-"
-    if not (np.isfinite(error) and error > 0.0):
-        return f"{value:.4g}"
-    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
+    if not (np.isfinite(error) and error >= 1e-6):
+        return f"{value:.6g}"
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 6))
     return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
