@@ -43,8 +43,8 @@ derivative jumps. What that means here:
   error in the multipliers that falls with the steps' squares only and that the error control does not see:
   at 2.2 Hz 2e-7 to 8e-7 for tolerances from 1e-11 to 1e-13, against 1e-8 to 5e-10 with c0 = 0, which takes
   the corner away. States agree to 4e-11 in either case. Differences of the map instead of tangents would
-  not help: they have the same error. By it the six doublings of period 1 between 2 and 2.6 Hz move by 2e-7 Hz
-  or less as the tolerance goes from 1e-11 to 1e-13. That is their accuracy, not the bracket's width; a
+  not help: they have the same error. By it the six doublings of period 1 between 2 and 2.6 Hz move by 2.2e-7
+  Hz or less as the tolerance goes from 1e-11 to 1e-13. That is their accuracy, not the bracket's width; a
   point at which the critical multiplier changes slowly is less accurate in proportion. scipy's DOP853, with
   differences of its own map, finds the critical multiplier of the six within 5e-7 of -1 there, and the
   orbits closed to 5e-11.

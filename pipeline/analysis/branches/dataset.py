@@ -73,6 +73,7 @@ class _Arrays:
         self.residual = np.full(shape, np.nan)
 
     def put(self, i: int, j: int, branch: Branch, point: Any) -> None:
+        """Write point number `j` of branch number `i`."""
         self.parameter[i, j] = branch.family.values(point.u)[0]
         self.section[i, j, : branch.family.period] = _orbit(branch, point)
         self.multiplier[i, j] = multipliers_of(point)
@@ -80,6 +81,7 @@ class _Arrays:
         self.residual[i, j] = point.residual
 
     def variables(self, units: str) -> dict[str, Any]:
+        """As xarray takes them; `units` are those of the parameter."""
         dims = ("branch", "point")
         return {
             "parameter": (dims, self.parameter, {"units": units, "long_name": "value of the parameter"}),
