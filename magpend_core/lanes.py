@@ -25,11 +25,12 @@ import numpy as np
 from numba import njit
 
 from magpend_core import observers
-from magpend_core.jit import OPTIONS, inline, is_covered, kernel, specialise
+from magpend_core.jit import UNCOUNTED, inline, is_covered, kernel, specialise
 from magpend_core.observers import Observer
 from magpend_core.simd import (
     WIDTH,
     absolute,
+    any_nonzero,
     load,
     load_rows,
     maximum,
@@ -189,8 +190,11 @@ def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
     return (h * h) * total * (1.0 / N_CONTROLLED)
 
 
-def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> None:
-    """Accept or reject the attempt, lane by lane, and set the next wish and the event."""
+def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> bool:
+    """Accept or reject the attempt, lane by lane, and set the next wish and the event.
+
+    Return whether a lane of the group has an event.
+    """
     e2 = minimum(squared_error(w, base, rtol, atol), 1e20)
     factor = SAFETY * exp2_rough(log2_rough(maximum(e2, 1e-20)) * -0.1)
     bounded = minimum(maximum(factor, SHRINK), GROW)
@@ -230,16 +234,19 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
         last = load(w, base + ROWS.state + (N - 1) * WIDTH)
         event = where_less(event, 0.5, where_less(last, RENEW_BELOW, DUE, event), event)
     store(w, base + ROWS.event, event)
+    return any_nonzero(event)
 
 
-def attempt(w: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float) -> None:
-    """Advance all groups by one attempted step."""
+def attempt(
+    w: Any, events: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float
+) -> None:
+    """Advance all groups by one attempted step; `events` says which have a lane with an event."""
     for group in range(n_groups):
         base = group * ROWS.size
         choose_step(w, base, slack)
         for s in range(1, N_STAGES):
             run_stage(w, base, s)
-        finish_step(w, base, rtol, atol, max_attempts)
+        events[group] = finish_step(w, base, rtol, atol, max_attempts)
 
 
 def load_cell(
@@ -496,21 +503,28 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: 
         # lanes beyond the last branch repeat it, so that they hold ordinary numbers; no one looks
         start_branch(cells, work, lane, min(lane, n_branches - 1), scratch)
     next_branch = active
+    # a field of a tuple is counted by an atomic operation at every use: too slow per lane
+    rows, events = work.lanes, np.zeros(n_groups, np.bool_)
     while active > 0:
-        attempt(work.lanes, (active + WIDTH - 1) // WIDTH, cells.slack, rtol, atol, max_attempts)
-        lane = ZERO
-        while lane < active:
-            event = work.lanes[(lane // WIDTH) * ROWS.size + ROWS.event + lane % WIDTH]
-            if event == NOTHING or not serve(cells, work, lane, settings, section, scratch):
-                lane += 1
-            elif next_branch < n_branches:
-                start_branch(cells, work, lane, next_branch, scratch)
-                next_branch += 1
-                lane += 1
-            else:
-                # the last lane moves here, with its event if it has one
-                active -= 1
-                copy_lane(work, active, lane)
+        in_use = (active + WIDTH - 1) // WIDTH
+        attempt(rows, events, in_use, cells.slack, rtol, atol, max_attempts)
+        for group in range(in_use):
+            if not events[group]:
+                continue
+            lane, last = group * WIDTH, min(group * WIDTH + WIDTH, active)
+            while lane < last:
+                event = rows[group * ROWS.size + ROWS.event + lane % WIDTH]
+                if event == NOTHING or not serve(cells, work, lane, settings, section, scratch):
+                    lane += 1
+                elif next_branch < n_branches:
+                    start_branch(cells, work, lane, next_branch, scratch)
+                    next_branch += 1
+                    lane += 1
+                else:
+                    # the last lane moves here, with its event if it has one
+                    active -= 1
+                    copy_lane(work, active, lane)
+                    last = min(last, active)
 
 
 def copy_lane(work: Work, source: int, target: int) -> None:
@@ -568,7 +582,7 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
     bindings["renew"] = inline(specialise(observer.renew, name, **bindings))
     for key in (*_INLINE, *_CALLED):
         function = specialise(globals()[key], name, **bindings)
-        bindings[key] = inline(function) if key in _INLINE else njit(**OPTIONS)(function)
+        bindings[key] = inline(function) if key in _INLINE else njit(**UNCOUNTED)(function)
     return bindings
 
 

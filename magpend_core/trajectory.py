@@ -86,7 +86,7 @@ def follow(
     scratch, section = np.zeros(NC), np.zeros(N)
     edge_table = np.zeros((3, max(NE, 1)))
     w = prepare(frequency, p, state, slack, scratch, edge_table)
-    y0, k0 = np.zeros(N), np.zeros(N)
+    y0, k0, events = np.zeros(N), np.zeros(N), np.zeros(1, np.bool_)
     turns = np.zeros(N, np.int64)
     edge = begin_period(w, 0, 0, edge_table)
     take_section(w, 0, 0, section, turns)
@@ -96,7 +96,7 @@ def follow(
         for i in range(N):
             y0[i] = w[ROWS.state + i * WIDTH]
             k0[i] = w[ROWS.slopes + i * WIDTH]
-        attempt(w, 1, slack, rtol, atol, max_attempts)
+        attempt(w, events, 1, slack, rtol, atol, max_attempts)
         if w[ROWS.event] == TOO_MANY_STEPS:
             return STEP_LIMIT
         if w[ROWS.event] == UNDERFLOW:
