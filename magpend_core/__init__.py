@@ -1,10 +1,16 @@
 """Physics and kernels of magpend: the forced double pendulum with magnets, many at a time."""
 
-from magpend_core.jit import source_digest as kernel_version
-from magpend_core.lyapunov import LyapunovExponents, lyapunov_exponents
-from magpend_core.model import Torques, accelerations, energy, jacobian, torques
+from magpend_core.engine.jit import source_digest as kernel_version
+from magpend_core.engine.lyapunov import LyapunovExponents, lyapunov_exponents
+from magpend_core.models.pendulum.mechanics import Torques, accelerations, energy, jacobian, torques
+from magpend_core.models.pendulum.parameters import (
+    ParameterError,
+    Parameters,
+    load_preset,
+    preset_names,
+    preset_provenance,
+)
 from magpend_core.orbits import PeriodicOrbits, polish_orbits
-from magpend_core.parameters import ParameterError, Parameters, load_preset, preset_names, preset_provenance
 from magpend_core.sections import Sections, run_branches, sections
 from magpend_core.status import Status
 from magpend_core.trajectory import trajectory

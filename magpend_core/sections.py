@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core.lanes import Cells, engine_of
-from magpend_core.observers import FIRST_TURN, ORBIT_PERIOD, RECORD_CLOSED, RECORD_LAST, Settings
-from magpend_core.parameters import Parameters
-from magpend_core.pendulum import PENDULUM_FITTED, system_of
-from magpend_core.system import System
+from magpend_core.engine.lanes import Cells, engine_of
+from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD_CLOSED, RECORD_LAST, Settings
+from magpend_core.engine.system import System
+from magpend_core.models.pendulum.parameters import Parameters
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED, system_of
 from magpend_core.validation import (
     check_array,
     check_count,

@@ -14,7 +14,7 @@ START_DIMS = ("initial_condition", *GRID_DIMS, "branch")
 """Dims of a cube that tell the cells of one parameter point apart."""
 
 ABSENT, CLOSED_ORBIT, BOUNDED_SET = range(3)
-"""Values of `kind`, see `pipeline.analysis.attractors`."""
+"""Values of `kind`, see `pipeline.analysis.attractors.attractors`."""
 
 PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = range(8)
 """Values of `magpend_core.status.Status`, whose package brings the compiler with it."""

@@ -36,7 +36,7 @@ def plot_basins(
     Parameters
     ----------
     attractors
-        Result of `pipeline.analysis.attractors.match` for a sweep over a grid of initial states.
+        Result of `pipeline.analysis.attractors.attractors.match` for a sweep over a grid of initial states.
     at
         Values of all other axes, such as ``{"frequency": 2.2}`` [units of the axis, rad]; the nearest
         ones are drawn.

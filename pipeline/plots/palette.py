@@ -86,7 +86,7 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     Parameters
     ----------
     attractors
-        Result of `pipeline.analysis.attractors.match` for the whole run, so that a colour does not
+        Result of `pipeline.analysis.attractors.attractors.match` for the whole run, so that a colour does not
         change with what is selected of it.
     part
         What the names are to describe; by default all of it.

@@ -33,7 +33,7 @@ from problem import draw_states, scaled_error
 from scalar_twin import LIMITED, TEXTBOOK, run_twin
 
 import magpend_core
-from magpend_core.jit import source_digest
+from magpend_core.engine.jit import source_digest
 
 GOALS = {"AVX-512": 7.0, "AVX2": 4.0}
 """Least ratio of the scalar twin's time to the engine's."""

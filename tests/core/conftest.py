@@ -12,10 +12,10 @@ import pytest
 
 import magpend_core
 from magpend_core import load_preset
-from magpend_core.jit import inline
-from magpend_core.parameters import DipoleMagnet, Parameters
-from magpend_core.system import System
-from magpend_core.vecmath import sincos
+from magpend_core.engine.jit import inline
+from magpend_core.engine.system import System
+from magpend_core.engine.vecmath import sincos
+from magpend_core.models.pendulum.parameters import DipoleMagnet, Parameters
 
 DATA = Path(__file__).parent / "data"
 

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 import xarray as xr
 
-from magpend_core.parameters import Parameters
-from magpend_core.pendulum import system_of
+from magpend_core.models.pendulum.parameters import Parameters
+from magpend_core.models.pendulum.systems import system_of
 from pipeline.analysis.branches.arclength import Point, Settings, Walk, correct, kernel_of, walk
 from pipeline.analysis.branches.bifurcations import KINDS, TORUS, multipliers_of
 from pipeline.analysis.branches.following import opposite

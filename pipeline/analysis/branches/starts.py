@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
+from magpend_core.engine.system import System
+from magpend_core.models.pendulum.parameters import Parameters
+from magpend_core.models.pendulum.systems import system_of
 from magpend_core.orbits import polish_orbits, scaled_distance, stroboscopic_map
-from magpend_core.parameters import Parameters
-from magpend_core.pendulum import system_of
-from magpend_core.system import System
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.vocabulary import START_DIMS
@@ -32,7 +32,7 @@ def attracting(
     Parameters
     ----------
     attractors
-        From `pipeline.analysis.attractors`.
+        From `pipeline.analysis.attractors.attractors`.
     parameters
         What was integrated, axes of the cube aside.
     parameter

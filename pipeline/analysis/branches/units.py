@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from magpend_core.parameters import describe, load_preset
+from magpend_core.models.pendulum.parameters import describe, load_preset
 from pipeline.analysis.branches.problems import FREQUENCY
 
 
