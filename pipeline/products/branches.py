@@ -78,7 +78,7 @@ def _interval(
     snapshot: Snapshot, parameter: str, low: float | None, high: float | None
 ) -> tuple[float, float]:
     """Check the parameter and complete its interval from the run's axis."""
-    from magpend_core.models.pendulum.parameters import unknown_name_problem
+    from magpend_core.models.parameters import unknown_name_problem
     from pipeline.analysis.attractors.attractors import parameters_of
 
     ds = snapshot.open()
