@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magpend_core.pendulum import PENDULUM_FITTED
+from magpend_core.engine.system import System
+from magpend_core.engine.variational import with_tangents
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.sections import run_branches
-from magpend_core.system import System
 from magpend_core.validation import check_array, check_frequency, check_states, check_tolerance
-from magpend_core.variational import with_tangents
 
 RTOL = 1e-12
 """Tolerance of the integrations here: the residual can then go below 1e-10."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from magpend_core.jit import OPTIONS, kernel, specialise
-from magpend_core.lanes import (
+from magpend_core.engine.jit import OPTIONS, kernel, specialise
+from magpend_core.engine.lanes import (
     DIVERGED,
     FIRST_STEP,
     N_STAGES,
@@ -22,15 +22,14 @@ from magpend_core.lanes import (
     ZERO,
     engine_bindings,
 )
-from magpend_core.observers import RECORD_LAST
-from magpend_core.parameters import Parameters
-from magpend_core.pendulum import system_of
+from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.simd import WIDTH
+from magpend_core.engine.system import System
+from magpend_core.engine.vecmath import TWO_PI
+from magpend_core.models.parameters import Parameters
 from magpend_core.sections import check_tolerances, slack_of
-from magpend_core.simd import WIDTH
 from magpend_core.status import Status
-from magpend_core.system import System
 from magpend_core.validation import check_array, check_count, check_frequency, check_states
-from magpend_core.vecmath import TWO_PI
 
 # Continuous extension of order 4 of the Dormand-Prince pair: y(t + x h) = y + h sum_i k_i P_i(x),
 # P_i(x) = sum_j DENSE[i, j] x^(j + 1). Shampine, Math. Comp. 46 (1986) 135-150.
@@ -163,7 +162,7 @@ def trajectory(
         If the trajectory diverges or meets the step limit before the last time; the message is
         the sentence of the `Status`.
     """
-    system = system_of(parameters)
+    system = parameters.model.system
     frequency = float(check_frequency(frequency_hz, ndim=0))
     state = check_states(initial_state, 1, system.n_states, "initial_state")
     grid = check_array("times", times, 1)

@@ -14,7 +14,7 @@ import pytest
 import pipeline
 from magpend_core import Status
 from pipeline.analysis.sides import Side, side
-from pipeline.run import shipped_workflows
+from pipeline.runs.run import shipped_workflows
 
 # see tests/core/data/README.md for where these points come from
 ORBITS = json.loads((Path(__file__).parent / "core" / "data" / "orbits.json").read_text("utf-8"))
@@ -22,7 +22,7 @@ ORBITS = json.loads((Path(__file__).parent / "core" / "data" / "orbits.json").re
 
 def magpend(*arguments, **environment):
     """Run the command as a user does, in a process of its own."""
-    code = "import sys; from pipeline.cli import main; sys.argv[0] = 'magpend'; main()"
+    code = "import sys; from pipeline.cli.main import main; sys.argv[0] = 'magpend'; main()"
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)],
         capture_output=True, text=True, check=False, timeout=900, env={**os.environ, **environment},
@@ -105,10 +105,10 @@ def test_plot__without_kernel(directory, tmp_path):
     """The figure comes from the cube alone: with a kernel that raises, it is the same file."""
     plotted = tmp_path / "again.png"
     code = (
-        "import sys, magpend_core.sections as s, magpend_core.lanes as l\n"
+        "import sys, magpend_core.sections as s, magpend_core.engine.lanes as l\n"
         "def broken(*a, **k): raise AssertionError('the kernel was called')\n"
         "s.run_branches = s.engine_of = l.engine_of = broken\n"
-        "from pipeline.cli import main\n"
+        "from pipeline.cli.main import main\n"
         f"sys.argv = ['magpend', 'plot', 'bifurcation', {str(directory)!r}, '--out', {str(plotted)!r}]\n"
         "main()"
     )

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from pipeline.cli import app
-from pipeline.run import shipped_workflows
-from pipeline.schema import VARIABLES
-from pipeline.spec import parse_spec
+from pipeline.cli.main import app
+from pipeline.layout.schema import VARIABLES
+from pipeline.runs.run import shipped_workflows
+from pipeline.spec.parsing import parse_spec
 
 README = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
 

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from magpend_core.system import System
+from magpend_core.engine.system import System
 
 TWO_PI = 2.0 * np.pi
 

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoMinorLocator
 
-from pipeline.analysis.lyapunov import GOOD, Motion, pooled_mean, summarise
+from pipeline.analysis.chaos.lyapunov import GOOD, Motion, pooled_mean, summarise
 from pipeline.analysis.selection import select_points
-from pipeline.analysis.vocabulary import split_dims
+from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import style
 
 UNITS = ("s", "period")
@@ -191,8 +191,8 @@ def plot_dimension(ds: xr.Dataset) -> style.DataFigure:
     Parameters
     ----------
     ds
-        Result of `pipeline.analysis.indicators.correlation_dimension` for one set of points, or of
-        `pipeline.analysis.chaos.section_dimension` for one parameter point.
+        Result of `pipeline.analysis.chaos.indicators.correlation_dimension` for one set of points, or of
+        `pipeline.analysis.chaos.chaos.section_dimension` for one parameter point.
 
     Returns
     -------

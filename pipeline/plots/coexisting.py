@@ -36,7 +36,7 @@ def plot_coexisting(
     Parameters
     ----------
     attractors
-        Result of `pipeline.analysis.attractors.match` over one parameter or more.
+        Result of `pipeline.analysis.attractors.attractors.match` over one parameter or more.
     state
         ``psi1``, ``psi2``, ``psi1_dot`` or ``psi2_dot``.
     at
@@ -44,7 +44,7 @@ def plot_coexisting(
     degrees
         Degrees instead of radians.
     hysteresis
-        Result of `pipeline.analysis.hysteresis.hysteresis`; its loops are shaded.
+        Result of `pipeline.analysis.attractors.hysteresis.hysteresis`; its loops are shaded.
 
     Returns
     -------

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoMinorLocator
 
-from pipeline.analysis.basin_numbers import binomial_interval
+from pipeline.analysis.basins.numbers import binomial_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.plots import palette, style
 
@@ -29,7 +29,7 @@ def plot_fractions(attractors: xr.Dataset, *, at: Mapping[str, float] | None = N
     Parameters
     ----------
     attractors
-        Result of `pipeline.analysis.attractors.match` for a sweep over one parameter or more.
+        Result of `pipeline.analysis.attractors.attractors.match` for a sweep over one parameter or more.
     at
         Values of the other swept parameters, such as ``{"q": 1.5}``; the nearest ones are drawn.
 

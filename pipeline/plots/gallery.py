@@ -25,9 +25,9 @@ def plot_gallery(attractors: xr.Dataset, portraits: xr.Dataset) -> style.DataFig
     Parameters
     ----------
     attractors
-        Result of `pipeline.analysis.attractors.match`; gives colours and names.
+        Result of `pipeline.analysis.attractors.attractors.match`; gives colours and names.
     portraits
-        Result of `pipeline.analysis.portraits.portraits` for a parameter point of it.
+        Result of `pipeline.analysis.attractors.portraits.portraits` for a parameter point of it.
 
     Returns
     -------

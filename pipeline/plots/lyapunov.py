@@ -14,7 +14,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoMinorLocator, MaxNLocator
 
-from pipeline.analysis.lyapunov import GOOD
+from pipeline.analysis.chaos.lyapunov import GOOD
 from pipeline.analysis.sides import side
 from pipeline.plots import style
 from pipeline.plots.bifurcation import SIDE_COLOURS, draw_diagram, swept_parameter, swept_parameters

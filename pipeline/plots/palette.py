@@ -24,8 +24,8 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.analysis import vocabulary
 from pipeline.analysis.sides import Side
+from pipeline.layout import vocabulary
 from pipeline.plots import style
 
 COLOURS = (
@@ -86,7 +86,7 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     Parameters
     ----------
     attractors
-        Result of `pipeline.analysis.attractors.match` for the whole run, so that a colour does not
+        Result of `pipeline.analysis.attractors.attractors.match` for the whole run, so that a colour does not
         change with what is selected of it.
     part
         What the names are to describe; by default all of it.

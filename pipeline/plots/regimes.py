@@ -13,8 +13,8 @@ from matplotlib.colors import ListedColormap, to_hex
 from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoMinorLocator
 
-from pipeline.analysis.basin_numbers import basin_fractions, binomial_interval
-from pipeline.analysis.basins import outcomes
+from pipeline.analysis.basins.basins import outcomes
+from pipeline.analysis.basins.numbers import basin_fractions, binomial_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.plots import palette, style
 from pipeline.plots.fractions import new_panel
@@ -32,7 +32,7 @@ def plot_regimes(
     Parameters
     ----------
     attractors
-        Result of `pipeline.analysis.attractors.match` for a run over two parameters or more.
+        Result of `pipeline.analysis.attractors.attractors.match` for a run over two parameters or more.
     show
         ``periods``: which periods [drive periods] and whether motions that are not periodic coexist;
         ``attractors``: which ids do; ``number``: how many attractors.

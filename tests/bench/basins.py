@@ -28,9 +28,9 @@ import xarray as xr
 from scalar_peers import scipy_runner
 
 from magpend_core import load_preset, sections
-from magpend_core.parameters import Parameters
-from pipeline.analysis.attractors import identify
-from pipeline.schema import LINKS, STATES
+from magpend_core.models.parameters import Parameters
+from pipeline.analysis.attractors.attractors import identify
+from pipeline.layout.schema import LINKS, STATES
 
 FREQUENCY_HZ = 2.2
 TOLERANCE = 1e-8

@@ -1,6 +1,6 @@
 """The model as heyoka expressions, and a batch integrator over them that returns sections.
 
-The equations are those of `magpend_core.equations`, written again: they share no code with it. What
+The equations are those of the pendulum's `equations`, written again: they share no code with it. What
 differs is forced by heyoka, and costs it nothing:
 
 * All parameters but the drive's frequency are numbers, so that heyoka can fold them.

@@ -33,7 +33,7 @@ from problem import draw_states, scaled_error
 from scalar_twin import LIMITED, TEXTBOOK, run_twin
 
 import magpend_core
-from magpend_core.jit import source_digest
+from magpend_core.engine.jit import source_digest
 
 GOALS = {"AVX-512": 7.0, "AVX2": 4.0}
 """Least ratio of the scalar twin's time to the engine's."""
@@ -284,7 +284,7 @@ def title_of(case: Case) -> str:
     return (
         f"{target()} ({numba.config.CPU_NAME or llvmlite.binding.get_host_cpu_name()}): "
         f"{len(case.initial)} trajectories, {case.n_periods} periods at {case.frequency_hz:g} Hz, "
-        f"tolerance {case.tolerance:.0e}, eps_drive {case.parameters.drive.eps_drive:g}"
+        f"tolerance {case.tolerance:.0e}, eps_drive {case.parameters['eps_drive']:g}"
     )
 
 

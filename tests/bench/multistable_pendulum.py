@@ -42,12 +42,12 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 from magpend_core import run_branches
-from magpend_core.jit import inline
+from magpend_core.engine.jit import inline
+from magpend_core.engine.system import System
+from magpend_core.engine.vecmath import TWO_PI, sin
 from magpend_core.sections import Sections
 from magpend_core.status import Status
-from magpend_core.system import System
-from magpend_core.vecmath import TWO_PI, sin
-from pipeline.analysis.basin_numbers import basin_fractions
+from pipeline.analysis.basins.numbers import basin_fractions
 
 GOAL = 12.0  # s, on two cores
 

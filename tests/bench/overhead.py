@@ -20,11 +20,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from pipeline import run as runs
-from pipeline import task
-from pipeline.cells import CellMap
-from pipeline.plan import make_plan
-from pipeline.spec import load_spec
+from pipeline.compute import task
+from pipeline.layout.cells import CellMap
+from pipeline.layout.plan import make_plan
+from pipeline.runs import run as runs
+from pipeline.spec.parsing import load_spec
 
 SPEC = """
 kind = "sweep"

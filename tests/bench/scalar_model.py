@@ -1,6 +1,6 @@
 """The model for one trajectory, compiled by numba with libm's functions, for the scalar peers.
 
-Written apart from `magpend_core.equations`, so that the reference solution is independent of them.
+Written apart from the pendulum's `equations`, so that the reference solution is independent of them.
 The parameters are compile-time constants here; the angular frequency of the drive is an argument.
 """
 

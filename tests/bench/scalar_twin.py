@@ -5,7 +5,7 @@ tableau, tolerances and step control, written again without a line of `magpend_c
 joints are taken in the fixed frame here. Control is chosen when `sections_of` is compiled:
 
 `LIMITED`
-    As in `magpend_core.lanes`: steps in proportion to the distance from the nearest layer or edge.
+    As in `magpend_core.engine.lanes`: steps in proportion to the distance from the nearest layer or edge.
 `TEXTBOOK`
     Hairer, Norsett and Wanner, Solving ODEs I, II.4: the factor 0.9 e^(-1/5) in [0.2, 5], and
     nothing else. Steps end on the known switch times of the drive.

@@ -10,9 +10,9 @@ import pytest
 import scipy.linalg
 
 from magpend_core import load_preset, polish_orbits, run_branches
+from magpend_core.engine.variational import with_tangents
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance, stroboscopic_map, wrap_angles
-from magpend_core.pendulum import PENDULUM_FITTED
-from magpend_core.variational import with_tangents
 
 # made by Newton's method on the stroboscopic map at rtol 1e-12 with other integrators: points agree
 # among them to 3e-11, multipliers are good to 1e-6

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from magpend_core.jit import inline
-from magpend_core.system import System
-from magpend_core.vecmath import TWO_PI, sincos
+from magpend_core.engine.jit import inline
+from magpend_core.engine.system import System
+from magpend_core.engine.vecmath import TWO_PI, sincos
 
 ROOT = Path(__file__).parents[2]
 
@@ -97,10 +97,10 @@ def bytes_of():
 @pytest.fixture
 def made(tmp_path, write_spec):
     """A run directory set up from the small sweep, with made-up numbers to commit."""
-    from pipeline import store
-    from pipeline.identity import identity_of
-    from pipeline.plan import make_plan
-    from pipeline.spec import load_spec
+    from pipeline.layout.identity import identity_of
+    from pipeline.layout.plan import make_plan
+    from pipeline.spec.parsing import load_spec
+    from pipeline.store import directory as store
 
     path = write_spec(SWEEP)
     spec = load_spec(path)
@@ -141,7 +141,7 @@ def magpend(tmp_path, environment):
 
     def call(*arguments, **options):
         return subprocess.run(
-            [sys.executable, "-m", "pipeline.cli", *map(str, arguments)],
+            [sys.executable, "-m", "pipeline.cli.main", *map(str, arguments)],
             cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240, check=False,
             **options,
         )  # fmt: skip
@@ -160,7 +160,7 @@ def start(tmp_path, environment):
 
     def begin(*arguments):
         process = subprocess.Popen(
-            [sys.executable, "-m", "pipeline.cli", *map(str, arguments)],
+            [sys.executable, "-m", "pipeline.cli.main", *map(str, arguments)],
             cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             start_new_session=True,
         )  # fmt: skip
@@ -178,7 +178,7 @@ def start(tmp_path, environment):
 @pytest.fixture
 def main(monkeypatch, tmp_path, capsys):
     """Call the command line in this process; returns exit code, output and errors."""
-    from pipeline.cli import main as entry
+    from pipeline.cli.main import main as entry
 
     def call(*arguments):
         monkeypatch.chdir(tmp_path)

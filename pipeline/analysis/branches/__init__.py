@@ -8,7 +8,7 @@ An orbit of period p is a fixed point of the p-fold stroboscopic map; its branch
 pseudo-arclength continuation, whether it is stable or not. `problems` has the equations, `lockstep`
 evaluates many of them in one call of the engine, `arclength` walks, `bifurcations` notices and locates,
 `following` makes one branch, `exploring` all that hang together, `curves` continues located points in two
-parameters. Everything but `starts` and the sides takes any `magpend_core.system.System`.
+parameters. Everything but `starts` and the sides takes any `magpend_core.engine.system.System`.
 
 What is located
 ---------------

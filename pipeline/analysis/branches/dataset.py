@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.parameters import Parameters
+from magpend_core.engine.variational import with_tangents
+from magpend_core.models.parameters import Parameters
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
-from magpend_core.variational import with_tangents
 from pipeline.analysis.branches.bifurcations import FOLD, KINDS, Bifurcation, multipliers_of, n_unstable
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.problems import FREQUENCY, RTOL

@@ -13,10 +13,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from magpend_core.engine.simd import WIDTH
+from magpend_core.engine.system import System
+from magpend_core.engine.variational import with_tangents
 from magpend_core.sections import run_branches
-from magpend_core.simd import WIDTH
-from magpend_core.system import System
-from magpend_core.variational import with_tangents
 from pipeline.analysis.branches.problems import RTOL, Ends, Problem, Rows, Value
 
 T = TypeVar("T")

@@ -14,8 +14,8 @@ from typing import Protocol
 
 import numpy as np
 
+from magpend_core.engine.system import System
 from magpend_core.orbits import wrap_angles
-from magpend_core.system import System
 
 FREQUENCY = "frequency_hz"
 

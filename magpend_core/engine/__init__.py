@@ -1,0 +1,1 @@
+"""The engine: many trajectories in step, observed and linearised; knows no model."""

@@ -1,0 +1,594 @@
+"""The engine: many trajectories in step, each with its own time, step size and parameters.
+
+Dormand-Prince 5(4) with error control. Every trajectory owns a lane; `simd.WIDTH` lanes form a
+group, whose numbers lie row by row in one flat array (see `Rows`). One attempted step advances all
+groups; accept or reject is a choice per lane, never a branch. Afterwards a short scalar pass serves
+the lanes at which something happened: the end of a segment between two edges of the forcing, the end
+of a period (then the observer is called), the end of a cell (then the lane is refilled).
+
+What a lane computes depends on its own inputs alone. Nothing crosses lanes, and no operation's result
+depends on the vector width, so results are the same bits alone or among others, in any order and on
+any CPU.
+
+The functions here are templates: names in capitals and the system's functions are bound by
+`engine_of`, then compiled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from magpend_core.engine import observers
+from magpend_core.engine.jit import UNCOUNTED, inline, is_covered, kernel, specialise
+from magpend_core.engine.observers import Observer
+from magpend_core.engine.simd import (
+    WIDTH,
+    absolute,
+    any_nonzero,
+    load,
+    load_rows,
+    maximum,
+    minimum,
+    multiply_add,
+    sqrt,
+    store,
+    store_rows,
+    where_less,
+)
+from magpend_core.engine.system import System
+from magpend_core.engine.vecmath import TWO_PI, exp2_rough, log2_rough
+from magpend_core.status import Status
+
+# Dormand and Prince, J. Comput. Appl. Math. 6 (1980) 19-26, RK5(4)7M
+NODES = np.array([0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0])
+STAGES = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0],
+        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0],
+        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ]
+)
+ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
+N_STAGES = 7
+ZERO: Any = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
+
+FIRST_STEP = 1e-3
+"""First step of a branch in drive periods; error control finds the right size within a few steps."""
+SAFETY = 0.85
+SHRINK = 0.2
+GROW = 5.0
+
+# events that the vector part leaves for the scalar pass
+NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW, DUE = 0.0, 1.0, 2.0, 3.0, 4.0
+PENDING, DIVERGED = int(Status.PENDING), int(Status.DIVERGED)
+STEP_LIMIT, STEP_UNDERFLOW = int(Status.STEP_LIMIT), int(Status.STEP_UNDERFLOW)
+UNREACHED = int(Status.UNREACHED)
+
+
+class Rows(NamedTuple):
+    """Where a group's rows start, in float64 numbers from the group's base."""
+
+    state: int
+    slopes: int  # N_STAGES * n_states rows
+    trial: int  # the stage's state, at the end the new state
+    constants: int
+    time: int  # s, since the last section
+    wish: int  # s, step size that the error control wants
+    step: int  # s, step size of this attempt
+    fresh: int  # 1 while the first slope is missing: the next attempt has step 0 and fills it
+    after_rejection: int  # 1 if the last attempt was rejected
+    start: int  # s, start of the segment
+    target: int  # s, end of the segment
+    start_width: int  # s, half-width of the edge at the start
+    target_width: int  # s
+    start_ratio: int  # step_ratio of the edge at the start
+    target_ratio: int
+    period: int  # s
+    steps: int  # accepted in this cell
+    rejected: int  # rejected attempts in this cell
+    attempts: int  # in this period
+    event: int
+    size: int
+
+
+def rows_of(system: System) -> Rows:
+    """Lay out a group for a system."""
+    counts = [
+        system.n_states, N_STAGES * system.n_states, system.n_states, system.n_constants, *[1] * 16,
+    ]  # fmt: skip
+    offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
+    return Rows(*(int(x) for x in offsets))
+
+
+def step_ratio(room: Any) -> Any:
+    """Largest step near a layer, in units of the distance from its complex singularity.
+
+    The right-hand side near a layer behaves like (J/pi) atan(t/d), whose derivatives at a distance R
+    from the poles at +-i d grow like J d n!/R^(n+1): a step h = c R leaves an error in proportion to
+    J d c^6 for a method of order 5. So c = (slack/(J d))^(1/6), with `room` = slack/(J d).
+    """
+    return exp2_rough(log2_rough(minimum(maximum(room, 1e-30), 1e30)) * (1.0 / 6.0))
+
+
+def choose_step(w: Any, base: int, slack: float) -> None:
+    """Set the step of the next attempt.
+
+    The step is the least of what error control wants and, for each layer and edge, what keeps it in
+    proportion to the distance from the nearest complex singularity: with D the distance in time to
+    the crossing, d the half-width in time and c the layer's `step_ratio`, at most
+    max(c D/(1 + c), c d) towards the crossing and c sqrt(D^2 + d^2) away from it. It ends on the
+    segment's end exactly, and the last two steps before that share the rest.
+    """
+    y = load_rows(w, base + ROWS.state, N)
+    dy = load_rows(w, base + ROWS.slopes, N)
+    c = load_rows(w, base + ROWS.constants, NC)
+    t = load(w, base + ROWS.time)
+    remaining = load(w, base + ROWS.target) - t
+    h = load(w, base + ROWS.wish)
+    if HAS_LAYERS:  # numba cannot loop over an empty tuple
+        for value, rate, half_width, per_strength in layers(y, dy, c):
+            speed = absolute(rate)
+            ratio = step_ratio(slack * speed * per_strength)
+            distance = absolute(value)
+            nearing = value * rate
+            # the two bounds of the docstring over one common division
+            towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
+            away = ratio * sqrt(multiply_add(value, value, half_width * half_width))
+            length = where_less(nearing, 0.0, towards, away)
+            h = minimum(length / (speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)), h)
+    if NE > 0:
+        passed = t - load(w, base + ROWS.start)
+        width = load(w, base + ROWS.start_width)
+        ratio = load(w, base + ROWS.start_ratio)
+        h = minimum(ratio * sqrt(multiply_add(passed, passed, width * width)), h)
+        width = load(w, base + ROWS.target_width)
+        ratio = load(w, base + ROWS.target_ratio)
+        h = minimum(maximum(ratio / (1.0 + ratio) * remaining, ratio * width), h)
+    shared = where_less(remaining, 2.0 * h, 0.5 * remaining, h)
+    h = where_less(h, remaining, shared, remaining)
+    h = where_less(0.5, load(w, base + ROWS.fresh), 0.0, h)
+    store(w, base + ROWS.step, h)
+
+
+def run_stage(w: Any, base: int, s: int) -> None:
+    """Compute the state and the slope of stage `s` (1 to 6)."""
+    h = load(w, base + ROWS.step)
+    for i in range(N):
+        row = base + i * WIDTH
+        total = STAGES[s, 0] * load(w, row + ROWS.slopes)
+        for j in range(1, s):
+            total = total + STAGES[s, j] * load(w, row + ROWS.slopes + j * N * WIDTH)
+        store(w, row + ROWS.trial, load(w, row + ROWS.state) + h * total)
+    c = load_rows(w, base + ROWS.constants, NC)
+    u = forcing(load(w, base + ROWS.time) + NODES[s] * h, c)
+    slopes = rhs(load_rows(w, base + ROWS.trial, N), u, c)
+    store_rows(w, base + ROWS.slopes + s * N * WIDTH, slopes)
+
+
+def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
+    """Mean square of the scaled error estimate of the attempt."""
+    total = 0.0 * load(w, base + ROWS.step)
+    for i in range(N_CONTROLLED):
+        row = base + i * WIDTH
+        error = ERROR[0] * load(w, row + ROWS.slopes)
+        for j in range(2, N_STAGES):
+            error = error + ERROR[j] * load(w, row + ROWS.slopes + j * N * WIDTH)
+        size = maximum(absolute(load(w, row + ROWS.state)), absolute(load(w, row + ROWS.trial)))
+        scaled = error / (atol + rtol * size)
+        total = total + scaled * scaled
+    h = load(w, base + ROWS.step)
+    return (h * h) * total * (1.0 / N_CONTROLLED)
+
+
+def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> bool:
+    """Accept or reject the attempt, lane by lane, and set the next wish and the event.
+
+    Return whether a lane of the group has an event.
+    """
+    e2 = minimum(squared_error(w, base, rtol, atol), 1e20)
+    factor = SAFETY * exp2_rough(log2_rough(maximum(e2, 1e-20)) * -0.1)
+    bounded = minimum(maximum(factor, SHRINK), GROW)
+    bounded = where_less(0.5, load(w, base + ROWS.after_rejection), minimum(bounded, 1.0), bounded)
+    h = load(w, base + ROWS.step)
+    wish = load(w, base + ROWS.wish)
+    t = load(w, base + ROWS.time)
+    target = load(w, base + ROWS.target)
+    rejected = where_less(1.0, e2, 1.0, 0.0)
+    # an attempt cut short by a layer or a target: the old wish stands unless the error says that
+    # it is too much, or allows more
+    next_wish = where_less(h, wish, minimum(h * factor, maximum(wish, h * bounded)), h * bounded)
+    next_wish = where_less(0.5, rejected, h * bounded, next_wish)
+    stepped = where_less(0.0, h, 1.0, 0.0)
+    next_wish = where_less(0.5, stepped, next_wish, wish)
+    store(w, base + ROWS.wish, next_wish)
+    for i in range(N):
+        row = base + i * WIDTH
+        old = load(w, row + ROWS.state)
+        store(w, row + ROWS.state, where_less(0.5, rejected, old, load(w, row + ROWS.trial)))
+        old = load(w, row + ROWS.slopes)
+        last = load(w, row + ROWS.slopes + (N_STAGES - 1) * N * WIDTH)
+        store(w, row + ROWS.slopes, where_less(0.5, rejected, old, last))
+    arrived = where_less(h, target - t, 0.0, 1.0 - rejected)
+    t_new = where_less(0.5, arrived, target, t + h)
+    store(w, base + ROWS.time, where_less(0.5, rejected, t, t_new))
+    attempts = load(w, base + ROWS.attempts) + stepped
+    store(w, base + ROWS.attempts, attempts)
+    store(w, base + ROWS.steps, load(w, base + ROWS.steps) + stepped * (1.0 - rejected))
+    store(w, base + ROWS.rejected, load(w, base + ROWS.rejected) + rejected)
+    store(w, base + ROWS.after_rejection, rejected)
+    store(w, base + ROWS.fresh, 0.0 * h)
+    event = where_less(0.5, arrived, REACHED, where_less(max_attempts, attempts, TOO_MANY_STEPS, NOTHING))
+    tiny = 1e-15 * load(w, base + ROWS.period)
+    event = where_less(next_wish, tiny, UNDERFLOW, event)
+    if REWRITES:
+        last = load(w, base + ROWS.state + (N - 1) * WIDTH)
+        event = where_less(event, 0.5, where_less(last, RENEW_BELOW, DUE, event), event)
+    store(w, base + ROWS.event, event)
+    return any_nonzero(event)
+
+
+def attempt(
+    w: Any, events: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float
+) -> None:
+    """Advance all groups by one attempted step; `events` says which have a lane with an event."""
+    for group in range(n_groups):
+        base = group * ROWS.size
+        choose_step(w, base, slack)
+        for s in range(1, N_STAGES):
+            run_stage(w, base, s)
+        events[group] = finish_step(w, base, rtol, atol, max_attempts)
+
+
+def load_cell(
+    w: Any, base: int, lane: int, frequency: float, p: Any, slack: float, scratch: Any, edge_table: Any
+) -> None:
+    """Give a lane the constants and edges of a cell; the state stays."""
+    constants(frequency, p, scratch)
+    for i in range(NC):
+        w[base + ROWS.constants + i * WIDTH + lane] = scratch[i]
+    period = 1.0 / frequency
+    edges(frequency, p, edge_table[0], edge_table[1], edge_table[2])
+    for i in range(NE):
+        edge_table[2, i] = step_ratio(slack / (edge_table[2, i] * edge_table[1, i]))
+    w[base + ROWS.period + lane] = period
+    w[base + ROWS.steps + lane] = 0.0
+    w[base + ROWS.rejected + lane] = 0.0
+
+
+def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
+    """Put a lane's time at the start of a period; return the number of the segment's end edge."""
+    w[base + ROWS.time + lane] = 0.0
+    w[base + ROWS.attempts + lane] = 0.0
+    # the last slope belongs to time `period`, where the forcing can differ from that at time 0 by its
+    # rounding: a branch continued from here by a later call starts from the latter
+    w[base + ROWS.fresh + lane] = 1.0
+    if NE > 0 and edge_table[0, 0] == 0.0:
+        set_target(w, base, lane, 0.0, edge_table, 0)
+        return begin_segment(w, base, lane, edge_table, 1)
+    set_target(w, base, lane, 0.0, edge_table, NE)
+    return begin_segment(w, base, lane, edge_table, 0)
+
+
+def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge: int) -> None:
+    """Let a segment end at `time`, with the layer of the edge number `edge` (none for n_edges)."""
+    w[base + ROWS.target + lane] = time
+    w[base + ROWS.target_width + lane] = edge_table[1, edge] if edge < NE else np.inf
+    w[base + ROWS.target_ratio + lane] = edge_table[2, edge] if edge < NE else 1.0
+
+
+def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> int:
+    """Let a lane run from its last target to the edge number `edge`, or to the period's end."""
+    w[base + ROWS.start + lane] = w[base + ROWS.target + lane]
+    w[base + ROWS.start_width + lane] = w[base + ROWS.target_width + lane]
+    w[base + ROWS.start_ratio + lane] = w[base + ROWS.target_ratio + lane]
+    if edge < NE:
+        set_target(w, base, lane, edge_table[0, edge], edge_table, edge)
+        return edge
+    # the next period starts with edge 0 if that is at time 0
+    first = 0 if NE > 0 and edge_table[0, 0] == 0.0 else NE
+    set_target(w, base, lane, w[base + ROWS.period + lane], edge_table, first)
+    return NE
+
+
+def in_bounds(w: Any, base: int, lane: int) -> bool:
+    """Whether no state of a lane has escaped or is NaN."""
+    for i in range(N):
+        if not abs(w[base + ROWS.state + i * WIDTH + lane]) <= ESCAPE[i]:
+            return False
+    return True
+
+
+def take_section(w: Any, base: int, lane: int, section: Any, turns: Any) -> bool:
+    """Copy a lane's state to `section`, angles wrapped in place; return whether it is in bounds."""
+    good = in_bounds(w, base, lane)
+    for i in range(N):
+        at = base + ROWS.state + i * WIDTH + lane
+        x = w[at]
+        if good and IS_ANGLE[i] and not (-math.pi < x <= math.pi):
+            n = math.ceil((x - math.pi) / TWO_PI)
+            x -= n * TWO_PI
+            # rounding can leave x on the wrong side of the cut
+            if x <= -math.pi:
+                x = math.pi
+            turns[i] += n
+            w[at] = x
+            w[base + ROWS.fresh + lane] = 1.0
+        section[i] = x
+    return good
+
+
+def move_lane(w: Any, source: int, target: int) -> None:
+    """Copy all rows of one lane to another."""
+    a = (source // WIDTH) * ROWS.size + source % WIDTH
+    b = (target // WIDTH) * ROWS.size + target % WIDTH
+    for row in range(0, ROWS.size, WIDTH):
+        w[b + row] = w[a + row]
+
+
+def renew_state(w: Any, base: int, lane: int, state: Any, memory: Any, settings: Any) -> None:
+    """Let the observer rewrite a lane's state."""
+    for i in range(N):
+        state[i] = w[base + ROWS.state + i * WIDTH + lane]
+    renew(state, memory, settings)
+    for i in range(N):
+        w[base + ROWS.state + i * WIDTH + lane] = state[i]
+    w[base + ROWS.fresh + lane] = 1.0
+
+
+class Work(NamedTuple):
+    """Per-lane bookkeeping of the scalar pass, one entry or row per lane."""
+
+    lanes: Any  # float64, the groups' rows
+    branch: Any  # int64
+    point: Any  # int64, within the branch
+    edge: Any  # int64, the edge at the end of the segment
+    i_period: Any  # int64, completed periods of this cell
+    turns: Any  # int64 (lanes, n_states), since the branch's start
+    edge_table: Any  # float64 (lanes, 3, n_edges): time [s], half-width [s], step_ratio
+    memory: Any  # float64 (lanes, n_memory), the observer's own
+
+
+class Cells(NamedTuple):
+    """Input and output arrays of `advance`; the first two dims are branch and point."""
+
+    frequency: Any  # Hz
+    parameters: Any  # (..., n_parameters)
+    slack: float  # see step_ratio
+    state: Any  # (branch, n_states): initial, at the end final
+    step_size: Any  # (branch,): initial [s] or 0, at the end the next
+    turns: Any  # int64 (branch, n_states): at the end the turns since the start
+    section: Any  # (..., n_keep, n_states)
+    measures: Any  # (..., n_measures)
+    status: Any  # int64
+    n_periods: Any  # int64
+    n_steps: Any  # int64, accepted
+    n_rejected: Any  # int64
+
+
+def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any) -> None:
+    """Put a branch's initial state and first cell into a lane."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    for i in range(N):
+        w_at = base + ROWS.state + i * WIDTH + column
+        work.lanes[w_at] = cells.state[branch, i]
+        work.turns[lane, i] = 0
+    work.branch[lane] = branch
+    start_point(cells, work, lane, ZERO, scratch)
+    # angles come in as given; from here on they are in (-pi, pi] at every section
+    take_section(work.lanes, base, column, scratch, work.turns[lane])
+    given = cells.step_size[branch]
+    cautious = FIRST_STEP * work.lanes[base + ROWS.period + column]
+    work.lanes[base + ROWS.wish + column] = given if given > 0.0 else cautious
+
+
+def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -> None:
+    """Begin the cell `point` of a lane's branch from the lane's state."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    branch = work.branch[lane]
+    frequency = cells.frequency[branch, point]
+    p = cells.parameters[branch, point]
+    load_cell(work.lanes, base, column, frequency, p, cells.slack, scratch, work.edge_table[lane])
+    work.edge[lane] = begin_period(work.lanes, base, column, work.edge_table[lane])
+    work.point[lane] = point
+    work.i_period[lane] = 0
+    for i in range(work.memory.shape[1]):
+        work.memory[lane, i] = 0.0
+    work.lanes[base + ROWS.fresh + column] = 1.0
+    work.lanes[base + ROWS.after_rejection + column] = 0.0
+    work.lanes[base + ROWS.event + column] = NOTHING
+
+
+def has_failed(status: int) -> bool:
+    """Whether a cell's sections are not to be used."""
+    return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW
+
+
+def forget(cells: Cells, branch: int, point: int) -> None:
+    """Take back the sections of a cell that failed."""
+    for i in range(cells.section.shape[2]):
+        for k in range(N):
+            cells.section[branch, point, i, k] = np.nan
+
+
+def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
+    """Write a finished cell's outcome."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    at = (work.branch[lane], work.point[lane])
+    cells.status[at] = status
+    cells.n_periods[at] = work.i_period[lane]
+    cells.n_steps[at] = int(work.lanes[base + ROWS.steps + column])
+    cells.n_rejected[at] = int(work.lanes[base + ROWS.rejected + column])
+    if has_failed(status):
+        forget(cells, work.branch[lane], work.point[lane])
+
+
+def end_branch(cells: Cells, work: Work, lane: int, status: int) -> None:
+    """Write a branch's last state; mark the points that it did not reach."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    branch = work.branch[lane]
+    for point in range(work.point[lane] + 1, cells.frequency.shape[1]):
+        cells.status[branch, point] = UNREACHED
+        forget(cells, branch, point)
+    for i in range(N):
+        cells.state[branch, i] = work.lanes[base + ROWS.state + i * WIDTH + column]
+        cells.turns[branch, i] = work.turns[lane, i]
+    cells.step_size[branch] = work.lanes[base + ROWS.wish + column]
+
+
+def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scratch: Any) -> bool:
+    """Act on a lane's event; return True when its branch has ended."""
+    w, base, column = work.lanes, (lane // WIDTH) * ROWS.size, lane % WIDTH
+    event = w[base + ROWS.event + column]
+    w[base + ROWS.event + column] = NOTHING
+    status = PENDING
+    if REWRITES and (event == REACHED or event == DUE):
+        renew_state(w, base, column, section, work.memory[lane], settings)
+        if event == DUE:
+            return False
+    if event == REACHED:
+        if work.edge[lane] < NE:
+            work.edge[lane] = begin_segment(w, base, column, work.edge_table[lane], work.edge[lane] + 1)
+            return False
+        work.i_period[lane] += 1
+        if take_section(w, base, column, section, work.turns[lane]):
+            at = (work.branch[lane], work.point[lane])
+            status = observe(
+                section, work.turns[lane], work.i_period[lane], work.memory[lane],
+                cells.section[at], cells.measures[at], settings,
+            )  # fmt: skip
+        else:
+            status = DIVERGED
+        if status == PENDING:
+            work.edge[lane] = begin_period(w, base, column, work.edge_table[lane])
+            return False
+    elif not in_bounds(w, base, column):
+        # a blow-up within a period shrinks the step before a section could show it
+        status = DIVERGED
+    elif event == TOO_MANY_STEPS:
+        status = STEP_LIMIT
+    else:
+        status = STEP_UNDERFLOW
+    end_cell(cells, work, lane, status)
+    if has_failed(status) or work.point[lane] + 1 == cells.frequency.shape[1]:
+        end_branch(cells, work, lane, status)
+        return True
+    start_point(cells, work, lane, work.point[lane] + 1, scratch)
+    return False
+
+
+def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: float, settings: Any) -> None:
+    """Integrate all branches, `n_lanes` at a time, and fill the output arrays of `cells`."""
+    n_branches = cells.frequency.shape[0]
+    active = min(n_lanes, n_branches)
+    n_groups = (active + WIDTH - 1) // WIDTH
+    size = n_groups * WIDTH
+    work = Work(
+        np.zeros(n_groups * ROWS.size), np.zeros(size, np.int64), np.zeros(size, np.int64),
+        np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros((size, N), np.int64),
+        np.zeros((size, 3, max(NE, 1))), np.zeros((size, memory_size(settings, N))),
+    )  # fmt: skip
+    scratch = np.zeros(max(NC, N))
+    section = np.zeros(N)
+    for lane in range(size):
+        # lanes beyond the last branch repeat it, so that they hold ordinary numbers; no one looks
+        start_branch(cells, work, lane, min(lane, n_branches - 1), scratch)
+    next_branch = active
+    # a field of a tuple is counted by an atomic operation at every use: too slow per lane
+    rows, events = work.lanes, np.zeros(n_groups, np.bool_)
+    while active > 0:
+        in_use = (active + WIDTH - 1) // WIDTH
+        attempt(rows, events, in_use, cells.slack, rtol, atol, max_attempts)
+        for group in range(in_use):
+            if not events[group]:
+                continue
+            lane, last = group * WIDTH, min(group * WIDTH + WIDTH, active)
+            while lane < last:
+                event = rows[group * ROWS.size + ROWS.event + lane % WIDTH]
+                if event == NOTHING or not serve(cells, work, lane, settings, section, scratch):
+                    lane += 1
+                elif next_branch < n_branches:
+                    start_branch(cells, work, lane, next_branch, scratch)
+                    next_branch += 1
+                    lane += 1
+                else:
+                    # the last lane moves here, with its event if it has one
+                    active -= 1
+                    copy_lane(work, active, lane)
+                    last = min(last, active)
+
+
+def copy_lane(work: Work, source: int, target: int) -> None:
+    """Copy everything that belongs to one lane to another."""
+    move_lane(work.lanes, source, target)
+    work.branch[target] = work.branch[source]
+    work.point[target] = work.point[source]
+    work.edge[target] = work.edge[source]
+    work.i_period[target] = work.i_period[source]
+    for i in range(N):
+        work.turns[target, i] = work.turns[source, i]
+    for i in range(NE):
+        for k in range(3):
+            work.edge_table[target, k, i] = work.edge_table[source, k, i]
+    for i in range(work.memory.shape[1]):
+        work.memory[target, i] = work.memory[source, i]
+
+
+_INLINE = (
+    "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period",
+    "in_bounds", "take_section", "renew_state", "move_lane", "has_failed",
+)  # fmt: skip
+_CALLED = (
+    "choose_step", "run_stage", "finish_step", "attempt",
+    "forget", "end_cell", "end_branch", "start_point", "start_branch", "serve", "copy_lane",
+)  # fmt: skip
+
+
+def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
+    """Names that the templates of this module use, bound to a system and an observer."""
+    name = f"{system.label}_{observer.name}"
+    bindings: dict[str, Any] = {
+        "ROWS": rows_of(system),
+        "N": system.n_states,
+        "N_CONTROLLED": system.controlled,
+        "NC": system.n_constants,
+        "NE": system.n_edges,
+        "HAS_LAYERS": system.has_layers,
+        "REWRITES": observer.rewrites,
+        "RENEW_BELOW": observer.renew_below,
+        "IS_ANGLE": system.is_angle,
+        "SCALES": system.scales,
+        "ESCAPE": system.escape,
+        "constants": system.constants,
+        "edges": system.edges,
+        "forcing": system.forcing,
+        "rhs": system.rhs,
+        "layers": system.layers,
+        "memory_size": observer.memory_size,
+        **observer.bindings,
+    }
+    for key in observers.HELPERS:
+        bindings[key] = inline(specialise(getattr(observers, key), name, **bindings))
+    bindings["observe"] = inline(specialise(observer.observe, name, **bindings))
+    bindings["renew"] = inline(specialise(observer.renew, name, **bindings))
+    for key in (*_INLINE, *_CALLED):
+        function = specialise(globals()[key], name, **bindings)
+        bindings[key] = inline(function) if key in _INLINE else njit(**UNCOUNTED)(function)
+    return bindings
+
+
+@cache
+def engine_of(system: System, observer: Observer) -> Callable[..., None]:
+    """Compile `advance` for a system and an observer."""
+    bindings = engine_bindings(system, observer)
+    cached = is_covered(*system.functions, observer.observe, observer.memory_size, observer.renew)
+    return kernel(specialise(advance, f"{system.label}_{observer.name}", **bindings), cached)

@@ -1,0 +1,185 @@
+"""What the engine does at each completed period: record, measure, decide.
+
+An observer is a pair of functions bound at compile time.
+
+``observe(section, turns, i_period, memory, record, measures, settings) -> status``
+    Called after period number `i_period` (1, 2, ...) of a cell. `section` is the state, angles in
+    (-pi, pi]; `turns` counts the full turns of each angle since the branch's start; `memory` is the
+    cell's own scratch vector, zero at the start; `record` (n_keep, n_states) and `measures` are the
+    cell's outputs. Returns ``PENDING`` to go on, any other status to end the cell.
+``memory_size(settings, n_states) -> int``
+    Length of `memory`.
+``renew(state, memory, settings)``, only where an observer rewrites states
+    Called at each edge of the forcing within a period, after a step that leaves the last state below
+    `renew_below`, and before `observe` at the period's end; the trajectory goes on from what it makes
+    of `state`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from magpend_core.engine.jit import inline
+from magpend_core.engine.vecmath import TWO_PI
+from magpend_core.status import Status
+
+PENDING, PERIODIC, BOUNDED = int(Status.PENDING), int(Status.PERIODIC), int(Status.BOUNDED)
+
+ORBIT_PERIOD = 0
+"""Column of `measures`: period of the orbit in drive periods, 0 if not closed."""
+FIRST_TURN = 1
+"""Columns of `measures` from here: turns of each state over the kept periods."""
+
+
+class Settings(NamedTuple):
+    """What the recording observers need to know."""
+
+    n_transient: int
+    n_keep: int
+    max_orbit_period: int
+    tolerance: float
+    window: int
+
+
+def _leave(state: Any, memory: Any, settings: Any) -> None:
+    """Rewrite nothing."""
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Named functions for the engine, with values for free names in them."""
+
+    name: str
+    observe: Callable[..., int]
+    memory_size: Callable[..., int]
+    bindings: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    renew: Callable[..., None] = _leave
+    renew_below: float = -math.inf
+
+    @property
+    def rewrites(self) -> bool:
+        """Whether `renew` does anything."""
+        return self.renew is not _leave
+
+
+HELPERS = ("_lag_distance", "_largest_lag", "_smallest_divisor", "closed_period")
+"""Templates here that an observer calls, callees first."""
+
+# layout of an observer's memory: three numbers, then a ring of the last `window` sections
+_SETTLED, _PERIOD, _KEPT, _RING = 0, 1, 2, 3
+
+
+def _lag_distance(ring: Any, i: int, j: int, window: int) -> float:
+    """Largest scaled difference of sections number `i` and `j` (1, 2, ...), angles on the circle."""
+    a, b = ((i - 1) % window) * N, ((j - 1) % window) * N
+    largest = 0.0
+    for k in range(N):
+        x = abs(ring[a + k] - ring[b + k])
+        if IS_ANGLE[k]:
+            x = min(x, abs(TWO_PI - x))
+        largest = max(largest, x / SCALES[k])
+    return largest
+
+
+def closed_period(ring: Any, last: int, settings: Settings) -> int:
+    """Period of the orbit on which the last sections close, or 0.
+
+    For each candidate period p, the distances between sections p apart are split into an older and
+    a younger half, with largest values D1 and D2. If they go on shrinking by r = D2/D1 per half
+    window, the sum of all that follow bounds the distance of the last section from the orbit:
+
+        D2 + m D2 r/(1 - r),   m = ceil(half window/p).
+
+    The orbit counts as closed if this bound is at most `tolerance`, or if D1 and D2 both are below a
+    hundredth of it (then integration error hides the decay). So a slow spiral is not mistaken for
+    the orbit that it approaches: at multipliers of modulus 0.96, the distance to the orbit is some
+    20 times that between successive sections.
+
+    What this does not exclude: a trajectory that passes an unstable orbit at a distance far below
+    the tolerance; a decay that becomes slower later on; and an approach along a stretched spiral that
+    turns by less than 0.05 rad per period, where the distance can exceed the tolerance twofold at
+    moduli of 0.96 to 0.99 and eightfold above.
+    """
+    n = min(last, settings.window)
+    for p in range(1, min(settings.max_orbit_period, n // 4) + 1):
+        half = (n - p) // 2
+        younger = _largest_lag(ring, last - half, last, p, settings)
+        if younger > settings.tolerance:
+            continue
+        older = _largest_lag(ring, last - 2 * half, last - half, p, settings)
+        steps = (half + p - 1) // p
+        hidden = max(older, younger) <= 0.01 * settings.tolerance
+        shrinking = younger < older
+        if hidden or (
+            shrinking and younger * (1.0 + steps * younger / (older - younger)) <= settings.tolerance
+        ):
+            return _smallest_divisor(ring, last, half, p, settings)
+    return 0
+
+
+def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -> float:
+    """Largest distance between sections `i` and ``i - p`` for first < i <= last."""
+    largest = 0.0
+    for i in range(first + 1, last + 1):
+        largest = max(largest, _lag_distance(ring, i, i - p, settings.window))
+    return largest
+
+
+def _smallest_divisor(ring: Any, last: int, half: int, p: int, settings: Settings) -> int:
+    """Smallest divisor of `p` that is a period too.
+
+    Near a slow spiral, sections p apart can settle before successive ones do. All of the younger
+    half lie within a few tolerances of the orbit, so ten of them tell the periods apart.
+    """
+    for q in range(1, p):
+        if p % q == 0 and _largest_lag(ring, last - half, last, q, settings) <= 10.0 * settings.tolerance:
+            return q
+    return p
+
+
+def _record(
+    section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: Settings
+) -> int:
+    """Keep `n_keep` sections after the transient, and say whether the orbit closes.
+
+    The transient lasts `n_transient` periods or, where `STOP_EARLY` is set, until the orbit has
+    closed (see `closed_period`; looked at every quarter window), if that comes first.
+    """
+    ring = memory[_RING:]
+    slot = ((i_period - 1) % settings.window) * N
+    for k in range(N):
+        ring[slot + k] = section[k]
+    if i_period <= settings.n_transient and memory[_SETTLED] == 0.0:
+        if STOP_EARLY and i_period >= settings.window and i_period % (settings.window // 4) == 0:
+            memory[_PERIOD] = closed_period(ring, i_period, settings)
+            memory[_SETTLED] = min(memory[_PERIOD], 1.0)
+        return PENDING
+    kept = int(memory[_KEPT])
+    memory[_KEPT] += 1.0
+    for k in range(N):
+        record[kept, k] = section[k]
+        if kept == 0:
+            measures[FIRST_TURN + k] = -turns[k]
+    if kept + 1 < settings.n_keep:
+        return PENDING
+    if memory[_PERIOD] == 0.0:
+        memory[_PERIOD] = closed_period(ring, i_period, settings)
+    measures[ORBIT_PERIOD] = memory[_PERIOD]
+    for k in range(N):
+        measures[FIRST_TURN + k] += turns[k]
+    return PERIODIC if memory[_PERIOD] > 0.0 else BOUNDED
+
+
+@inline
+def _memory_size(settings: Settings, n_states: int) -> int:
+    return _RING + settings.window * n_states
+
+
+RECORD_LAST = Observer("record_last", _record, _memory_size, {"STOP_EARLY": False})
+"""Keep `n_keep` sections after exactly `n_transient` periods."""
+
+RECORD_CLOSED = Observer("record_closed", _record, _memory_size, {"STOP_EARLY": True})
+"""Keep `n_keep` sections as soon as the orbit has closed, after `n_transient` periods at the latest."""

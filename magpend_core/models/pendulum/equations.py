@@ -1,0 +1,293 @@
+"""The full model: Wojna et al., J. Sound Vib. 430 (2018) 214-230, cited by equation number.
+
+Functions of numbers that are compiled for a float64 or for a group of lanes. The state is
+``(psi1, psi2, psi1_dot, psi2_dot)``: absolute angles of the links from the downward vertical [rad]
+and their rates [rad/s]; ``psi_rel = psi2 - psi1``. SI units throughout.
+
+Where the model completes or corrects the paper:
+
+* The magnetic torques stand on the right-hand side of Eq. 1, positive where they increase the
+  angle, so that a repelling magnet pushes the pendulum away from the bottom.
+* The bearing loads contain the accelerations (Eq. 9-11), which makes the model implicit. It is
+  solved, not simplified: a linear solve without the load-dependent friction, then two Newton steps.
+  The relative residual is below 1e-12 on the preset and grows with the fifth power of mu: 2e-12 at
+  twice the preset's mu, 6e-9 at ten times.
+* In the drive (Eq. 12) the constant `a` is added to the sine, and the phase is half of what Eq. 14
+  prints, so that the rising edge is at t = 0 and the high state lasts the fraction `duty_cycle`.
+* In Eq. 19 the second bracket is a sum, ``f1 + f2``.
+* Angles enter the magnet's torque modulo one turn: after a full rotation a link is where it was.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from magpend_core.engine.jit import inline
+from magpend_core.engine.simd import absolute, maximum, sqrt
+from magpend_core.engine.vecmath import TWO_OVER_PI, TWO_PI, atan, exp, sin, wrapped
+
+VACUUM_PERMEABILITY = 1.25663706212e-6  # N/A2, CODATA 2018
+
+
+class LinkConstants(NamedTuple):
+    """What the equations of motion, friction and drive use, derived from the parameters."""
+
+    B1: Any  # kg m2, J1 + e1^2 m1 + l1^2 m2
+    B2: Any  # kg m2, J2 + e2^2 m2
+    N12: Any  # kg m2, m2 e2 l1
+    M1: Any  # N m, m1 g e1 + m2 g l1
+    M2: Any  # N m, m2 g e2
+    B1_B2: Any
+    m1_g: Any  # N
+    m2_g: Any  # N
+    m1_e1: Any  # kg m
+    m2_e2: Any  # kg m
+    m2_l1: Any  # kg m
+    m1_e1_m2_l1: Any  # kg m
+    T1: Any  # N m
+    T2: Any  # N m
+    viscous1: Any  # N m s, 2 c
+    viscous2: Any  # N m s, c
+    mu: Any  # m
+    stribeck_floor: Any  # 2 mu0/pi
+    stribeck_drop: Any  # 2 (1 - mu0)/pi
+    c0: Any  # s/rad
+    eps: Any  # s/rad
+    per_eps: Any  # rad/s
+    omega: Any  # rad/s, of the drive
+    phase: Any  # rad, Eq. 14 corrected
+    offset: Any  # a of Eq. 13
+    drive_amplitude: Any  # N m, 2 q/pi of the square wave, q of the sine
+    eps_drive: Any
+    compliance1: Any  # 1/(kg m2), acceleration per torque on link 1, links in line
+    per_reversal1: Any  # 1/(rad2/s3), see `System.layers`
+    per_reversal2: Any
+
+
+class FittedConstants(NamedTuple):
+    """What the fitted magnet torque uses (Eq. 18-20)."""
+
+    half_alpha1: Any  # N m
+    half_alpha2: Any
+    beta1: Any  # rad
+    beta2: Any
+    per_gamma1: Any  # 1/rad
+    per_gamma2: Any
+    p1: Any
+    p2: Any
+    r1: Any  # rad
+    r2: Any
+    per_c1: Any  # 1/rad
+    per_c2: Any
+    m: Any  # slope of the middle of the peaks
+    n: Any  # rad
+    eps_mag: Any  # 1/rad
+    per_eps_mag: Any  # rad
+    l1: Any  # m
+    l2: Any
+    h: Any
+    per_h: Any  # 1/m
+    l1_per_h: Any
+    l2_per_h: Any
+    delta2: Any  # m2
+    per_magnet_jump: Any  # 1/(rad2/s2), see `System.layers`
+
+
+class DipoleConstants(NamedTuple):
+    """What the point-dipole torque uses (Eq. 16)."""
+
+    strength: Any  # N m2, mu_0 pole1 pole2/(4 pi)
+    l1: Any  # m
+    l2: Any
+    h: Any
+
+
+N_LINK = len(LinkConstants._fields)
+N_FITTED = len(FittedConstants._fields)
+N_DIPOLE = len(DipoleConstants._fields)
+
+
+def link_constants(frequency: Any, p: Any) -> Any:
+    """Derive `LinkConstants` from the drive frequency [Hz] and the packed parameters.
+
+    A template: `AT` tells where each parameter stands, `drive_constants` is that of the drive.
+    """
+    g, l1, m1, m2, e1, e2 = p[AT.g], p[AT.l1], p[AT.m1], p[AT.m2], p[AT.e1], p[AT.e2]
+    T1, T2, c, mu, mu0, eps = p[AT.T1], p[AT.T2], p[AT.c], p[AT.mu], p[AT.mu0], p[AT.eps]
+    B1 = p[AT.J1] + e1 * e1 * m1 + l1 * l1 * m2
+    B2 = p[AT.J2] + e2 * e2 * m2
+    N12 = m2 * e2 * l1
+    phase, offset, amplitude, eps_drive = drive_constants(p)
+    per_det = 1.0 / (B1 * B2 - N12 * N12)
+    jump1 = 2.0 * (T1 + mu * g * (m1 + m2)) * B2 * per_det
+    jump2 = 2.0 * (T2 + mu * g * m2) * (B1 + N12) * per_det
+    return LinkConstants(
+        B1, B2, N12, m1 * g * e1 + m2 * g * l1, m2 * g * e2, B1 * B2,
+        m1 * g, m2 * g, m1 * e1, m2 * e2, m2 * l1, m1 * e1 + m2 * l1,
+        T1, T2, 2.0 * c, c, mu, TWO_OVER_PI * mu0, TWO_OVER_PI * (1.0 - mu0), p[AT.c0], eps, 1.0 / eps,
+        TWO_PI * frequency, phase, offset, amplitude, eps_drive,
+        B2 * per_det, eps / max(jump1, 1e-30), eps / max(jump2, 1e-30),
+    )  # fmt: skip
+
+
+def square_wave_constants(p: Any) -> Any:
+    """Phase and offset (Eq. 13, 14, corrected), amplitude over pi/2 and steepness. A template."""
+    phase = (math.pi - TWO_PI * p[AT.duty_cycle]) / 2.0
+    return phase, -sin(phase), TWO_OVER_PI * p[AT.q], p[AT.eps_drive]
+
+
+def sine_constants(p: Any) -> Any:
+    """Phase, offset, amplitude, steepness (without use) of a sine. A template."""
+    return 0.0, 0.0, p[AT.q], 1.0
+
+
+@inline
+def sine_drive(t: Any, k: Any) -> Any:
+    """Driving torque [N m] at time `t` [s] after a rising zero: a sine instead of Eq. 12."""
+    return k.drive_amplitude * sin(k.omega * t)
+
+
+@inline
+def drive(t: Any, k: Any) -> Any:
+    """Driving torque M_e [N m] at time `t` [s] after a rising edge (Eq. 12-15)."""
+    return k.drive_amplitude * atan(k.eps_drive * (sin(k.omega * t + k.phase) + k.offset))
+
+
+@inline
+def stribeck(v: Any, k: Any) -> Any:
+    """Factor of the dry friction at relative velocity `v` [rad/s], in (-1, 1) (Eq. 7-8)."""
+    return atan(k.eps * v) * (k.stribeck_drop * exp(-(k.c0 * absolute(v))) + k.stribeck_floor)
+
+
+@inline
+def magnet_moment(psi1: Any, psi_rel: Any, k: Any) -> Any:
+    """Fitted torque M_M of the magnets about joint 1 [N m] (Eq. 18-19)."""
+    psi1 = wrapped(psi1)
+    psi_rel = wrapped(psi_rel)
+    u1 = (psi_rel + k.beta1) * k.per_gamma1
+    v1 = (psi1 + (k.p1 * psi_rel + k.r1)) * k.per_c1
+    u2 = (psi_rel + k.beta2) * k.per_gamma2
+    v2 = (psi1 + (k.p2 * psi_rel + k.r2)) * k.per_c2
+    half_f1 = k.half_alpha1 * exp(-(u1 * u1 + v1 * v1))
+    half_f2 = k.half_alpha2 * exp(-(u2 * u2 + v2 * v2))
+    step = TWO_OVER_PI * atan(k.eps_mag * (psi1 - (k.m * psi_rel + k.n)))
+    return (half_f1 - half_f2) * step + (half_f1 + half_f2)
+
+
+@inline
+def fitted_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
+    """Generalised torques (Q1, Q2) [N m] of the fitted magnet force (Eq. 20)."""
+    dx = k.l1 * s1 + k.l2 * s2
+    dy = k.h - k.l1 * c1 - k.l2 * c2
+    moment = magnet_moment(psi1, psi2 - psi1, k)
+    slope = dy * dx / (dx * dx + k.delta2)  # Fy/Fx
+    return (moment * k.l1_per_h) * (c1 + slope * s1), (moment * k.l2_per_h) * (c2 + slope * s2)
+
+
+@inline
+def dipole_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
+    """Generalised torques (Q1, Q2) [N m] of the point-dipole force (Eq. 16)."""
+    dx = k.l1 * s1 + k.l2 * s2
+    dy = k.h - k.l1 * c1 - k.l2 * c2
+    r2 = dx * dx + dy * dy
+    per_length = k.strength / (r2 * sqrt(r2))
+    fx = per_length * dx
+    fy = per_length * dy
+    return k.l1 * (fx * c1 + fy * s1), k.l2 * (fx * c2 + fy * s2)
+
+
+@inline
+def loads(s1: Any, c1: Any, s12: Any, c12: Any, w1: Any, w2: Any, a1: Any, a2: Any, k: Any) -> Any:
+    """Bearing loads (N1, N2) [N] (Eq. 9-11).
+
+    The force that link 2 puts on joint 2 is written in the frame of link 1, along and across it:
+    there N1 and N2 share most of their terms, and the acceleration of link 1 leaves the first.
+    """
+    w1w1 = w1 * w1
+    w2w2 = k.m2_e2 * (w2 * w2)
+    along = k.m2_g * c1 + k.m2_l1 * w1w1 + w2w2 * c12 - k.m2_e2 * s12 * a2
+    across = k.m2_g * s1 + w2w2 * s12 + k.m2_l1 * a1 + k.m2_e2 * c12 * a2
+    along1 = along + (k.m1_g * c1 + k.m1_e1 * w1w1)
+    across1 = across + (k.m1_g * s1 + k.m1_e1 * a1)
+    return sqrt(along1 * along1 + across1 * across1), sqrt(along * along + across * across)
+
+
+class _LoadTerms(NamedTuple):
+    """Forces in the joints as functions of the accelerations, in the frame of link 1 (see `loads`)."""
+
+    along0: Any  # N, joint 2, what does not depend on the accelerations
+    across0: Any
+    along10: Any  # N, joint 1
+    across10: Any
+    sine: Any  # kg m, m2 e2 sin(psi1 - psi2)
+    cosine: Any  # kg m, m2 e2 cos(psi1 - psi2)
+
+
+@inline
+def _newton_step(a1: Any, a2: Any, a1_free: Any, a2_free: Any, effect: Any, f: Any, k: Any) -> Any:
+    """One Newton step for a = a_free + P N(a).
+
+    With K = P dN/da, about 2e-3 in size, the inverse of 1 - K is taken as 1 + K.
+    """
+    p11, p12, p21, p22 = effect
+    along_a = f.sine * a2
+    across_a = f.cosine * a2
+    along = f.along0 - along_a
+    across = f.across0 + (k.m2_l1 * a1 + across_a)
+    along1 = f.along10 - along_a
+    across1 = f.across10 + (k.m1_e1_m2_l1 * a1 + across_a)
+    load1 = sqrt(along1 * along1 + across1 * across1)
+    load2 = sqrt(along * along + across * across)
+    r1 = (a1_free - a1) + (p11 * load1 + p12 * load2)
+    r2 = (a2_free - a2) + (p21 * load1 + p22 * load2)
+    # change of the loads along (r1, r2); weightless joints have load 0 and no gradient
+    sine = f.sine * r2
+    cosine = f.cosine * r2
+    change1 = (across1 * (k.m1_e1_m2_l1 * r1 + cosine) - along1 * sine) / maximum(load1, 1e-290)
+    change2 = (across * (k.m2_l1 * r1 + cosine) - along * sine) / maximum(load2, 1e-290)
+    return (
+        a1 + (r1 + (p11 * change1 + p12 * change2)),
+        a2 + (r2 + (p21 * change1 + p22 * change2)),
+    )
+
+
+@inline
+def solve_accelerations(
+    s1: Any, c1: Any, s2: Any, c2: Any, w1: Any, w2: Any, torque1: Any, torque2: Any, k: Any
+) -> Any:
+    """Accelerations (a1, a2) [rad/s2] from Eq. 1-11, implicit in the bearing loads.
+
+    `torque1` and `torque2` [N m] are the drive plus Q1, and Q2.
+    """
+    s12 = s1 * c2 - c1 * s2
+    c12 = c1 * c2 + s1 * s2
+    w1w1 = w1 * w1
+    w2w2 = w2 * w2
+    v2 = w2 - w1
+    g1 = stribeck(w1, k)
+    g2 = stribeck(v2, k)
+    r2 = k.T2 * g2 + k.viscous2 * v2
+    b1 = torque1 - (k.N12 * s12) * w2w2 - k.M1 * s1 - (k.T1 * g1 + k.viscous1 * w1) + r2
+    b2 = torque2 + (k.N12 * s12) * w1w1 - k.M2 * s2 - r2
+    n12 = k.N12 * c12
+    per_det = 1.0 / (k.B1_B2 - n12 * n12)
+    a1_free = (k.B2 * b1 - n12 * b2) * per_det
+    a2_free = (k.B1 * b2 - n12 * b1) * per_det
+    # a = a_free + P N(a): what a load of one newton does to the accelerations
+    u1 = (k.mu * per_det) * g1
+    u2 = (k.mu * per_det) * g2
+    p11 = -(k.B2 * u1)
+    p12 = (k.B2 + n12) * u2
+    p21 = n12 * u1
+    p22 = -((k.B1 + n12) * u2)
+    # the loads of `loads`, split into what does and does not depend on the accelerations
+    m2e2w2w2 = k.m2_e2 * w2w2
+    along0 = k.m2_g * c1 + k.m2_l1 * w1w1 + m2e2w2w2 * c12
+    across0 = k.m2_g * s1 + m2e2w2w2 * s12
+    along10 = along0 + (k.m1_g * c1 + k.m1_e1 * w1w1)
+    across10 = across0 + k.m1_g * s1
+    effect = (p11, p12, p21, p22)
+    terms = _LoadTerms(along0, across0, along10, across10, k.m2_e2 * s12, k.m2_e2 * c12)
+    a1, a2 = _newton_step(a1_free, a2_free, a1_free, a2_free, effect, terms, k)
+    return _newton_step(a1, a2, a1_free, a2_free, effect, terms, k)

@@ -1,0 +1,1 @@
+"""Coexisting attractors: found, described, followed along the axes."""

@@ -1,0 +1,268 @@
+"""Basins of attraction of a sweep: which cell goes where, how large each basin is, how tangled they are.
+
+Reads the cube and the ids of its attractors, integrates nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, get_args
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.basins.boundaries import Scaling, basin_entropy, uncertainty_exponent
+from pipeline.analysis.basins.labels import check_confidence, check_resamples
+from pipeline.analysis.basins.numbers import Interval, basin_fractions
+from pipeline.analysis.basins.wada import Metric, wada_merge_test
+from pipeline.layout import vocabulary
+from pipeline.layout.vocabulary import split_dims
+
+DIVERGED = -2
+"""Label of the cells that diverged: an outcome like an attractor. -1 is no outcome."""
+
+
+def basins(
+    ds: xr.Dataset,
+    ids: xr.Dataset,
+    *,
+    interval: Interval = "wilson",
+    confidence: float = 0.95,
+    box: int = 5,
+    block: int = 1,
+    scaling: Scaling = "perturbation",
+    radius: int = 1,
+    metric: Metric = "taxicab",
+    resamples: int = 200,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Basins of attraction at each parameter point of a sweep, and their numbers.
+
+    Parameters
+    ----------
+    ds
+        Cube of a sweep.
+    ids
+        Result of `match` for it, or of `identify`.
+    interval, confidence
+        Method and level of the intervals of the fractions, see `basin_numbers.binomial_interval`; the
+        level also of the bootstrap intervals.
+    box, block
+        Side of the boxes of the basin entropy [cells], side of the squares of boxes that its bootstrap
+        draws; see `basin_boundaries.basin_entropy`.
+    scaling
+        Method of `basin_boundaries.uncertainty_exponent`.
+    radius, metric
+        Of the Wada test [cells], see `basin_wada.wada_merge_test`.
+    resamples, seed
+        Of the bootstraps.
+
+    Returns
+    -------
+    Dataset
+        On the cells: `attractor_id`, `decision`, `status`, `n_periods`. On the parameter dims and
+        `label`, the ids and -2 where cells diverged: `count`, `fraction` and all that
+        `basin_numbers.basin_fractions` returns, cells without an outcome being unfinished. On the
+        parameter dims: `n_pending`, `n_undecided` (bounded, but on nothing found) and `n_failed` (step
+        limits), which add up to `n_unfinished`.
+
+        If the starts are a grid, evenly spaced along every axis, on the parameter dims:
+        `basin_entropy`, `boundary_basin_entropy`, `uncertainty_exponent`, `wada_beyond`, each with
+        `_stderr`, `_low`, `_high`; `above_ln2_surely`, `boundary_dimension`, `exponent_r_squared`;
+        `wada_distance`, the smallest radius [cells] that passes the Wada test; `wada`: 1 passes with
+        `radius`, 0 does not, -1 fewer than three labels; and, on `epsilon` too, `uncertain`. A number
+        that the grid does not allow is NaN, and the attribute ``not_computed`` says why.
+
+    Raises
+    ------
+    ValueError
+        If the cube is a continuation, or an option is out of bounds.
+    """
+    check_basin_options(
+        interval=interval, confidence=confidence, box=box, block=block, scaling=scaling, radius=radius,
+        metric=metric, resamples=resamples,
+    )  # fmt: skip
+    check_starts(ds)
+    dims, start_dims = split_dims(ids["attractor_id"])
+    cells = ids[["attractor_id", "decision", "status"]].drop_dims("attractor", errors="ignore")
+    result = cells.assign(n_periods=ds["n_periods"].transpose(*dims, *start_dims).load())
+    labels = outcomes(ids)
+    fractions = basin_fractions(
+        labels, dims=start_dims, ids=ids["attractor"].values.tolist(),
+        inferred=ids["status"] == vocabulary.INFERRED, confidence=confidence, method=interval,
+    )  # fmt: skip
+    result = result.assign(fractions.data_vars).assign(_unfinished(ids, start_dims))
+    result = result.assign_coords(label=fractions["label"])
+    reason = _no_grid(ds, start_dims)
+    points = _Points(dims, tuple(ids.sizes[d] for d in dims))
+    if not reason:
+        common: dict[str, Any] = {"resamples": resamples, "confidence": confidence, "seed": seed}
+        for index in np.ndindex(*points.shape):
+            grid = labels.isel(dict(zip(dims, index, strict=True))).values
+            for number in _boundary(grid, box, block, scaling, radius, metric, common, points.missing):
+                points.add(index, *number)
+        result = result.assign(points.variables())
+    reasons = "\n".join([reason] if reason else sorted(points.missing))
+    about = {"basin_interval": interval, "basin_confidence": confidence, "basin_box": box,
+             "basin_block": block, "basin_scaling": scaling, "basin_radius": radius,
+             "basin_metric": metric, "basin_resamples": resamples, "basin_seed": seed}  # fmt: skip
+    return result.assign_attrs({**ids.attrs, **about, "not_computed": reasons})
+
+
+def check_basin_options(**options: Any) -> None:
+    """Refuse options that no cube allows."""
+    check_confidence(options["confidence"])
+    check_resamples(options["resamples"])
+    for name, least in (("box", 2), ("block", 1), ("radius", 1)):
+        if options[name] < least:
+            raise ValueError(f"{name} = {options[name]} is out of bounds: it must be {least} or more.")
+    for name, words in (("interval", Interval), ("scaling", Scaling), ("metric", Metric)):
+        if options[name] not in get_args(words):
+            raise ValueError(
+                f"{name} = {options[name]!r}: must be {' or '.join(map(repr, get_args(words)))}."
+            )
+
+
+def check_starts(ds: xr.Dataset) -> None:
+    """Refuse a cube whose cells are no independent initial conditions."""
+    if "branch" in ds["status"].dims:
+        raise ValueError(
+            'basins need independent initial conditions, a sweep (kind = "sweep"): where a branch of a '
+            "continuation starts is the end of its last point."
+        )
+    if not split_dims(ds["status"])[1]:
+        raise ValueError("basins need several initial conditions per parameter point; this run has one.")
+
+
+def outcomes(ids: xr.Dataset) -> xr.DataArray:
+    """Label of each cell: its attractor, -2 (`DIVERGED`), or -1 if its outcome is not known."""
+    label = ids["attractor_id"].values.copy()
+    label[ids["status"].values == vocabulary.DIVERGED] = DIVERGED
+    return ids["attractor_id"].copy(data=label)
+
+
+def _unfinished(ids: xr.Dataset, start_dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
+    """Numbers of cells without an outcome, by what became of them."""
+    status, unknown = ids["status"], ids["attractor_id"] < 0
+    pending, diverged = status == vocabulary.PENDING, status == vocabulary.DIVERGED
+    failed = status.isin(vocabulary.FAILED)
+    kinds = {
+        "n_pending": (pending, "cells not computed"),
+        "n_undecided": (
+            unknown & ~pending & ~failed & ~diverged,
+            "cells on nothing found",
+        ),
+        "n_failed": (unknown & failed, "cells that could not be integrated"),
+    }
+    return {
+        name: (which & unknown).sum(start_dims, dtype=np.int64).assign_attrs(units="1", long_name=text)
+        for name, (which, text) in kinds.items()
+    }
+
+
+def _no_grid(ds: xr.Dataset, start_dims: tuple[str, ...]) -> str:
+    """Why the starts are no regular grid, empty if they are."""
+    if "initial_condition" in start_dims:
+        return "boundaries: the starts are no grid"
+    for dim in start_dims:
+        steps = np.diff(ds[dim].values)
+        if np.ptp(steps) > 1e-6 * np.abs(steps).max(initial=0.0):
+            return f"boundaries: {dim} is not evenly spaced"
+    return ""
+
+
+_LONG_NAMES = {
+    "basin_entropy": ("nat", "basin entropy"),
+    "boundary_basin_entropy": ("nat", "boundary basin entropy"),
+    "above_ln2_surely": ("1", "boundary basin entropy surely above ln 2: a fractal boundary; -1 not known"),
+    "uncertainty_exponent": ("1", "uncertainty exponent"),
+    "boundary_dimension": ("1", "dimension of the basin boundary"),
+    "exponent_r_squared": ("1", "R squared of the fit of the uncertainty exponent"),
+    "wada_distance": ("cells", "largest distance between boundaries, the least radius that passes"),
+    "wada_beyond": ("1", "part of all cells that is off the common boundary"),
+    "wada": ("1", "passes the Wada merge test; -1 fewer than three labels"),
+    "uncertain": ("1", "uncertain part of the region"),
+}
+_FLAGS = ("above_ln2_surely", "wada")
+_ERRORS = ("stderr", "low", "high")
+_SCALARS = (
+    *(f"{name}{end}" for name in ("basin_entropy", "boundary_basin_entropy", "uncertainty_exponent",
+      "wada_beyond") for end in ("", *(f"_{e}" for e in _ERRORS))),
+    "above_ln2_surely", "boundary_dimension", "exponent_r_squared", "wada_distance", "wada",
+)  # fmt: skip
+
+
+class _Points:
+    """Numbers per parameter point, gathered one by one."""
+
+    def __init__(self, dims: tuple[str, ...], shape: tuple[int, ...]) -> None:
+        self.dims, self.shape = dims, shape
+        self.missing: set[str] = set()
+        self._scalars = {
+            name: np.full(shape, -1, np.int8) if name in _FLAGS else np.full(shape, np.nan)
+            for name in _SCALARS
+        }
+        self._epsilon = np.empty(0, np.int64)
+        self._uncertain: dict[tuple[int, ...], np.ndarray] = {}
+
+    def add(self, index: tuple[int, ...], name: str, value: Any) -> None:
+        """Take in one number of a point."""
+        if name == "uncertain":
+            self._epsilon, self._uncertain[index] = value["epsilon"].values, value.values
+        else:
+            self._scalars[name][index] = value
+
+    def variables(self) -> dict[str, Any]:
+        """As xarray takes them."""
+        found: dict[str, Any] = {}
+        for name, values in self._scalars.items():
+            base = next((name.removesuffix(f"_{e}") for e in _ERRORS if name.endswith(f"_{e}")), name)
+            units, text = _LONG_NAMES[base]
+            suffix = name.removeprefix(base).replace("_stderr", ", standard error").replace("_", ", ")
+            found[name] = (self.dims, values, {"units": units, "long_name": text + suffix})
+        if self._uncertain:
+            table = np.full((*self.shape, len(self._epsilon)), np.nan)
+            for index, values in self._uncertain.items():
+                table[index] = values
+            units, text = _LONG_NAMES["uncertain"]
+            found["uncertain"] = ((*self.dims, "epsilon"), table, {"units": units, "long_name": text})
+            found["epsilon"] = ("epsilon", self._epsilon, {"units": "cells"})
+        return found
+
+
+def _boundary(
+    grid: np.ndarray, box: int, block: int, scaling: Scaling, radius: int, metric: Metric,
+    common: dict[str, Any], missing: set[str],
+) -> Iterator[tuple[str, Any]]:  # fmt: skip
+    """Numbers on the boundaries of one grid of labels, by name."""
+    if not (grid != -1).any():
+        return
+    try:
+        entropy = basin_entropy(grid, box, block=block, **common)
+    except ValueError as error:
+        missing.add(f"basin entropy: {error}")
+    else:
+        for ours, theirs in (("basin_entropy", "entropy"), ("boundary_basin_entropy", "boundary_entropy")):
+            yield from _with_errors(entropy, ours, theirs)
+        if np.isfinite(entropy["boundary_entropy_low"]):
+            yield "above_ln2_surely", int(entropy["above_ln2_surely"])
+    try:
+        exponent = uncertainty_exponent(grid, method=scaling, **common)
+    except ValueError as error:
+        missing.add(f"uncertainty exponent: {error}")
+    else:
+        yield from _with_errors(exponent, "uncertainty_exponent", "exponent")
+        yield "boundary_dimension", float(exponent["boundary_dimension"])
+        yield "exponent_r_squared", float(exponent["r_squared"])
+        yield "uncertain", exponent["uncertain"]
+    if np.unique(grid[grid != -1]).size >= 3:
+        wada = wada_merge_test(grid, radius, metric=metric, **common).isel(radius=0)
+        yield from _with_errors(wada, "wada_beyond", "beyond")
+        yield "wada_distance", float(wada["hausdorff_distance"])
+        yield "wada", int(wada["wada"])
+
+
+def _with_errors(ds: xr.Dataset, ours: str, theirs: str) -> Iterator[tuple[str, float]]:
+    yield ours, float(ds[theirs])
+    for end in _ERRORS:
+        yield f"{ours}_{end}", float(ds[f"{theirs}_{end}"])

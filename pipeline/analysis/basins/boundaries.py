@@ -1,0 +1,389 @@
+"""How hard it is to tell the basin of a state: basin entropy and uncertainty exponent.
+
+Both read a grid of labels (see `basin_labels`) with one cell per initial condition, evenly spaced
+along each axis, in any number of dimensions. Their values depend on the resolution of the grid and on
+the boxes: compare basins at the same ones. Errors come from resampling parts of the grid; they tell how
+much the value would differ in another region that looks alike, not what a finer grid would show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from pipeline.analysis.basins.labels import (
+    UNFINISHED,
+    Codes,
+    Floats,
+    Ints,
+    bootstrap_weights,
+    check_confidence,
+    check_resamples,
+    read_labels,
+    spread,
+    tile_numbers,
+    tile_sums,
+    tiles_per_side,
+)
+
+LN_2 = float(np.log(2.0))
+"""Boundary basin entropy above which the boundary must be fractal."""
+
+Scaling = Literal["perturbation", "boxes", "entropy"]
+
+_EXPONENT_REFERENCES = {
+    "perturbation": "McDonald, Grebogi, Ott and Yorke, Physica D 17, 125 (1985)",
+    "boxes": "McDonald, Grebogi, Ott and Yorke, Physica D 17, 125 (1985)",
+    "entropy": "Daza et al., Sci. Rep. 6, 31416 (2016)",
+}
+
+
+class _Boxes(NamedTuple):
+    """Content of each box: entropy, number of labels, number of finished cells."""
+
+    entropy: Floats
+    n_labels: Ints
+    n_finished: Ints
+
+
+FEWEST_DRAWN = 5
+"""Fewest boxes that say something about the error of their mean: a single one is never drawn otherwise."""
+
+
+def basin_entropy(
+    labels: npt.ArrayLike | xr.DataArray,
+    box: int | Sequence[int] = 5,
+    *,
+    unfinished: Collection[int] = UNFINISHED,
+    block: int = 1,
+    resamples: int = 200,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Basin entropy and boundary basin entropy, with bootstrap errors over boxes.
+
+    The grid is cut into boxes; the entropy of a box is that of the labels in it,
+    ``S_i = sum_j p_ij ln(1/p_ij)``. The basin entropy is its mean over all boxes, the boundary basin
+    entropy its mean over the boxes with two labels or more (Daza, Wagemakers, Georgeot, Guéry-Odelin
+    and Sanjuán, Sci. Rep. 6, 31416, 2016). If the latter exceeds ln 2 the boundary is fractal: a smooth
+    one separates two basins in nearly every box. The converse does not hold, and two labels can never
+    exceed ln 2.
+
+    Parameters
+    ----------
+    labels
+        Outcome per cell of a regular grid, integers, any number of dims.
+    box
+        Side of a box [cells], one for all dims or one each. Cells at the far edges that fill no box are
+        left out (`fraction_used`).
+    unfinished
+        Codes of cells whose outcome is not known: left out of their box, and a box of nothing else is
+        left out of the means. With ``()`` they count as a label like any other.
+    block
+        Side of the square of boxes that the bootstrap draws as one. Boxes next to each other are alike;
+        with 1 they are drawn singly and the errors come out too small for structures wider than a box.
+    resamples, confidence, seed
+        Bootstrap samples, level of the percentile intervals, seed.
+
+    Returns
+    -------
+    Dataset
+        `entropy` and `boundary_entropy` [nat], each with `_stderr`, `_low`, `_high`; `n_boxes`,
+        `n_boundary_boxes`, `n_labels`, `fraction_used`, `fraction_unfinished`; `above_ln2`: the boundary
+        entropy exceeds ln 2, `above_ln2_surely`: so does the lower end of its interval. Without a
+        boundary box the boundary entropy is NaN. Errors are NaN with fewer than `FEWEST_DRAWN` (boundary)
+        boxes, or squares of them, to draw from. That the boxes are small against the basins is not
+        validated.
+
+    Raises
+    ------
+    TypeError
+        If the labels are not integers.
+    ValueError
+        If a box holds one cell only or is larger than the grid, or `block`, `resamples` or `confidence`
+        is out of range.
+    """
+    check_confidence(confidence)
+    check_resamples(resamples)
+    grid = read_labels(labels, unfinished)
+    sides = _box_sides(box, grid.codes.shape)
+    if block < 1:
+        raise ValueError(f"block is {block}, below 1: give the number of boxes drawn as one, per side")
+    boxes = _fill_boxes(grid.codes, sides)
+    used = boxes.n_finished > 0
+    boundary = boxes.n_labels > 1
+    sums = np.stack([_pool(part, block) for part in (boxes.entropy, used, boundary)])
+    value = _entropies(sums.sum(axis=1))
+    weights = bootstrap_weights(sums.shape[1], resamples, seed)
+    errors = np.array(spread(np.array([_entropies(sums @ w) for w in weights]), confidence))
+    errors[:, (sums[1:] > 0).sum(axis=1) < FEWEST_DRAWN] = np.nan
+    stderr, low, high = errors
+    ds = xr.Dataset()
+    long_names = {"entropy": "basin entropy", "boundary_entropy": "boundary basin entropy"}
+    for i, (name, long_name) in enumerate(long_names.items()):
+        ds[name] = ((), value[i], {"long_name": long_name, "units": "nat"})
+        for end, of in (("stderr", stderr), ("low", low), ("high", high)):
+            ds[f"{name}_{end}"] = ((), of[i])
+    return ds.assign(
+        n_boxes=int(used.sum()),
+        n_boundary_boxes=int(boundary.sum()),
+        n_labels=grid.ids.size,
+        fraction_used=float(boxes.n_labels.size * np.prod(sides) / grid.codes.size),
+        fraction_unfinished=grid.fraction_unfinished,
+        above_ln2=bool(value[1] > LN_2),
+        above_ln2_surely=bool(low[1] > LN_2),
+    ).assign_attrs(
+        box=list(sides),
+        block=block,
+        resamples=resamples,
+        confidence=confidence,
+        seed=seed,
+        unfinished_codes=sorted(unfinished),
+        references=_EXPONENT_REFERENCES["entropy"],
+    )
+
+
+def uncertainty_exponent(
+    labels: npt.ArrayLike | xr.DataArray,
+    *,
+    epsilons: Sequence[int] | None = None,
+    method: Scaling = "perturbation",
+    unfinished: Collection[int] = UNFINISHED,
+    resamples: int = 200,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Uncertainty exponent alpha: the uncertain part of the region scales as ``f(eps) ~ eps**alpha``.
+
+    alpha is the dimension of the region less that of the boundary: 1 for a smooth boundary, near 0 where
+    a better initial condition hardly helps to tell the outcome (McDonald, Grebogi, Ott and Yorke,
+    Physica D 17, 125, 1985; Grebogi, McDonald, Ott and Yorke, Phys. Lett. A 99, 415, 1983). It is the
+    slope of ln f against ln eps by least squares.
+
+    Parameters
+    ----------
+    labels
+        Outcome per cell of a regular grid, integers, any number of dims.
+    epsilons
+        Perturbations or box sides [cells], at least three; None: twelve or fewer, evenly spaced in the
+        logarithm, up to a tenth of the shortest side.
+    method
+        What f is. ``"perturbation"``: the part of the cells whose outcome differs from that of the cell
+        `eps` before or after it along an axis, all axes pooled, the definition of 1985; every cell far
+        enough from the edge for the largest `eps` is a trial. ``"boxes"``: the part of the boxes of side
+        `eps` with more than one label, box counting; a small box sees its content through few cells,
+        so the smallest sides bias the slope. ``"entropy"``: the basin entropy with boxes of side `eps`,
+        of which Daza et al. (Sci. Rep. 6, 31416, 2016) show that it scales alike.
+    unfinished
+        Codes of cells whose outcome is not known: trials with such a cell are left out, boxes are judged
+        by the rest.
+    resamples, confidence, seed
+        Bootstrap samples of tiles of the grid, level of the percentile interval, seed.
+
+    Returns
+    -------
+    Dataset
+        `exponent`; `exponent_stderr_fit` from the scatter about the line, too small since all points
+        come from the same grid; `exponent_stderr`, `exponent_low`, `exponent_high` from fits to about 64
+        tiles drawn with replacement; `boundary_dimension`; `intercept`, `r_squared`;
+        `fraction_unfinished`. On `epsilon`: `uncertain`, which is f; `used`: f > 0, so part of the fit;
+        `fitted`. NaN if fewer than three points can be used, as without a boundary. That the points
+        follow a power law is not validated: look at them.
+
+    Raises
+    ------
+    TypeError
+        If the labels are not integers.
+    ValueError
+        If there are fewer than three different `epsilons`, or one that does not fit into the grid, or
+        `method`, `resamples` or `confidence` is out of range.
+    """
+    check_confidence(confidence)
+    check_resamples(resamples)
+    if method not in _EXPONENT_REFERENCES:
+        raise ValueError(f"method is {method!r}: use one of {sorted(_EXPONENT_REFERENCES)}")
+    grid = read_labels(labels, unfinished)
+    shape = grid.codes.shape
+    eps = _epsilons(epsilons, shape, method)
+    if method == "perturbation":
+        trials, hits = _perturbed(grid.codes, eps)
+    else:
+        trials, hits = _boxed(grid.codes, eps, method)
+    uncertain = _ratio(hits.sum(axis=1), trials.sum(axis=1))
+    fit = _fit_line(eps, uncertain)
+    weights = bootstrap_weights(trials.shape[1], resamples, seed)
+    slopes = np.array([_fit_line(eps, _ratio(hits @ w, trials @ w)).slope for w in weights])
+    stderr, low, high = spread(slopes, confidence)
+    return xr.Dataset(
+        {
+            "exponent": ((), fit.slope, {"long_name": "uncertainty exponent", "units": "1"}),
+            "exponent_stderr": ((), stderr),
+            "exponent_low": ((), low),
+            "exponent_high": ((), high),
+            "exponent_stderr_fit": ((), fit.stderr),
+            "boundary_dimension": ((), len(shape) - fit.slope),
+            "intercept": ((), fit.intercept),
+            "r_squared": ((), fit.r_squared),
+            "fraction_unfinished": ((), grid.fraction_unfinished),
+            "uncertain": ("epsilon", uncertain),
+            "used": ("epsilon", uncertain > 0.0),
+            "fitted": ("epsilon", np.exp(fit.intercept) * eps**fit.slope),
+        },
+        coords={"epsilon": ("epsilon", eps, {"units": "cells"})},
+        attrs={
+            "method": method,
+            "resamples": resamples,
+            "confidence": confidence,
+            "seed": seed,
+            "unfinished_codes": sorted(unfinished),
+            "references": _EXPONENT_REFERENCES[method],
+        },
+    )
+
+
+# --- boxes ---------------------------------------------------------------------------------------------
+
+
+def _box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Sides of a box along each axis, checked against the grid."""
+    given = np.atleast_1d(np.asarray(box, dtype=np.int64)).tolist()
+    sides = tuple(given) * (len(shape) if len(given) == 1 else 1)
+    if len(sides) != len(shape):
+        raise ValueError(f"box {box} has {len(sides)} sides, the grid {len(shape)} dims: give 1 or one each")
+    if min(sides, default=0) < 1 or int(np.prod(sides)) < 2:
+        raise ValueError(f"box {sides} does not hold 2 cells: an entropy needs sides of 2 or more, such as 5")
+    if any(side > n for side, n in zip(sides, shape, strict=True)):
+        raise ValueError(f"box {sides} is larger than the grid {shape}: use a smaller box or more cells")
+    return sides
+
+
+def _fill_boxes(codes: Codes, sides: tuple[int, ...]) -> _Boxes:
+    """Entropy [nat] and number of labels in each box; unfinished cells are left out.
+
+    The cells of each box are sorted, so the work does not grow with the number of labels.
+    """
+    n = tuple(size // side for size, side in zip(codes.shape, sides, strict=True))
+    cut = codes[tuple(slice(0, k * side) for k, side in zip(n, sides, strict=True))]
+    pairs = cut.reshape([part for pair in zip(n, sides, strict=True) for part in pair])
+    order = (*range(0, 2 * len(n), 2), *range(1, 2 * len(n), 2))
+    content = np.sort(pairs.transpose(order).reshape(-1, int(np.prod(sides))), axis=1)
+    first = np.ones(content.shape, dtype=np.bool_)
+    first[:, 1:] = content[:, 1:] != content[:, :-1]
+    start = np.flatnonzero(first)
+    run = np.diff(start, append=content.size)
+    known = content.ravel()[start] >= 0
+    index, run = (start // content.shape[1])[known], run[known]
+    n_finished = np.bincount(index, weights=run, minlength=len(content)).astype(np.int64)
+    n_labels = np.bincount(index, minlength=len(content)).astype(np.int64)
+    p = run / n_finished[index]
+    entropy = np.bincount(index, weights=-p * np.log(p), minlength=len(content))
+    return _Boxes(entropy.reshape(n), n_labels.reshape(n), n_finished.reshape(n))
+
+
+def _pool(values: npt.NDArray[np.generic], block: int) -> Floats:
+    """Sums over blocks of `block` elements a side, the last ones smaller; flat."""
+    out = values.astype(np.float64)
+    for axis, n in enumerate(values.shape):
+        out = np.add.reduceat(out, np.arange(0, n, block), axis=axis)
+    return out.ravel()
+
+
+def _entropies(sums: Floats) -> Floats:
+    """Mean entropy over all boxes and over boundary boxes, from the sums of both kinds."""
+    return _ratio(np.array([sums[0], sums[0]]), sums[1:])
+
+
+def _ratio(hits: Floats, trials: Floats) -> Floats:
+    """Quotient, NaN where there is no trial."""
+    return np.where(trials > 0.0, hits / np.where(trials > 0.0, trials, 1.0), np.nan)
+
+
+# --- scaling -------------------------------------------------------------------------------------------
+
+
+class _Line(NamedTuple):
+    """A straight line fitted to the logarithms."""
+
+    slope: float
+    intercept: float
+    stderr: float
+    r_squared: float
+
+
+def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Scaling) -> Ints:
+    """Perturbations or box sides [cells], ascending, checked against the grid."""
+    first = 1 if method == "perturbation" else 2
+    shortest = min(shape)
+    # a perturbation needs room on both sides, a box must fit
+    limit = (shortest - 1) // 2 if method == "perturbation" else shortest
+    if epsilons is None:
+        last = max(first + 2, shortest // 10)
+        eps = np.unique(np.rint(np.geomspace(first, last, 12)).astype(np.int64))
+    else:
+        eps = np.unique(np.asarray(epsilons, dtype=np.int64))
+    if eps.size < 3:
+        raise ValueError(f"epsilons {eps.tolist()} are fewer than 3 different ones: a slope needs 3 or more")
+    if eps[0] < first or eps[-1] > limit:
+        raise ValueError(
+            f"epsilons from {eps[0]} to {eps[-1]} are not within {first} and {limit}, which the grid {shape} "
+            f"allows for {method!r}: choose others, or use a finer grid"
+        )
+    return eps
+
+
+def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
+    """Trials and uncertain trials per epsilon and tile.
+
+    Every epsilon has the same trials, the cells that have room for the largest; else f would not be
+    a straight line even for a straight boundary.
+    """
+    n_tiles = tiles_per_side(codes.shape) ** codes.ndim
+    trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))
+    room = int(eps[-1])
+    for axis, size in enumerate(codes.shape):
+        middle = _window(codes, axis, room, size - room)
+        margin = tuple(room if k == axis else 0 for k in range(codes.ndim))
+        tile = tile_numbers(middle.shape, codes.shape, margin=margin)
+        for i, e in enumerate(eps):
+            before = _window(codes, axis, room - int(e), size - room - int(e))
+            after = _window(codes, axis, room + int(e), size - room + int(e))
+            known = (middle >= 0) & (before >= 0) & (after >= 0)
+            trials[i] += tile_sums(known, tile, n_tiles)
+            hits[i] += tile_sums(known & ((middle != before) | (middle != after)), tile, n_tiles)
+    return trials, hits
+
+
+def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
+    """Boxes, and boxes with more than one label or the sum of their entropies, per epsilon and tile."""
+    n_tiles = tiles_per_side(codes.shape) ** codes.ndim
+    trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))
+    for i, e in enumerate(eps):
+        boxes = _fill_boxes(codes, (int(e),) * codes.ndim)
+        tile = tile_numbers(boxes.n_labels.shape, codes.shape, step=int(e))
+        trials[i] = tile_sums(boxes.n_finished > 0, tile, n_tiles)
+        hits[i] = tile_sums(boxes.entropy if method == "entropy" else boxes.n_labels > 1, tile, n_tiles)
+    return trials, hits
+
+
+def _window(codes: Codes, axis: int, start: int, stop: int) -> Codes:
+    """Part of the grid between two positions along an axis."""
+    return codes[tuple(slice(start, stop) if k == axis else slice(None) for k in range(codes.ndim))]
+
+
+def _fit_line(eps: Ints, f: Floats) -> _Line:
+    """Least-squares line through ln f against ln eps where f > 0; NaN with fewer than three points."""
+    use = f > 0.0
+    if use.sum() < 3:
+        return _Line(np.nan, np.nan, np.nan, np.nan)
+    x, y = np.log(eps[use]), np.log(f[use])
+    dx, dy = x - x.mean(), y - y.mean()
+    slope = float(dx @ dy / (dx @ dx))
+    left = float(((dy - slope * dx) ** 2).sum())
+    total = float(dy @ dy)
+    stderr = float(np.sqrt(left / (x.size - 2) / (dx @ dx)))
+    r_squared = 1.0 - left / total if total > 0.0 else 1.0
+    return _Line(slope, float(y.mean() - slope * x.mean()), stderr, r_squared)

@@ -1,0 +1,347 @@
+"""Numbers on basins of attraction, each with its error.
+
+Basin fractions and tipping probabilities are here; basin entropy and uncertainty exponent are in
+`basin_boundaries`, the Wada test in `basin_wada`, and all can be imported from here. They take labels:
+an integer per cell that names its outcome (see `basin_labels`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy import special
+
+from pipeline.analysis.basins.boundaries import basin_entropy, uncertainty_exponent
+from pipeline.analysis.basins.labels import UNFINISHED, Floats, LabelGrid, check_confidence, read_labels
+from pipeline.analysis.basins.wada import wada_merge_test
+
+__all__ = [
+    "basin_entropy",
+    "basin_fractions",
+    "binomial_interval",
+    "tipping_probabilities",
+    "uncertainty_exponent",
+    "wada_merge_test",
+]
+
+Interval = Literal["wilson", "clopper-pearson"]
+
+_REFERENCES = {
+    "wilson": "Wilson, J. Am. Stat. Assoc. 22, 209 (1927)",
+    "clopper-pearson": "Clopper and Pearson, Biometrika 26, 404 (1934)",
+}
+
+
+def binomial_interval(
+    count: npt.ArrayLike, n: npt.ArrayLike, *, confidence: float = 0.95, method: Interval = "wilson"
+) -> tuple[Floats, Floats]:
+    """Confidence interval of a probability from `count` hits in `n` independent trials.
+
+    Wilson's score interval (J. Am. Stat. Assoc. 22, 209, 1927) covers the truth at the stated rate on
+    average over the probability; Clopper and Pearson's (Biometrika 26, 404, 1934) at least at the
+    stated rate for every probability, and is wider. Both are compared by Brown, Cai and DasGupta
+    (Stat. Sci. 16, 101, 2001). Neither collapses to a point at 0 or `n` hits.
+
+    Parameters
+    ----------
+    count, n
+        Hits and trials, arrays that broadcast; ``n = 0`` gives (0, 1).
+    confidence
+        Two-sided level, between 0 and 1.
+    method
+        ``"wilson"`` or ``"clopper-pearson"``.
+
+    Returns
+    -------
+    low, high
+        Ends of the intervals, within [0, 1]. That the trials are independent is not validated.
+
+    Raises
+    ------
+    ValueError
+        If the level or the method is unknown, or hits are not between 0 and the trials.
+    """
+    check_confidence(confidence)
+    k, trials = (np.asarray(x, dtype=np.float64) for x in np.broadcast_arrays(count, n))
+    if np.any(k < 0) or np.any(k > trials):
+        raise ValueError(f"count {k.tolist()} is not within 0 and n {trials.tolist()}: count hits among n")
+    tail = 0.5 * (1.0 - confidence)
+    safe = np.maximum(trials, 1.0)
+    if method == "wilson":
+        z2 = special.ndtri(1.0 - tail) ** 2
+        centre = k + 0.5 * z2
+        half = np.sqrt(z2 * (k * (safe - k) / safe + 0.25 * z2))
+        low, high = (centre - half) / (safe + z2), (centre + half) / (safe + z2)
+    elif method == "clopper-pearson":
+        # arguments of 0 belong to the ends that are set below
+        low = special.betaincinv(np.maximum(k, 1.0), safe - k + 1.0, tail)
+        high = special.betaincinv(k + 1.0, np.maximum(safe - k, 1.0), 1.0 - tail)
+    else:
+        raise ValueError(f"method is {method!r}: use one of {sorted(_REFERENCES)}")
+    low = np.where(k == 0.0, 0.0, np.clip(low, 0.0, 1.0))
+    high = np.where(k == trials, 1.0, np.clip(high, 0.0, 1.0))
+    return low, high
+
+
+def basin_fractions(
+    labels: npt.ArrayLike | xr.DataArray,
+    *,
+    dims: Sequence[str] | None = None,
+    ids: Collection[int] = (),
+    unfinished: Collection[int] = UNFINISHED,
+    inferred: npt.ArrayLike | xr.DataArray | None = None,
+    confidence: float = 0.95,
+    method: Interval = "wilson",
+) -> xr.Dataset:
+    """Part of the cells that goes to each attractor, with its sampling error.
+
+    `fraction` is taken among the finished cells, as if the unfinished ones went the same ways; what
+    they may change at most is stated beside it. A label that no cell shows has the fraction 0 and an
+    interval that does not end there. For an attractor that is not listed at all `unseen_high` bounds
+    the fraction: the exact one-sided bound ``1 - (1 - confidence)**(1/N)``, at 95 % the "rule of
+    three" 3/N (Hanley and Lippman-Hand, J. Am. Med. Assoc. 249, 1743, 1983).
+
+    Parameters
+    ----------
+    labels
+        Outcome per cell, integers of any shape.
+    dims
+        Dims to count over, of a DataArray; None: all. The others stay: fractions along a sweep.
+    ids
+        Labels to list though no cell may show them.
+    unfinished
+        Codes of cells whose outcome is not known; ``()`` if every code is an outcome.
+    inferred
+        Which cells were not integrated but inferred (status ``INFERRED`` of a refined grid), in the shape
+        or on the dims of the labels. They are area like all others and count in full.
+    confidence
+        Two-sided level of the intervals, one-sided level of the `unseen` bounds.
+    method
+        See `binomial_interval`.
+
+    Returns
+    -------
+    Dataset
+        On the kept dims and `label`: `count`; `fraction` with `low` and `high`; `fraction_if_none` and
+        `fraction_if_all`, the fraction if none or all of the unfinished cells belonged to the label;
+        `low_if_none` and `high_if_all`, the interval around both. On the kept dims: `n_cells`,
+        `n_unfinished`, `fraction_unfinished`, `unseen_high`, and `unseen_high_if_all`, the bound if all
+        unfinished cells went to one attractor that was not seen. NaN fractions where nothing finished.
+        With `inferred`, on the kept dims and `label`: `n_inferred`, how many of `count` were inferred.
+
+    Notes
+    -----
+    The intervals hold for cells drawn independently from the region, each label by itself, not for all
+    labels at once. Cells of a regular grid are not independent: there the error comes from the cells
+    along the boundary and is smaller, so the intervals are too wide rather than too narrow. What a refined
+    grid overlooked (`pipeline.compute.refinement`) is not in them. Whether
+    the cells were drawn at random is not validated, nor whether they cover the region evenly.
+
+    Raises
+    ------
+    TypeError
+        If the labels are not integers.
+    ValueError
+        If there is no cell, `dims` are not dims of a DataArray, `inferred` is not on the cells of the
+        labels, or level or method are unknown.
+    """
+    kept, over = _kept_dims(labels, dims)
+    if isinstance(labels, xr.DataArray):
+        if isinstance(inferred, xr.DataArray):
+            inferred = _same_cells(labels, inferred).transpose(*kept, *over)
+        coords = {name: c for name, c in labels.coords.items() if set(c.dims) <= set(kept)}
+        labels = labels.transpose(*kept, *over)
+    else:
+        coords = {}
+    grid = read_labels(labels, unfinished, ids)
+    shape = grid.codes.shape[: len(kept)]
+    count, n_unfinished = _count_rows(grid, shape)
+    n_cells = np.full(shape, grid.codes.size // max(1, int(np.prod(shape))))
+    ds = xr.Dataset(coords=coords | {"label": grid.ids})
+    ds = ds.assign(_with_intervals(count, n_cells, n_unfinished, (*kept, "label"), confidence, method))
+    ds = ds.assign(
+        n_cells=(kept, n_cells),
+        n_unfinished=(kept, n_unfinished),
+        fraction_unfinished=(kept, n_unfinished / n_cells),
+        unseen_high=(kept, _upper_bound(np.zeros_like(n_cells), n_cells - n_unfinished, confidence)),
+        unseen_high_if_all=(kept, _upper_bound(n_unfinished, n_cells, confidence)),
+    )
+    if inferred is not None:
+        ds["n_inferred"] = ((*kept, "label"), _count_inferred(grid, np.asarray(inferred), shape))
+    ds["fraction"].attrs = {"long_name": "basin fraction among the finished cells", "units": "1"}
+    return ds.assign_attrs(_provenance(unfinished, confidence, method))
+
+
+def tipping_probabilities(
+    labels_before: npt.ArrayLike | xr.DataArray,
+    labels_after: npt.ArrayLike | xr.DataArray,
+    *,
+    unfinished: Collection[int] = UNFINISHED,
+    confidence: float = 0.95,
+    method: Interval = "wilson",
+) -> xr.Dataset:
+    """Probability that a state in the basin of i lies in the basin of j after a parameter has changed.
+
+    The part of the cells of each basin before the change that belongs to each basin after it:
+    ``P(i -> j) = |B_i(before) and B_j(after)| / |B_i(before)|`` (Kaszás, Feudel and Tél, Sci. Rep. 9,
+    8654, 2019).
+
+    Parameters
+    ----------
+    labels_before, labels_after
+        Outcome per cell, integers, the same cells in both. Ids should be matched between the two for
+        the diagonal to mean "stays"; that is not validated.
+    unfinished
+        Codes of cells whose outcome is not known; ``()`` if every code, such as that of divergence, is
+        an outcome.
+    confidence, method
+        See `binomial_interval`; the notes of `basin_fractions` on independent cells apply.
+
+    Returns
+    -------
+    Dataset
+        On `before` and `after`: `count`; `probability`, among the cells finished both times, with
+        `low` and `high`; `probability_if_none`, `probability_if_all`, `low_if_none`, `high_if_all`: the
+        same if none or all of the cells unfinished after the change went to j. On `before`: `n_cells`,
+        `n_unfinished` after the change, `fraction_unfinished`. Scalar: `fraction_unfinished_before`,
+        the part of the cells that belongs to no row.
+
+    Raises
+    ------
+    TypeError
+        If the labels are not integers.
+    ValueError
+        If the two are not of one shape, or of other dims or coordinates.
+    """
+    if isinstance(labels_before, xr.DataArray) and isinstance(labels_after, xr.DataArray):
+        labels_after = _same_cells(labels_before, labels_after)
+    before, after = read_labels(labels_before, unfinished), read_labels(labels_after, unfinished)
+    if before.codes.shape != after.codes.shape:
+        raise ValueError(
+            f"labels before are of shape {before.codes.shape}, after of {after.codes.shape}: label the same "
+            "cells at both parameters"
+        )
+    n_rows, n_columns = before.ids.size, after.ids.size + 1
+    row, column = before.codes.ravel(), after.codes.ravel() + 1  # column 0: unfinished after
+    known = row >= 0
+    pairs = row[known].astype(np.int64) * n_columns + column[known]
+    table = np.bincount(pairs, minlength=n_rows * n_columns).reshape(n_rows, n_columns)
+    n_cells, n_unfinished = table.sum(axis=1), table[:, 0]
+    ds = xr.Dataset(coords={"before": before.ids, "after": after.ids})
+    ds = ds.assign(
+        _with_intervals(
+            table[:, 1:], n_cells, n_unfinished, ("before", "after"), confidence, method, "probability"
+        )
+    )
+    ds = ds.assign(
+        n_cells=("before", n_cells),
+        n_unfinished=("before", n_unfinished),
+        fraction_unfinished=("before", n_unfinished / n_cells),
+        fraction_unfinished_before=((), before.fraction_unfinished),
+    )
+    ds["probability"].attrs = {"long_name": "tipping probability", "units": "1"}
+    attrs = _provenance(unfinished, confidence, method)
+    attrs["references"] = f"Kaszás, Feudel and Tél, Sci. Rep. 9, 8654 (2019); {attrs['references']}"
+    return ds.assign_attrs(attrs)
+
+
+def _kept_dims(
+    labels: npt.ArrayLike | xr.DataArray, dims: Sequence[str] | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the dims that stay and of those counted over."""
+    if dims is None:
+        over = tuple(str(dim) for dim in labels.dims) if isinstance(labels, xr.DataArray) else ()
+        return (), over
+    if isinstance(dims, str):
+        dims = (dims,)
+    have = tuple(str(dim) for dim in labels.dims) if isinstance(labels, xr.DataArray) else ()
+    if missing := [dim for dim in dims if dim not in have]:
+        raise ValueError(f"dims {missing} are not dims of the labels, {list(have)}: name some of those")
+    return tuple(dim for dim in have if dim not in dims), tuple(dims)
+
+
+def _count_rows(
+    grid: LabelGrid, shape: tuple[int, ...]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Cells per label and unfinished cells, for each element of the leading axes `shape`."""
+    n_rows, width = int(np.prod(shape)), grid.ids.size + 1
+    codes = grid.codes.reshape(n_rows, -1).astype(np.int64) + 1
+    codes += width * np.arange(n_rows)[:, None]
+    table = np.bincount(codes.ravel(), minlength=n_rows * width).reshape(*shape, width)
+    return table[..., 1:], table[..., 0]
+
+
+def _count_inferred(
+    grid: LabelGrid, inferred: npt.NDArray[np.generic], shape: tuple[int, ...]
+) -> npt.NDArray[np.int64]:
+    """Inferred cells per label."""
+    if inferred.dtype != bool or inferred.shape != grid.codes.shape:
+        raise ValueError(
+            f"inferred is {inferred.dtype} of shape {inferred.shape}, the labels are of shape "
+            f"{grid.codes.shape}: give true or false per cell, such as ds.status == Status.INFERRED"
+        )
+    return _count_rows(LabelGrid(np.where(inferred, grid.codes, np.int32(-1)), grid.ids), shape)[0]
+
+
+def _with_intervals(
+    count: npt.NDArray[np.int64],
+    n_cells: npt.NDArray[np.int64],
+    n_unfinished: npt.NDArray[np.int64],
+    dims: tuple[str, ...],
+    confidence: float,
+    method: Interval,
+    name: str = "fraction",
+) -> dict[str, tuple[tuple[str, ...], npt.NDArray[np.generic]]]:
+    """Fractions of a table of counts (last axis: the outcomes), intervals, and the reach of the unknown."""
+    cells, unknown = n_cells[..., None], n_unfinished[..., None]
+    finished = cells - unknown
+    low, high = binomial_interval(count, finished, confidence=confidence, method=method)
+    low_if_none, _ = binomial_interval(count, cells, confidence=confidence, method=method)
+    _, high_if_all = binomial_interval(count + unknown, cells, confidence=confidence, method=method)
+    fraction = np.where(finished > 0, count / np.maximum(finished, 1), np.nan)
+    return {
+        "count": (dims, count),
+        name: (dims, fraction),
+        "low": (dims, low),
+        "high": (dims, high),
+        f"{name}_if_none": (dims, count / cells),
+        f"{name}_if_all": (dims, (count + unknown) / cells),
+        "low_if_none": (dims, low_if_none),
+        "high_if_all": (dims, high_if_all),
+    }
+
+
+def _upper_bound(
+    count: npt.NDArray[np.int64], n: npt.NDArray[np.int64], confidence: float
+) -> npt.NDArray[np.float64]:
+    """One-sided upper Clopper-Pearson bound; 1 where all of the `n` are hits, or there is none."""
+    bound = special.betaincinv(count + 1.0, np.maximum(n - count, 1), confidence)
+    return np.where(count >= n, 1.0, bound)
+
+
+def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
+    """`after` with its dims in the order of `before`, once both are known to lie on the same cells."""
+    if set(before.dims) != set(after.dims):
+        raise ValueError(
+            f"labels before have the dims {before.dims}, after {after.dims}: select one parameter value "
+            "from each"
+        )
+    for dim in before.dims:
+        one, other = before.indexes.get(dim), after.indexes.get(dim)
+        if one is not None and other is not None and not one.equals(other):
+            raise ValueError(f"coordinate {dim!r} differs before and after: label the same cells at both")
+    return after.transpose(*before.dims)
+
+
+def _provenance(unfinished: Collection[int], confidence: float, method: Interval) -> dict[str, object]:
+    """What the numbers were made with."""
+    return {
+        "interval": method,
+        "confidence": confidence,
+        "unfinished_codes": sorted(unfinished),
+        "references": _REFERENCES[method],
+    }

@@ -1,0 +1,263 @@
+"""What stored Lyapunov exponents say: per period, how sure, chaos or not, and whether it lasts.
+
+Works on the variables of ``[products] lyapunov``; integrates nothing. `spectrum_of_jacobians` gives the
+exponents of any map whose Jacobians are known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from pipeline.layout.vocabulary import PERIODIC
+
+Floats = npt.NDArray[np.float64]
+
+GOOD = 1
+"""Value of `lyapunov_flag` without objection (see `pipeline.layout.schema.LyapunovFlag`)."""
+
+UNRESOLVED, FAILED = 3, 4
+
+
+class Motion(IntEnum):
+    """What the exponents of a cell say of its motion."""
+
+    UNKNOWN = 0
+    REGULAR = 1
+    UNDECIDED = 2
+    CHAOTIC = 3
+    HYPERCHAOTIC = 4
+
+
+def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> xr.Dataset:
+    """Return what the exponents of a cube say, cell by cell.
+
+    Parameters
+    ----------
+    ds
+        Cube with `lyapunov`, `lyapunov_stderr`, `lyapunov_blocks`, `divergence`, `lyapunov_flag`, and
+        the coordinate `frequency` [Hz].
+    n_sigma
+        Standard errors by which an exponent must differ from 0 to count as positive or negative.
+    least
+        Least modulus [1/s] that counts as different from 0; a slow bifurcation is below it.
+
+    Returns
+    -------
+    Dataset
+        With the cell dims of the cube:
+
+        ``lyapunov_per_period`` (exponent), ``lyapunov_per_period_stderr`` (exponent)
+            Exponents per drive period, lambda/f [1].
+        ``lyapunov_running`` (block, exponent)
+            Mean over the blocks up to this one [1/s]: the convergence history.
+        ``motion``
+            Codes of `Motion`: chaotic if the largest exponent is positive, hyperchaotic if the second
+            is too, regular if the largest is negative (or the orbit closed), undecided in between. A
+            continuous quasi-periodic motion, whose largest exponent of the section map is 0, is undecided.
+        ``drift``
+            Largest exponent of the later half of the blocks minus that of the earlier [1/s], and
+            ``drift_sigma``, the same in standard errors: a transient that ends within the blocks shows as a
+            large negative value, chaos that lasts stays within a few.
+        ``audit``
+            Sum of a whole spectrum minus the divergence [1/s]; NaN for a part.
+
+    Raises
+    ------
+    ValueError
+        If the cube has no exponents.
+    """
+    if "lyapunov" not in ds:
+        raise ValueError(
+            "the cube has no Lyapunov exponents; run it with [products] lyapunov = {} in its specification"
+        )
+    rate, error = ds["lyapunov"], ds["lyapunov_stderr"]
+    frequency = ds["frequency"] if "frequency" in ds.coords else xr.DataArray(float(ds.attrs["frequency_hz"]))
+    result = xr.Dataset(
+        {
+            "lyapunov_per_period": (rate / frequency).transpose(*rate.dims),
+            "lyapunov_per_period_stderr": (error / frequency).transpose(*rate.dims),
+            "lyapunov_running": _running(ds["lyapunov_blocks"]),
+            "motion": _motion(ds, n_sigma, least),
+            **_drift(ds["lyapunov_blocks"]),
+            "audit": _audit(ds),
+        }
+    )
+    return result.assign_attrs(ds.attrs)
+
+
+def _running(blocks: xr.DataArray) -> xr.DataArray:
+    count = xr.DataArray(np.arange(1, blocks.sizes["block"] + 1), dims="block")
+    mean = (blocks.cumsum("block") / count).transpose(*blocks.dims)
+    return mean.assign_attrs(units="1/s", long_name="mean growth rate up to this block")
+
+
+def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> xr.DataArray:
+    margin = np.maximum(n_sigma * ds["lyapunov_stderr"], least)
+    rate = ds["lyapunov"]
+    sign = (rate > margin).astype(np.int8) - (rate < -margin).astype(np.int8)
+    first = sign.isel(exponent=0, drop=True)
+    motion = xr.full_like(ds["lyapunov_flag"], Motion.UNDECIDED)
+    closed = (ds["status"] == PERIODIC) | (ds["orbit_period"] > 0)
+    motion = motion.where(~((first < 0) | closed), np.int8(Motion.REGULAR))
+    motion = motion.where(~((first > 0) & ~closed), np.int8(Motion.CHAOTIC))
+    if ds.sizes["exponent"] > 1:
+        second = sign.isel(exponent=1, drop=True)
+        resolved = ds["lyapunov_flag"] != UNRESOLVED
+        hyper = (first > 0) & (second > 0) & resolved & ~closed
+        motion = motion.where(~hyper, np.int8(Motion.HYPERCHAOTIC))
+    known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != FAILED)
+    motion = motion.where(known, np.int8(Motion.UNKNOWN))
+    return motion.assign_attrs(
+        units="1",
+        long_name="kind of motion by its exponents",
+        flag_values=np.array(list(Motion), np.int8),
+        flag_meanings=" ".join(m.name.lower() for m in Motion),
+    )
+
+
+def _drift(blocks: xr.DataArray) -> dict[str, xr.DataArray]:
+    first = blocks.isel(exponent=0, drop=True)
+    half = first.sizes["block"] // 2
+    early, late = first.isel(block=slice(half)), first.isel(block=slice(-half, None))
+    drift = late.mean("block") - early.mean("block")
+    drift = drift.assign_attrs(units="1/s", long_name="largest exponent, later minus earlier half")
+    if half < 2:
+        return {"drift": drift, "drift_sigma": xr.full_like(drift, np.nan)}
+    error = np.sqrt((late.var("block", ddof=1) + early.var("block", ddof=1)) / half)
+    sigma = (drift / error).assign_attrs(units="1", long_name="drift in standard errors")
+    return {"drift": drift, "drift_sigma": sigma}
+
+
+def _audit(ds: xr.Dataset) -> xr.DataArray:
+    total = ds["lyapunov_blocks"].mean("block").sum("exponent", skipna=False) - ds["divergence"]
+    if ds.sizes["exponent"] < ds.sizes["state"]:
+        total = xr.full_like(total, np.nan)
+    return total.assign_attrs(units="1/s", long_name="sum of the exponents minus the divergence")
+
+
+# ---- means over cells --------------------------------------------------------------------------
+
+
+def pooled_mean(value: Floats, stderr: Floats, which: npt.NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
+    """Mean over cells, its standard error, and the standard deviation between cells beyond their errors.
+
+    The variance S**2 between m cells contains that within a cell, s_i**2. With T**2 = S**2 - mean(s_i**2)
+    for the part beyond it, 0 if that is negative, the variance of the mean is ``(T**2 + mean(s_i**2))/m``
+    (Hedges and Olkin, Statistical Methods for Meta-Analysis, 1985, ch. 9): the errors within cells
+    while the cells agree, the scatter of the cells where it is larger. One cell has its own error.
+
+    Parameters
+    ----------
+    value, stderr
+        Values with their standard errors, cells on the last axis; not finite: left out.
+    which
+        Cells that count, of the same shape or one that broadcasts.
+
+    Returns
+    -------
+    tuple of ndarray
+        Without the last axis; NaN where no cell counts.
+    """
+    there = which & np.isfinite(value)
+    m = there.sum(-1)
+    mean = _over(np.where(there, value, 0.0).sum(-1), m)
+    apart = np.where(there, value - np.expand_dims(mean, -1), 0.0)
+    scatter = np.where(m > 1, _over((apart**2).sum(-1), m - 1), 0.0)
+    within = _over((np.where(there, stderr, 0.0) ** 2).sum(-1), m)
+    between = np.maximum(scatter - within, 0.0)
+    return mean, np.sqrt(_over(between + within, m)), np.sqrt(between)
+
+
+def _over(values: Any, counts: Any) -> Floats:
+    empty = np.full(np.shape(values), np.nan)
+    return np.asarray(np.divide(values, counts, out=empty, where=np.asarray(counts) > 0))
+
+
+# ---- from Jacobians ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class JacobianSpectrum:
+    """Lyapunov exponents of a map along its trajectories, per iterate.
+
+    Attributes
+    ----------
+    exponents : ndarray, (..., state)
+        In falling order.
+    stderr : ndarray, (..., state)
+        Standard errors by block means.
+    blocks : ndarray, (..., block, state)
+        Mean growth in each block, in the order of `exponents`.
+    """
+
+    exponents: Floats
+    stderr: Floats
+    blocks: Floats
+
+
+def spectrum_of_jacobians(
+    jacobians: npt.ArrayLike, *, n_blocks: int = 16, n_transient: int = 0
+) -> JacobianSpectrum:
+    """Lyapunov spectrum of a map from its Jacobians along trajectories.
+
+    A basis is carried along by the Jacobians and made orthonormal at each by QR; an exponent is the mean
+    logarithm of the diagonal of R (Benettin, Galgani, Giorgilli and Strelcyn, Meccanica 15, 9 and 21,
+    1980; Eckmann and Ruelle, Rev. Mod. Phys. 57, 617, 1985, sec. V). Divided by the time of an iterate they
+    are exponents of the flow: for the stroboscopic map (`magpend_core.orbits.stroboscopic_map`), times
+    the frequency.
+
+    Parameters
+    ----------
+    jacobians
+        ``J[..., i, :, :]`` is the derivative of the map at point i; shape (..., n, state, state).
+    n_blocks
+        Blocks of equal length for the errors, 2 or more. They are right if a block is longer than the
+        motion remembers.
+    n_transient
+        First Jacobians, in which the basis turns into its directions, that are not counted.
+
+    Returns
+    -------
+    JacobianSpectrum
+        -inf where a Jacobian is singular.
+
+    Raises
+    ------
+    ValueError
+        If the shape is another, there is a Jacobian that is not finite, or what is counted is no whole
+        number of blocks.
+    """
+    given = np.asarray(jacobians, np.float64)
+    if given.ndim < 3 or given.shape[-1] != given.shape[-2]:
+        raise ValueError(f"jacobians have shape {given.shape}: give (..., n, state, state)")
+    if not np.isfinite(given).all():
+        raise ValueError("jacobians are not all finite: leave trajectories out that fail")
+    if n_blocks < 2 or n_transient < 0:
+        raise ValueError(f"n_blocks = {n_blocks}, n_transient = {n_transient}: give 2 or more, and 0 or more")
+    n, size = given.shape[-3] - n_transient, given.shape[-1]
+    if n < n_blocks or n % n_blocks:
+        raise ValueError(
+            f"{n} Jacobians after the transient are no whole number of each of {n_blocks} blocks: "
+            f"give {max(n // n_blocks, 1) * n_blocks}, or other n_blocks"
+        )
+    basis = np.broadcast_to(np.eye(size), (*given.shape[:-3], size, size))
+    growth = np.empty((*given.shape[:-3], n, size))
+    for i in range(given.shape[-3]):
+        basis, r = np.linalg.qr(given[..., i, :, :] @ basis)
+        if i >= n_transient:
+            factor = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+            growth[..., i - n_transient, :] = np.log(
+                factor, out=np.full(factor.shape, -np.inf), where=factor > 0.0
+            )
+    blocks = growth.reshape(*growth.shape[:-2], n_blocks, n // n_blocks, size).mean(axis=-2)
+    order = np.argsort(-blocks.mean(axis=-2), axis=-1, kind="stable")
+    blocks = np.take_along_axis(blocks, order[..., None, :], axis=-1)
+    with np.errstate(invalid="ignore"):  # -inf has no error
+        stderr = blocks.std(axis=-2, ddof=1) / np.sqrt(n_blocks)
+    return JacobianSpectrum(blocks.mean(axis=-2), stderr, blocks)

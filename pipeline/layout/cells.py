@@ -1,0 +1,292 @@
+"""From a specification to numbers: dims and coordinates of the cube, and a task's input arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from magpend_core.models.model import Model
+from pipeline.layout.schema import STATE_UNITS, STATES
+from pipeline.spec.parsing import FREQUENCY, GridStarts, ListStarts, RandomStarts, Range, Spec, Starts
+
+DIRECTION_CODES = {"up": 1, "down": -1}
+STATE_NAMES = dict(
+    zip(STATES, ("angle of link 1", "angle of link 2", "rate of link 1", "rate of link 2"), strict=True)
+)
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One coordinate of the cube."""
+
+    name: str
+    dims: tuple[str, ...]
+    values: np.ndarray
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ParameterAxis:
+    """A swept parameter and the cube's dim that it becomes."""
+
+    dim: str
+    parameter: str
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class InitialStates:
+    """Initial states in a flat order, without making a table of a grid.
+
+    Attributes
+    ----------
+    dims, shape
+        Dims of the initial conditions in a sweep.
+    columns
+        Values of each state: a number for all, one value per row, or with `grid` one per step of the
+        grid's dim [rad, rad/s].
+    grid
+        The grid dim of each state, or None.
+    """
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    columns: tuple[np.ndarray, ...]
+    grid: tuple[int | None, ...] | None = None
+
+    def __len__(self) -> int:
+        return math.prod(self.shape)
+
+    def at(self, flat: np.ndarray) -> np.ndarray:
+        """Return the states with these flat indices, shape (n, 4) [rad, rad/s]."""
+        out = np.empty((len(flat), len(self.columns)))
+        steps = np.unravel_index(flat, self.shape) if self.shape else ()
+        for i, column in enumerate(self.columns):
+            if column.ndim == 0:
+                out[:, i] = column
+            else:
+                dim = 0 if self.grid is None else self.grid[i]
+                assert dim is not None
+                out[:, i] = column[steps[dim]]
+        return out
+
+
+def parameter_axes(spec: Spec) -> tuple[ParameterAxis, ...]:
+    """Return the swept parameters in the order of the file."""
+    return tuple(
+        ParameterAxis("frequency" if name == FREQUENCY else name, name, axis.array())
+        for name, axis in spec.axes.items()
+    )
+
+
+def _state_value(table: Any, state: str) -> tuple[Any, float]:
+    """Return what the table gives for a state, and the factor to SI units. Degrees end here."""
+    in_degrees = getattr(table, f"{state}_deg")
+    if in_degrees is not None:
+        return in_degrees, math.pi / 180
+    value = getattr(table, state)
+    return (0.0 if value is None else value), 1.0
+
+
+def initial_states(starts: Starts) -> InitialStates:
+    """Return the initial conditions of a specification."""
+    if isinstance(starts, GridStarts):
+        return _grid(starts)
+    columns = _rows(starts) if isinstance(starts, ListStarts) else _samples(starts)
+    return InitialStates(("initial_condition",), (len(columns[0]),), tuple(columns))
+
+
+def _grid(starts: GridStarts) -> InitialStates:
+    dims: list[str] = []
+    columns: list[np.ndarray] = []
+    grid: list[int | None] = []
+    for state in STATES:
+        value, factor = _state_value(starts, state)
+        if isinstance(value, Range):
+            grid.append(len(dims))
+            dims.append(f"{state}_0")
+            columns.append(value.array() * factor)
+        else:
+            grid.append(None)
+            columns.append(np.array(value * factor))
+    shape = tuple(len(c) for c in columns if c.ndim)
+    return InitialStates(tuple(dims), shape, tuple(columns), tuple(grid))
+
+
+def _rows(starts: ListStarts) -> list[np.ndarray]:
+    rows, factor = (starts.points, 1.0) if starts.points is not None else (starts.points_deg, math.pi / 180)
+    assert rows is not None
+    table = np.array([(*row, 0.0, 0.0)[:4] for row in rows], dtype=np.float64) * factor
+    return list(table.T)
+
+
+def _samples(starts: RandomStarts) -> list[np.ndarray]:
+    # Four numbers are drawn per sample whatever is fixed, so that fixing a state leaves the others.
+    uniform = np.random.Generator(np.random.PCG64(starts.seed)).random((starts.n, len(STATES)))
+    columns = []
+    for state, u in zip(STATES, uniform.T, strict=True):
+        value, factor = _state_value(starts, state)
+        low, high = value if isinstance(value, tuple) else (value, value)
+        columns.append((low + (high - low) * u) * factor)
+    return columns
+
+
+def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
+    """Return the cube's coordinates, numbers only.
+
+    ``direction`` is +1 (up) or -1 (down) here; `open_run` shows words.
+    """
+    model = spec.parameters.load().model
+    found = [
+        Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, model))
+        for a in parameter_axes(spec)
+    ]
+    if FREQUENCY not in spec.axes:
+        value = np.array(spec.parameters.frequency_hz, dtype=np.float64)
+        found.append(Coordinate("frequency", (), value, _parameter_attrs(FREQUENCY, model)))
+    states = initial_states(spec.initial_conditions)
+    return (*found, *(_branch_coords(spec, states) if spec.continuation else _start_coords(states)))
+
+
+def _parameter_attrs(name: str, model: Model) -> dict[str, str]:
+    if name == FREQUENCY:
+        return {"units": "Hz", "long_name": "drive frequency"}
+    parameter = model.parameter(name)
+    return {"units": parameter.unit, "long_name": parameter.meaning}
+
+
+def _start_attrs(state: str) -> dict[str, str]:
+    unit = STATE_UNITS[STATES.index(state)]
+    return {"units": unit, "long_name": f"initial {STATE_NAMES[state]}"}
+
+
+def _start_coords(states: InitialStates) -> list[Coordinate]:
+    found = []
+    for i, (state, column) in enumerate(zip(STATES, states.columns, strict=True)):
+        name = f"{state}_0"
+        dims: tuple[str, ...] = ()
+        if column.ndim:
+            dims = (name,) if states.grid is not None else states.dims
+        found.append(Coordinate(name, dims, np.asarray(states.columns[i]), _start_attrs(state)))
+    return found
+
+
+def _branch_coords(spec: Spec, states: InitialStates) -> list[Coordinate]:
+    assert spec.continuation is not None
+    directions = spec.continuation.directions
+    n = len(states)
+    seeds = np.tile(np.arange(n, dtype=np.int32), len(directions))
+    codes = np.repeat([DIRECTION_CODES[d] for d in directions], n).astype(np.int8)
+    dims = ("branch",)
+    table = states.at(seeds)
+    return [
+        Coordinate("branch", dims, np.arange(len(seeds), dtype=np.int32), {"long_name": "branch"}),
+        Coordinate(
+            "direction", dims, codes,
+            {"long_name": "direction of the walk", "flag_values": [1, -1], "flag_meanings": "up down"},
+        ),
+        Coordinate("seed", dims, seeds, {"long_name": "index of the initial condition"}),
+        *(Coordinate(f"{s}_0", dims, table[:, i], _start_attrs(s)) for i, s in enumerate(STATES)),
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """A task's arguments for `run_branches`: branches times points.
+
+    Attributes
+    ----------
+    parameters : ndarray, (branch, point, parameter)
+    frequency_hz : ndarray, (branch, point)
+    initial_states : ndarray, (branch, 4)
+    """
+
+    parameters: np.ndarray
+    frequency_hz: np.ndarray
+    initial_states: np.ndarray
+
+
+class CellMap:
+    """Between the cells of a block of the cube and the branches and points of the kernel.
+
+    In a sweep each cell is a branch of one point. In a continuation the branches of a block walk the
+    whole path, those that go down from its end.
+    """
+
+    def __init__(self, spec: Spec) -> None:
+        base = spec.parameters.load()
+        self._names = base.names
+        self._packed = base.pack()
+        self._fixed_hz = spec.parameters.frequency_hz
+        self._axes = parameter_axes(spec)
+        self._states = initial_states(spec.initial_conditions)
+        self._walk = spec.continuation
+        if self._walk is None:
+            self.dims = (*(a.dim for a in self._axes), *self._states.dims)
+            self.shape = (*(len(a.values) for a in self._axes), *self._states.shape)
+            self.path: int | None = None
+        else:
+            n_branches = len(self._states) * len(self._walk.directions)
+            self.dims = (*(a.dim for a in self._axes), "branch")
+            self.shape = (*(len(a.values) for a in self._axes), n_branches)
+            self.path = [a.parameter for a in self._axes].index(self._walk.path)
+
+    def inputs(self, block: tuple[slice, ...]) -> Inputs:
+        """Return the kernel's arguments for a block of cells."""
+        sizes = [s.stop - s.start for s in block]
+        index = self._branch_first(np.indices(sizes).reshape(len(block), math.prod(sizes)), block)
+        values = {a.parameter: a.values[index[i]] for i, a in enumerate(self._axes)}
+        shape = index.shape[1:]
+        parameters = np.broadcast_to(self._packed, (*shape, len(self._packed))).copy()
+        for name, value in values.items():
+            if name != FREQUENCY:
+                parameters[..., self._names.index(name)] = value
+        fixed = np.full(shape, np.nan if self._fixed_hz is None else self._fixed_hz)
+        return Inputs(
+            parameters, values.get(FREQUENCY, fixed), self._states.at(self._start_of(index[:, :, 0]))
+        )
+
+    def _start_of(self, index: np.ndarray) -> np.ndarray:
+        """Flat index of the initial state of each branch."""
+        own = index[len(self._axes) :]
+        if self._walk is not None:
+            return np.asarray(own[0] % len(self._states))
+        if not self._states.shape:
+            return np.zeros(index.shape[1], dtype=np.int64)
+        return np.asarray(np.ravel_multi_index(tuple(own), self._states.shape))
+
+    def _branch_first(self, cells: np.ndarray, block: tuple[slice, ...]) -> np.ndarray:
+        """Return cell indices, shape (dim, branch, point), in the order in which the kernel walks them."""
+        sizes = [s.stop - s.start for s in block]
+        index = cells + np.array([s.start for s in block], dtype=np.int64).reshape(-1, 1)
+        if self.path is None:
+            return index[..., None]
+        grid = np.moveaxis(index.reshape(len(block), *sizes), self.path + 1, -1)
+        walked = grid.reshape(len(block), -1, sizes[self.path]).copy()
+        down = self._down(walked[-1, :, 0])
+        walked[:, down] = walked[:, down, ::-1]
+        return walked
+
+    def _down(self, branches: np.ndarray) -> np.ndarray:
+        """Which branches walk down."""
+        assert self._walk is not None
+        directions = np.array([d == "down" for d in self._walk.directions])
+        return np.asarray(directions[branches // len(self._states)])
+
+    def outputs(self, block: tuple[slice, ...], values: np.ndarray) -> np.ndarray:
+        """Bring a kernel's result, shape (branch, point, ...), into the block's shape."""
+        sizes = [s.stop - s.start for s in block]
+        own = values.shape[2:]
+        if self.path is None:
+            return values.reshape(*sizes, *own)
+        others = [n for i, n in enumerate(sizes) if i != self.path]
+        branches = np.broadcast_to(np.arange(block[-1].start, block[-1].stop), others).ravel()
+        down = self._down(branches)
+        values = values.copy()
+        values[down] = values[down, ::-1]
+        grid = values.reshape(*others, sizes[self.path], *own)
+        return np.ascontiguousarray(np.moveaxis(grid, len(others), self.path))

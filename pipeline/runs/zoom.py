@@ -1,0 +1,289 @@
+"""A new specification from an old one: narrower ranges, pinned parameters, everything else as it was."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.spec.parsing import (
+    FREQUENCY,
+    STATES,
+    GridStarts,
+    RandomStarts,
+    Range,
+    Spec,
+    load_spec,
+    parse_spec,
+)
+from pipeline.spec.problems import SpecError
+
+MARK = "(zoom)"
+_ORDER = ("parameters", "axes", "initial_conditions", "continuation", "integration", "products", "execution")
+STATE_KEYS = (*STATES, *(f"{state}_deg" for state in STATES))
+_ROUNDING = 1e-9
+"""Relative amount by which a range may pass the old one's end without a note: degrees are converted."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A specification and where it comes from.
+
+    Attributes
+    ----------
+    spec : Spec
+    origin : str
+        For the comment at the head of the new file.
+    """
+
+    spec: Spec
+    origin: str
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What differs from the old specification.
+
+    Attributes
+    ----------
+    ranges : dict
+        Lowest and highest value by key: of states (``psi1`` [rad], ``psi1_deg``, ...), ``frequency_hz`` or
+        parameters.
+    pins : dict
+        One value by such a key.
+    num : int or None
+        Points of every new range.
+    nums : dict
+        Points by the key's state, frequency or parameter; they go before `num`.
+    samples : int or None
+        Number of random initial conditions.
+    """
+
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    pins: Mapping[str, float] = field(default_factory=dict)
+    num: int | None = None
+    nums: Mapping[str, int] = field(default_factory=dict)
+    samples: int | None = None
+
+
+def read_source(path: str | Path) -> Source:
+    """Read the specification of a run directory, a TOML file or a shipped workflow.
+
+    Raises
+    ------
+    SpecError, store.RefusedError
+        If there is none, or it is not valid.
+    """
+    from pipeline.runs.run import find_spec
+    from pipeline.store import directory as store
+
+    if Path(path).is_dir():
+        info = store.read_run(Path(path))
+        return Source(parse_spec(info.spec), f"run {info.directory.resolve().name}, digest {info.digest}")
+    found = find_spec(path)
+    return Source(load_spec(found), f"specification {found.name}")
+
+
+def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
+    """Return the changed specification, and notes on ranges that reach beyond the old ones.
+
+    A range keeps the number of points that it had; a state or parameter that had one value can be given
+    a range with a number of points. Ranges are evenly spaced, whatever the old ones were. A ``[smoke]``
+    table is not taken over.
+
+    Raises
+    ------
+    SpecError
+        If nothing changes, a change does not fit, or the result is no valid specification.
+    """
+    problems = _check(spec, changes)
+    if problems:
+        raise SpecError(problems)
+    data = spec.as_dict()
+    notes: list[str] = []
+    for key, value in changes.pins.items():
+        _put(data, key, value)
+    for key, (low, high) in changes.ranges.items():
+        old = _extent(spec, key)
+        if old and not (old[0] - _slack(old) <= low and high <= old[1] + _slack(old)):
+            notes.append(f"{key}: {low:g} to {high:g} reaches beyond the old {old[0]:g} to {old[1]:g}.")
+        num = _points(spec, key, changes)
+        as_interval = _state(key) is not None and isinstance(spec.initial_conditions, RandomStarts)
+        _put(data, key, [low, high] if as_interval else {"start": low, "stop": high, "num": num})
+    if changes.samples is not None:
+        data["initial_conditions"]["n"] = changes.samples
+    data["title"] = spec.title if spec.title.endswith(MARK) else f"{spec.title} {MARK}".strip()
+    return parse_spec(data), notes
+
+
+def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
+    """Write the specification that `changes` make of `source`; returns the notes of `zoom`.
+
+    Raises
+    ------
+    SpecError
+        As `zoom`; also if `out` exists or cannot be written to. Nothing is written then.
+    """
+    if out.suffix != ".toml":
+        raise SpecError([f"{out}: the suffix must be .toml."])
+    if not out.parent.is_dir():
+        raise SpecError([f"{out.parent}: no such folder; make it first."])
+    spec, notes = zoom(source.spec, changes)
+    text = f"# Zoom. Derived from {_one_line(source.origin)}.\n{to_toml(spec)}"
+    try:
+        with out.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise SpecError([f"{out}: exists already and is not overwritten; give another --out."]) from None
+    return notes
+
+
+# ---- changes -----------------------------------------------------------------------------------
+
+
+def _state(key: str) -> str | None:
+    """Name of the state that a key sets, None if it is a parameter's."""
+    return key.removesuffix("_deg") if key in STATE_KEYS else None
+
+
+def _check(spec: Spec, changes: Changes) -> list[str]:
+    """Problems with the changes themselves."""
+    keys = [*changes.ranges, *changes.pins]
+    if not keys:
+        return ["zoom: nothing to change; give a range such as --psi1-deg -10 10, or --at frequency_hz=2.2."]
+    names = [_state(key) or key for key in keys]
+    problems = [f"{n}: is changed twice; keep one." for n in dict.fromkeys(names) if names.count(n) > 1]
+    for key, (low, high) in changes.ranges.items():
+        if not low < high:
+            problems.append(f"{key} = {low!r} {high!r}: the second number must be greater than the first.")
+    starts = spec.initial_conditions
+    if not isinstance(starts, GridStarts | RandomStarts):
+        problems += [
+            f"{key}: the initial conditions are a list, which has no ranges; zoom into parameters alone."
+            for key in keys
+            if _state(key)
+        ]
+        return problems
+    ranged = {_state(key) or key for key in changes.ranges}
+    sampled = isinstance(starts, RandomStarts)
+    if changes.samples is not None and not sampled:
+        problems.append(f"samples = {changes.samples}: the initial conditions are not random; drop it.")
+    if changes.num is not None and all(sampled and _state(key) for key in changes.ranges):
+        problems.append(f"num = {changes.num}: no new range has points; give one, or drop it.")
+    for name in changes.nums:
+        if name not in ranged:
+            problems.append(f"points of {name}: no range is given for it; give one or drop it.")
+        elif sampled and name in STATES:
+            problems.append(
+                f"number of points of {name}: samples have none; --samples says how many are drawn."
+            )
+    for key in changes.ranges:
+        if not (sampled and _state(key)) and _points(spec, key, changes) < 2:
+            problems.append(f"{key}: a range has 2 points or more; say how many, such as --num 101.")
+    return problems
+
+
+def _points(spec: Spec, key: str, changes: Changes) -> int:
+    """Points of a new range: as asked for, else as before, else 0."""
+    asked = changes.nums.get(_state(key) or key, changes.num)
+    old = _old_range(spec, key)
+    return asked if asked is not None else (len(old.array()) if old is not None else 0)
+
+
+def _old(spec: Spec, key: str) -> tuple[Any, float]:
+    """What the old specification has for the key, and the factor to the key's unit."""
+    state = _state(key)
+    if state is None:
+        return spec.axes.get(key), 1.0
+    for name in (state, f"{state}_deg"):
+        value = getattr(spec.initial_conditions, name)
+        if value is not None:
+            same = name == key
+            return value, 1.0 if same else (math.pi / 180 if name != state else 180 / math.pi)
+    return None, 1.0
+
+
+def _old_range(spec: Spec, key: str) -> Range | None:
+    value, _ = _old(spec, key)
+    return value if isinstance(value, Range) else None
+
+
+def _extent(spec: Spec, key: str) -> tuple[float, float] | None:
+    """Old lowest and highest value in the key's unit; None if there was no range."""
+    value, factor = _old(spec, key)
+    if isinstance(value, Range):
+        array = value.array()
+        return float(array[0]) * factor, float(array[-1]) * factor
+    return (value[0] * factor, value[1] * factor) if isinstance(value, tuple) else None
+
+
+def _slack(extent: tuple[float, float]) -> float:
+    return _ROUNDING * max(abs(extent[0]), abs(extent[1]))
+
+
+def _put(data: dict[str, Any], key: str, value: Any) -> None:
+    """Set a state's or parameter's value or range in plain data, and take its old one out."""
+    state = _state(key)
+    if state is not None:
+        data["initial_conditions"].pop(state, None)
+        data["initial_conditions"].pop(f"{state}_deg", None)
+        data["initial_conditions"][key] = value
+        return
+    parameters = data["parameters"]
+    parameters.pop(key, None) if key == FREQUENCY else parameters["overrides"].pop(key, None)
+    if isinstance(value, dict):
+        data["axes"][key] = value
+        return
+    data["axes"].pop(key, None)
+    (parameters if key == FREQUENCY else parameters["overrides"])[key] = value
+
+
+# ---- TOML --------------------------------------------------------------------------------------
+
+
+def to_toml(spec: Spec) -> str:
+    """Return a specification as a TOML text that reads back as the same.
+
+    A writer for what specifications hold: tables of numbers, texts, truth values, lists, and tables within
+    a line.
+    """
+    data = spec.as_dict()
+    lines = [f"{key} = {_value(data[key])}" for key in ("kind", "title") if data[key]]
+    names = [name for name in data if isinstance(data[name], dict)]
+    for name in sorted(names, key=lambda n: _ORDER.index(n) if n in _ORDER else len(_ORDER)):
+        # an empty table says nothing
+        table = {key: value for key, value in data[name].items() if value != {}}
+        if table:
+            lines += ["", f"[{name}]", *(f"{_key(k)} = {_value(v)}" for k, v in table.items())]
+    text = "\n".join(lines) + "\n"
+    assert parse_spec(tomllib.loads(text)) == spec
+    return text
+
+
+def _key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        # JSON escapes what TOML must have escaped, but for DEL
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        items = [_value(v) for v in value]
+        if any(isinstance(v, list | tuple) for v in value):
+            return "[\n" + "".join(f"    {item},\n" for item in items) + "]"
+        return "[" + ", ".join(items) + "]"
+    return repr(value)
+
+
+def _one_line(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text)

@@ -1,0 +1,1 @@
+"""What a person writes: tables, starts, parsing, and what is wrong with them."""

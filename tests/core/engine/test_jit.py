@@ -1,0 +1,139 @@
+"""The compile cache: named by the sources, switched off by the environment; and without the compiler."""
+
+import dataclasses
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import magpend_core
+from magpend_core import accelerations, sections
+from magpend_core.engine.jit import is_covered, source_digest, specialise
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
+
+PACKAGE = Path(magpend_core.__file__).parent
+SCRIPT = """
+from magpend_core import accelerations, kernel_version, load_preset
+from magpend_core.models.pendulum.mechanics import _evaluator
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
+value = accelerations(0.1, [0.1, 0.2, 0.3, 0.4], load_preset(), 2.2)
+stats = _evaluator(PENDULUM_FITTED, "rates").stats
+print(kernel_version(), value[0].hex(), sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
+"""
+
+
+@pytest.fixture
+def copied(tmp_path):
+    """A copy of the package that a test may edit."""
+    shutil.copytree(PACKAGE, tmp_path / "copy" / "magpend_core", ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path / "copy"
+
+
+def edit(folder, name, old, new):
+    path = folder / "magpend_core" / name
+    text = path.read_text("utf-8")
+    assert text.count(old) == 1, old
+    path.write_text(text.replace(old, new), "utf-8")
+
+
+def test_kernel__sees_an_edit_of_a_callee(run_python, copied):
+    # the cached entry point is in model.py, what it calls in equations.py
+    first = run_python(SCRIPT, package=copied).split()
+    again = run_python(SCRIPT, package=copied).split()
+    assert first[:2] == again[:2]
+    assert (first[2:], again[2:]) == (["0", "1"], ["1", "0"])
+    edit(copied, "equations.py", "B2 = J2 + e2 * e2 * m2", "B2 = J2 + 1.01 * e2 * e2 * m2")
+    edited = run_python(SCRIPT, package=copied).split()
+    assert edited[0] != first[0]
+    assert edited[1] != first[1]
+    assert edited[2:] == ["0", "1"]
+    assert float.fromhex(edited[1]) == pytest.approx(float.fromhex(first[1]), rel=0.1)
+
+
+def test_kernel__cache_folder_is_named_by_the_digest(run_python, copied, tmp_path):
+    version = run_python(SCRIPT, package=copied).split()[0]
+    (folder,) = (tmp_path / "cache").iterdir()
+    assert folder.name.startswith(f"{version}-numba-")
+    assert list(folder.rglob("*.nbi"))
+    assert list(folder.rglob("*.nbc"))
+    # nothing beside the sources
+    assert not [p for p in copied.rglob("*") if p.suffix in (".nbi", ".nbc")]
+
+
+def test_kernel__writes_nothing_when_switched_off(run_python, copied, tmp_path):
+    before = run_python(SCRIPT, package=copied, MAGPEND_CACHE="0").split()
+    assert not (tmp_path / "cache").exists()
+    assert not [p for p in tmp_path.rglob("*") if p.suffix in (".nbi", ".nbc")]
+    assert before[2] == "0"
+
+
+def test_source_digest__changes_with_any_source(run_python, copied):
+    script = "from magpend_core import kernel_version; print(kernel_version())"
+    versions = {run_python(script, package=copied)}
+    for name in ("vecmath.py", "status.py"):
+        path = copied / "magpend_core" / name
+        path.write_text(path.read_text("utf-8") + "\n# changed\n", "utf-8")
+        versions.add(run_python(script, package=copied))
+    assert len(versions) == 3
+    assert re.fullmatch("[0-9a-f]{16}", source_digest())
+
+
+def test_kernel__leaves_numbas_own_setting_alone(run_python, tmp_path):
+    script = (
+        "import numba; before = numba.config.CACHE_DIR; import magpend_core.models.pendulum.mechanics as m\n"
+    )
+    script += "from magpend_core.models.pendulum.systems import PENDULUM_FITTED\n"
+    script += "m._evaluator(PENDULUM_FITTED, 'rates'); print(numba.config.CACHE_DIR == before)"
+    assert run_python(script).strip() == "True"
+
+
+def test_specialise__binds_names_and_renames():
+    def template(x):
+        return x + OFFSET  # noqa: F821
+
+    bound = specialise(template, "seven", OFFSET=7)
+    assert bound(1) == 8
+    assert bound.__name__ == "template_seven"
+    assert bound.__qualname__.endswith("template_seven")
+    assert bound.__module__ == template.__module__
+    with pytest.raises(NameError):
+        template(1)
+
+
+def test_is_covered__goes_by_the_module():
+    assert is_covered(accelerations, sections)
+    assert not is_covered(accelerations, np.median)
+
+
+def test_plain_python__gives_the_same_numbers(run_python, preset):
+    # the same sources run without the compiler; only fused products round differently
+    script = (
+        "import numpy as np\n"
+        "np.seterr(all='ignore')\n"
+        "from magpend_core import accelerations, jacobian, load_preset, sections\n"
+        "p, y = load_preset(), [0.05, 0.1, 1.0, -2.0]\n"
+        "print(*accelerations(0.1, y, p, 2.2), *jacobian(0.1, y, p, 2.2).ravel())\n"
+        "r = sections(p, 2.9, [y], n_transient=0, n_keep=1, rtol=1e-6, atol=1e-6)\n"
+        "print(*r.section.ravel(), *r.n_steps)\n"
+    )
+    lines = run_python(script, NUMBA_DISABLE_JIT="1").splitlines()
+    y = [0.05, 0.1, 1.0, -2.0]
+    compiled = sections(preset, 2.9, [y], n_transient=0, n_keep=1, rtol=1e-6, atol=1e-6)
+    values = np.array(lines[0].split(), dtype=float)
+    assert values[:2] == pytest.approx(accelerations(0.1, y, preset, 2.2), rel=1e-12)
+    slopes = magpend_core.models.pendulum.jacobian(0.1, y, preset, 2.2).ravel()
+    assert values[2:] == pytest.approx(slopes, rel=1e-11, abs=1e-10)
+    section = np.array(lines[1].split(), dtype=float)
+    assert section[:4] == pytest.approx(compiled.section.ravel(), abs=1e-9)
+    assert section[4] == compiled.n_steps[0]
+
+
+@pytest.mark.parametrize("changes", [{"escape": (1.0, 1.0, 1.0, 1.0)}, {"scales": (1.0, 1.0, 5.0, 5.0)}])
+def test_label__follows_the_data(changes):
+    """Data of a system go into its compiled code, so they must go into the name under which it is kept."""
+    changed = dataclasses.replace(PENDULUM_FITTED, **changes)
+    assert changed.name == PENDULUM_FITTED.name
+    assert changed.label != PENDULUM_FITTED.label
+    assert dataclasses.replace(PENDULUM_FITTED).label == PENDULUM_FITTED.label

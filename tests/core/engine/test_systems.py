@@ -1,0 +1,101 @@
+"""The engine on another system: published points of linear and Duffing oscillators."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from magpend_core import run_branches
+from magpend_core.engine.jit import CACHE_FOLDER, is_covered
+from magpend_core.engine.lanes import engine_of
+from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.variational import with_tangents
+from magpend_core.models.pendulum.systems import PENDULUM_DIPOLE, PENDULUM_FITTED
+
+UNIT_FREQUENCY = 0.5 / np.pi  # forcing cos t
+PERIOD = 2.0 * np.pi
+
+
+def run(system, parameters, starts, frequency=UNIT_FREQUENCY, **settings):
+    """Sections (x, x', and the derivative of the map, row by row) of each start, shape (n, n_keep, 6)."""
+    full = np.array([[*s, 1.0, 0.0, 0.0, 1.0] for s in starts])
+    packed = np.tile(np.array(parameters), (len(full), 1, 1))
+    result = run_branches(
+        packed, np.full((len(full), 1), frequency), full, system=system, rtol=1e-11, atol=1e-11, **settings
+    )
+    return result.section[:, 0]
+
+
+def test_linear_oscillator__section_is_the_closed_form(oscillator):
+    # F (k - w^2)/D and F c w^2/D with D = (k - w^2)^2 + (c w)^2: the forced response at t = 2 pi n/w
+    c, k, force = 0.2, 2.0, 1.0
+    d = (k - 1.0) ** 2 + c**2
+    expected = np.array([force * (k - 1.0) / d, force * c / d])
+    assert expected == pytest.approx([0.9615384615, 0.1923076923], abs=5e-11)
+    # the transient shrinks by exp(-c T/2), half of a decade a period
+    found = run(oscillator, [c, k, 0.0, force], [[3.0, -2.0], [0.0, 0.0]], n_transient=45, n_keep=1)[:, 0, :2]
+    assert np.max(abs(found - expected)) < 1e-9
+
+
+def test_linear_oscillator__transient_is_exact(oscillator):
+    # free decay: exp(-c t/2) (cos s t + c/(2 s) sin s t) with s^2 = k - c^2/4
+    c, k = 0.3, 2.0
+    s = np.sqrt(k - c * c / 4.0)
+    found = run(oscillator, [c, k, 0.0, 0.0], [[1.0, 0.0]], frequency=0.7, n_transient=0, n_keep=10)[0]
+    t = np.arange(1, 11) / 0.7
+    exact = np.exp(-0.5 * c * t) * (np.cos(s * t) + 0.5 * c / s * np.sin(s * t))
+    assert np.max(abs(found[:, 0] - exact)) < 1e-9
+    # the variational equation of a linear system is the system
+    assert found[:, 2] == pytest.approx(found[:, 0], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("start", "point"),
+    [((-0.8, 0.0), (-0.7790549287, 0.0274168155)), ((1.2, 0.0), (1.2100908241, 0.0552949542))],
+)
+def test_duffing__two_attractors_at_their_published_points(oscillator, start, point):
+    # x'' = .2 cos t + x - x^3 - .15 x'; points recomputed independently, also in issue 139 of
+    # DynamicalSystemsBase.jl
+    duffing = [0.15, -1.0, 1.0, 0.2]
+    found = run(oscillator, duffing, [start], n_transient=60, n_keep=1)[0, 0, :2]
+    assert np.max(abs(found - point)) < 1e-9
+    # from there on one period's derivative has the published multipliers
+    one = run(oscillator, duffing, [found], n_transient=0, n_keep=1)[0, 0]
+    assert one[:2] == pytest.approx(found, abs=1e-9)
+    multipliers = np.linalg.eigvals(one[2:].reshape(2, 2))
+    published = [-0.226806 - 0.581567j, -0.226806 + 0.581567j]
+    assert np.sort_complex(multipliers) == pytest.approx(published, abs=1e-6)
+    assert np.prod(multipliers).real == pytest.approx(np.exp(-0.15 * PERIOD), abs=1e-8)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.15, 0.5])
+@pytest.mark.parametrize("start", [(0.3, 0.2), (-1.5, 1.0)])
+def test_duffing__determinant_of_the_map_is_that_of_the_damping(oscillator, damping, start):
+    found = run(oscillator, [damping, -1.0, 1.0, 0.3], [start], n_transient=0, n_keep=2)[0]
+    for n, section in enumerate(found, start=1):
+        determinant = np.linalg.det(section[2:].reshape(2, 2))
+        assert determinant == pytest.approx(np.exp(-damping * n * PERIOD), rel=1e-8)
+
+
+def test_duffing__derivative_agrees_with_differences_of_sections(oscillator):
+    duffing, start, h = [0.15, -1.0, 1.0, 0.2], np.array([0.3, 0.2]), 1e-4
+    shifts = np.array([[h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])
+    ends = run(oscillator, duffing, start + shifts, n_transient=0, n_keep=1)[:, 0, :2]
+    differences = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=1) / (2.0 * h)
+    derivative = run(oscillator, duffing, [start], n_transient=0, n_keep=1)[0, 0, 2:].reshape(2, 2)
+    # differences of second order, and 1e-11 of error over 2e-4
+    assert np.max(abs(derivative - differences)) < 1e-6
+
+
+def test_engine_of__keeps_only_the_packages_own_systems(oscillator):
+    assert is_covered(*PENDULUM_FITTED.functions)
+    assert is_covered(*PENDULUM_DIPOLE.functions)
+    assert is_covered(*with_tangents(PENDULUM_FITTED, 1).functions)
+    assert not is_covered(*oscillator.functions)
+    mixed = dataclasses.replace(PENDULUM_FITTED, name="mixed", rhs=oscillator.rhs)
+    assert not is_covered(*mixed.functions)
+    assert not is_covered(*with_tangents(mixed, 1).functions)
+    # a kept function has a cache with a path; what is not kept has none
+    kept = getattr(engine_of(PENDULUM_FITTED, RECORD_LAST)._cache, "cache_path", None)
+    assert (kept is None) == (CACHE_FOLDER is None)
+    assert getattr(engine_of(oscillator, RECORD_LAST)._cache, "cache_path", None) is None

@@ -1,0 +1,567 @@
+"""Numbers on basins against values known on paper, published values, and simulated truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+from scipy.spatial.distance import cdist
+
+from pipeline.analysis.basins.numbers import (
+    basin_entropy,
+    basin_fractions,
+    binomial_interval,
+    tipping_probabilities,
+    uncertainty_exponent,
+    wada_merge_test,
+)
+
+METHODS = ["wilson", "clopper-pearson"]
+
+
+def cubic_map(x, threshold=1.0):
+    """Where x -> x^3/threshold^2 ends: 0 at the fixed point 0, 1 and 2 at plus and minus infinity.
+
+    On paper: the unstable fixed points -threshold and threshold part the basins.
+    """
+    for _ in range(60):
+        x = np.clip(x**3 / threshold**2, -1e9, 1e9)
+    return np.where(np.abs(x) < 1.0e-3, 0, np.where(x > 0, 1, 2))
+
+
+def grebogi_map(n=300):
+    """Basins of the two fixed points of the map of Grebogi et al. (a = 1.32, b = 0.9, J0 = 0.3)."""
+    theta, x = np.meshgrid(np.linspace(0, 2 * np.pi, n), np.linspace(-0.5, 0.5, n), indexing="ij")
+    for _ in range(300):
+        kick = 1.32 * np.sin(2 * theta) - 0.9 * np.sin(4 * theta) - x * np.sin(theta)
+        theta, x = np.mod(theta + kick, 2 * np.pi), -0.3 * np.cos(theta)
+    return np.where(np.abs(np.sin(theta)) > 1e-6, -1, np.cos(theta) < 0)
+
+
+def newton_basins(n=300):
+    """Basins of Newton's method on z^3 - 1 over [-1, 1]^2."""
+    x = np.linspace(-1, 1, n)
+    z = x[:, None] + 1j * x
+    for _ in range(60):
+        z = z - (z**3 - 1) / (3 * z**2)
+    distance = np.abs(z[..., None] - np.exp(2j * np.pi * np.arange(3) / 3))
+    return np.where(distance.min(axis=-1) < 1e-6, distance.argmin(axis=-1), -1)
+
+
+def cantor_basins(levels=8):
+    """A line whose basin boundary is the middle-third Cantor set: gaps in turn, by level, 0 and 1."""
+    labels = np.full(3**levels, 2)
+    for level in range(levels):
+        width = 3 ** (levels - level)
+        thirds = labels.reshape(-1, 3, width // 3)
+        whole = (thirds == 2).all(axis=(1, 2))
+        thirds[whole, 1] = level % 2
+    return labels
+
+
+# --- fractions -------------------------------------------------------------------------------------------
+
+
+def test_basin_fractions__counts():
+    ds = basin_fractions([[1, 2, 2], [-3, 2, -1]])
+    assert ds["label"].values.tolist() == [-3, 1, 2]
+    assert ds["count"].values.tolist() == [1, 1, 3]
+    np.testing.assert_allclose(ds["fraction"], [0.2, 0.2, 0.6])
+    assert (ds["n_cells"].item(), ds["n_unfinished"].item()) == (6, 1)
+    assert ds["fraction_unfinished"].item() == pytest.approx(1 / 6)
+    np.testing.assert_allclose(ds["fraction_if_none"], [1 / 6, 1 / 6, 3 / 6])
+    np.testing.assert_allclose(ds["fraction_if_all"], [2 / 6, 2 / 6, 4 / 6])
+    assert basin_fractions([0, -1], unfinished=())["label"].values.tolist() == [-1, 0]
+
+
+@pytest.mark.parametrize(
+    ("method", "expected"),
+    # scipy.stats.binomtest(k, 20).proportion_ci; "exact" is Clopper and Pearson's
+    [("wilson", "wilson"), ("clopper-pearson", "exact")],
+)
+def test_binomial_interval__agrees_with_scipy(method, expected):
+    for k in range(21):
+        reference = stats.binomtest(k, 20).proportion_ci(0.9, method=expected)
+        low, high = binomial_interval(k, 20, confidence=0.9, method=method)
+        np.testing.assert_allclose([low, high], [reference.low, reference.high], atol=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_basin_fractions__none_and_all_have_an_error(method):
+    ds = basin_fractions(np.zeros(100, dtype=int), ids=[7], method=method)
+    assert ds["fraction"].values.tolist() == [1.0, 0.0]
+    assert ds["low"].values[1] == 0.0
+    assert ds["high"].values[0] == 1.0
+    assert 0.02 < ds["high"].values[1] < 0.04
+    assert 0.96 < ds["low"].values[0] < 0.98
+
+
+def test_basin_fractions__rule_of_three():
+    ds = basin_fractions(np.zeros(1000, dtype=int))
+    bound = ds["unseen_high"].item()
+    assert (1 - bound) ** 1000 == pytest.approx(0.05)
+    assert bound == pytest.approx(3 / 1000, rel=0.01)
+    half = basin_fractions(np.repeat([0, -1], 500))
+    assert half["unseen_high"].item() == pytest.approx(3 / 500, rel=0.01)
+    # all 500 unfinished cells may have gone to one that was not seen
+    assert 0.5 < half["unseen_high_if_all"].item() < 0.53
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_binomial_interval__exact_coverage(method):
+    n = 40
+    low, high = binomial_interval(np.arange(n + 1), n, method=method)
+    p = np.linspace(0.005, 0.995, 397)[:, None]
+    rate = (stats.binom.pmf(np.arange(n + 1), n, p) * ((low <= p) & (p <= high))).sum(axis=1)
+    if method == "wilson":
+        assert 0.945 < rate.mean() < 0.96
+    else:
+        assert rate.min() >= 0.95
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_basin_fractions__simulated_coverage(method):
+    # starts in [-1.04, 2]; basins (-1, 1), (1, 2], [-1.04, -1) on paper
+    rng = np.random.default_rng(7)
+    starts = rng.uniform(-1.04, 2.0, (2000, 150))
+    truth = np.array([2.0, 1.0, 0.04]) / 3.04
+    ds = basin_fractions(
+        xr.DataArray(cubic_map(starts), dims=("run", "start")), dims=["start"], method=method
+    )
+    assert ds["fraction"].dims == ("run", "label")
+    assert ds["fraction"].mean("run").values == pytest.approx(truth, abs=0.003)
+    rate = ((ds["low"] <= truth) & (truth <= ds["high"])).mean("run").values
+    # one standard error of a rate is 0.005; Wilson's rate swings about the level with p and n
+    assert np.all(rate > (0.92 if method == "wilson" else 0.94))
+    assert np.all(rate[:2] < 0.975)
+    # a sixth of the runs do not see the rarest basin at all, and still do not call it absent
+    assert (ds["count"].sel(label=2) == 0).mean() > 0.1
+    assert (ds["high"].sel(label=2) > truth[2]).mean() > 0.94
+
+
+def test_basin_fractions__unfinished_cells_that_are_not_like_the_rest():
+    rng = np.random.default_rng(8)
+    labels = cubic_map(rng.uniform(-1.5, 1.5, (1000, 150)))
+    labels[labels == 2] = -1  # one basin is slow: none of its cells finished
+    ds = basin_fractions(
+        xr.DataArray(labels, dims=("run", "start")), dims="start", ids=[2], method="clopper-pearson"
+    )
+    truth = np.array([4, 1, 1]) / 6
+    naive = ((ds["low"] <= truth) & (truth <= ds["high"])).mean("run").values
+    honest = ((ds["low_if_none"] <= truth) & (truth <= ds["high_if_all"])).mean("run").values
+    assert np.all(naive < 0.9)
+    assert np.all(honest > 0.94)
+    assert (ds["unseen_high_if_all"] >= 1 / 6).mean() > 0.92
+
+
+def test_basin_fractions__along_a_sweep():
+    labels = xr.DataArray(
+        [[[0, 0], [1, -1]], [[-1, -1], [-1, -1]]],
+        dims=("frequency", "y", "x"),
+        coords={"frequency": [2.0, 2.1], "x": [0.0, 1.0], "drive": "square"},
+    )
+    ds = basin_fractions(labels.transpose("x", "frequency", "y"), dims=["x", "y"])
+    np.testing.assert_allclose(ds["fraction"].sel(frequency=2.0), [2 / 3, 1 / 3])
+    assert ds["fraction"].sel(frequency=2.1).isnull().all()
+    assert ds["low"].sel(frequency=2.1).values.tolist() == [0.0, 0.0]
+    assert ds["high"].sel(frequency=2.1).values.tolist() == [1.0, 1.0]
+    assert ds["unseen_high"].sel(frequency=2.1).item() == 1.0
+    assert set(ds.coords) == {"frequency", "drive", "label"}
+
+
+def test_basin_fractions__inferred_cells_count_and_are_told():
+    rng = np.random.default_rng(5)
+    labels = xr.DataArray(rng.integers(-1, 3, (2, 30, 20)), dims=["frequency", "x", "y"])
+    inferred = xr.DataArray(rng.random((2, 30, 20)) < 0.4, dims=["frequency", "x", "y"])
+    ds = basin_fractions(labels, dims=["x", "y"], inferred=inferred.transpose("y", "frequency", "x"))
+    plain = basin_fractions(labels, dims=["x", "y"])
+    assert ds.drop_vars("n_inferred").identical(plain)
+    assert ds["n_inferred"].dims == ("frequency", "label")
+    for f in range(2):
+        for i, label in enumerate(ds["label"].values):
+            assert ds["n_inferred"][f, i] == ((labels[f] == label) & inferred[f]).sum()
+    assert basin_fractions([0, 1, 1], inferred=[True, True, False])["n_inferred"].values.tolist() == [1, 1]
+    for wrong in ([True, False], [0, 1, 7]):
+        with pytest.raises(ValueError, match="inferred is"):
+            basin_fractions([0, 1, 1], inferred=wrong)
+
+
+def test_basin_fractions__refuses():
+    with pytest.raises(TypeError, match=r"float64.*integer code"):
+        basin_fractions([0.0, 1.0])
+    for nothing in (np.zeros((0, 3), dtype=int), 4):
+        with pytest.raises(ValueError, match="no cells"):
+            basin_fractions(nothing)
+    with pytest.raises(ValueError, match="confidence is 95"):
+        basin_fractions([0, 1], confidence=95)
+    with pytest.raises(ValueError, match="'wald'"):
+        basin_fractions([0, 1], method="wald")
+    with pytest.raises(ValueError, match="also in unfinished"):
+        basin_fractions([0, 1], ids=[-1])
+    with pytest.raises(ValueError, match=r"'y'.*not dims"):
+        basin_fractions(xr.DataArray([0, 1], dims="x"), dims=["y"])
+    with pytest.raises(ValueError, match="not within 0 and n"):
+        binomial_interval(5, 4)
+
+
+# --- tipping ---------------------------------------------------------------------------------------------
+
+
+def test_tipping_probabilities__published_toy_case():
+    # JuliaDynamics/Attractors.jl, test/basins/tipping_points_tests.jl
+    before, after = np.ones((20, 20), dtype=int), np.ones((20, 20), dtype=int)
+    before[:10, :10] = -1
+    after[:, 10:] = 2
+    ds = tipping_probabilities(before, after, unfinished=())
+    p = ds["probability"].sel(before=[1, -1], after=[1, 2]).values
+    np.testing.assert_allclose(p, [[1 / 3, 2 / 3], [1, 0]])
+    assert np.all((ds["low"] <= ds["probability"]) & (ds["probability"] <= ds["high"]))
+    assert 0 < ds["high"].sel(before=-1, after=2).item() < 0.05
+
+
+def test_tipping_probabilities__map_known_on_paper():
+    x = np.random.default_rng(2).uniform(-2, 2, 40_000)
+    ds = tipping_probabilities(cubic_map(x), cubic_map(x, threshold=1.5))
+    expected = [[1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5]]
+    np.testing.assert_allclose(ds["probability"], expected, atol=0.02)
+    covered = ((ds["low"] <= expected) & (expected <= ds["high"])).values
+    assert covered.all()
+
+
+def test_tipping_probabilities__unfinished():
+    ds = tipping_probabilities([0, 0, 0, 0, 1, 1, -1, -1], [0, 0, 1, -1, 1, -1, 0, 1])
+    np.testing.assert_allclose(ds["probability"], [[2 / 3, 1 / 3], [0, 1]])
+    np.testing.assert_allclose(ds["probability_if_none"], [[0.5, 0.25], [0, 0.5]])
+    np.testing.assert_allclose(ds["probability_if_all"], [[0.75, 0.5], [0.5, 1]])
+    np.testing.assert_allclose(ds["fraction_unfinished"], [0.25, 0.5])
+    assert ds["fraction_unfinished_before"].item() == 0.25
+
+
+def test_tipping_probabilities__cells_must_be_the_same():
+    a = xr.DataArray([[0, 1, 1], [0, 0, 0]], dims=("y", "x"), coords={"x": [0.0, 1.0, 2.0], "frequency": 2.0})
+    b = (1 - a).assign_coords(frequency=2.1)
+    straight = tipping_probabilities(a, b)
+    np.testing.assert_array_equal(straight["probability"], [[0, 1], [1, 0]])
+    xr.testing.assert_identical(tipping_probabilities(a, b.T), straight)
+    with pytest.raises(ValueError, match="'x' differs"):
+        tipping_probabilities(a, b.assign_coords(x=[0.0, 1.0, 3.0]))
+    with pytest.raises(ValueError, match="dims"):
+        tipping_probabilities(a, b.rename(y="z"))
+    with pytest.raises(ValueError, match="shape"):
+        tipping_probabilities([0, 1], [0, 1, 1])
+
+
+# --- entropy ---------------------------------------------------------------------------------------------
+
+
+def test_basin_entropy__grebogi_map():
+    # Attractors.jl, test/basins/uncertainty_tests.jl: 0.40-0.42 and 0.60-0.61 at this resolution
+    ds = basin_entropy(grebogi_map(), 6)
+    assert ds["fraction_unfinished"].item() == 0.0
+    assert 0.40 <= ds["entropy"].item() <= 0.42
+    assert 0.60 <= ds["boundary_entropy"].item() <= 0.61
+    assert not ds["above_ln2"].item()  # two labels cannot exceed it
+
+
+def test_basin_entropy__on_paper():
+    labels = np.zeros((6, 5), dtype=int)
+    labels[0, 0] = 1  # one box of 2 x 2 with a quarter
+    labels[2:4, 1] = 2  # one half and half
+    ds = basin_entropy(labels, 2)
+    quarter = 0.25 * np.log(4) + 0.75 * np.log(4 / 3)
+    assert ds["entropy"].item() == pytest.approx((quarter + np.log(2)) / 6)
+    assert ds["boundary_entropy"].item() == pytest.approx((quarter + np.log(2)) / 2)
+    assert (ds["n_boxes"].item(), ds["n_boundary_boxes"].item(), ds["n_labels"].item()) == (6, 2, 3)
+    assert ds["fraction_used"].item() == pytest.approx(24 / 30)
+
+
+def test_basin_entropy__three_dimensions():
+    labels = np.zeros((9, 8, 12), dtype=int)
+    labels[:5] = 1
+    labels[:, :, ::2] += 10
+    ds = basin_entropy(labels, (3, 2, 1))
+    # boxes of one plane: a third against two thirds in the middle layer
+    mixed = np.log(3) - 2 / 3 * np.log(2)
+    assert ds["entropy"].item() == pytest.approx(mixed / 3)
+    assert ds["boundary_entropy"].item() == pytest.approx(mixed)
+
+
+def test_basin_entropy__ln_2():
+    rng = np.random.default_rng(0)
+    three = basin_entropy(rng.integers(3, size=(60, 60)))
+    assert three["boundary_entropy"].item() > 1.0
+    assert three["above_ln2"].item()
+    assert three["above_ln2_surely"].item()
+    two = basin_entropy(rng.integers(2, size=(60, 60)))
+    assert not two["above_ln2"].item()
+
+
+def test_basin_entropy__unfinished():
+    labels = np.zeros((4, 4), dtype=int)
+    labels[0, 0], labels[0, 1], labels[2:, 2:] = 1, -1, -1
+    ds = basin_entropy(labels, 2)
+    third = np.log(3) - 2 / 3 * np.log(2)
+    assert ds["entropy"].item() == pytest.approx(third / 3)
+    assert ds["n_boxes"].item() == 3
+    assert ds["fraction_unfinished"].item() == 5 / 16
+    assert basin_entropy(labels, 2, unfinished=())["n_labels"].item() == 3
+
+
+def test_basin_entropy__no_boundary():
+    ds = basin_entropy(np.full((20, 20), 4))
+    assert ds["entropy"].item() == 0.0
+    assert np.isnan(ds["boundary_entropy"].item())
+    assert not ds["above_ln2"].item()
+
+
+@pytest.mark.parametrize(
+    ("patch", "block", "low", "high"), [(1, 1, 0.8, 1.25), (4, 4, 0.8, 1.25), (4, 1, 0.1, 0.45)]
+)
+def test_basin_entropy__bootstrap_tells_the_scatter(patch, block, low, high):
+    # patches of boxes are mixed or not by a coin: the scatter over many such grids is the true error
+    rng = np.random.default_rng(5)
+    values, errors = [], []
+    for _ in range(150):
+        side = 3 * patch
+        mixed = np.kron(rng.random((60 // side, 60 // side)) < 0.5, np.ones((side, side), dtype=int))
+        ds = basin_entropy(mixed * rng.integers(2, size=(60, 60)), 3, block=block, resamples=60)
+        values.append(ds["entropy"].item())
+        errors.append(ds["entropy_stderr"].item())
+    assert low < np.mean(errors) / np.std(values) < high
+
+
+def test_boundaries__names_of_labels_do_not_matter():
+    labels = newton_basins(120)
+    renamed = np.array([40, -7, 3])[labels]
+    for function in (basin_entropy, uncertainty_exponent, wada_merge_test):
+        one, other = function(labels), function(renamed)
+        for name in (
+            "entropy",
+            "entropy_stderr",
+            "exponent",
+            "exponent_stderr",
+            "hausdorff_distance",
+            "beyond_stderr",
+        ):
+            if name in one:
+                np.testing.assert_allclose(one[name], other[name], rtol=1e-12)
+
+
+def test_basin_entropy__refuses():
+    labels = np.zeros((10, 10), dtype=int)
+    with pytest.raises(ValueError, match="2 cells"):
+        basin_entropy(labels, 1)
+    with pytest.raises(ValueError, match=r"larger than the grid \(10, 10\)"):
+        basin_entropy(labels, 11)
+    with pytest.raises(ValueError, match="3 sides, the grid 2"):
+        basin_entropy(labels, (2, 2, 2))
+    with pytest.raises(ValueError, match="block is 0"):
+        basin_entropy(labels, block=0)
+    with pytest.raises(ValueError, match="resamples is 1"):
+        basin_entropy(labels, resamples=1)
+
+
+# --- uncertainty exponent --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("method", "epsilons"), [("perturbation", None), ("perturbation", range(1, 31)), ("boxes", range(5, 31))]
+)
+def test_uncertainty_exponent__newton(method, epsilons):
+    # Attractors.jl, test/basins/uncertainty_tests.jl: 0.55-0.65 by boxes of 5 to 30 cells on 300 x 300
+    ds = uncertainty_exponent(newton_basins(), method=method, epsilons=epsilons)
+    assert 0.55 <= ds["exponent"].item() <= 0.65
+    assert ds["boundary_dimension"].item() == pytest.approx(2 - ds["exponent"].item())
+    assert ds["exponent_low"].item() < ds["exponent"].item() < ds["exponent_high"].item()
+    assert 0.01 < ds["exponent_stderr"].item() < 0.06
+
+
+def test_uncertainty_exponent__grebogi_map():
+    # the same file, 251 x 251, boxes of 3 to 15: 0.2-0.3, roughly 0.2 in the paper
+    ds = uncertainty_exponent(grebogi_map(251), method="boxes", epsilons=range(3, 16))
+    assert 0.2 <= ds["exponent"].item() <= 0.3
+
+
+def test_uncertainty_exponent__cantor_boundary_is_exact():
+    # boxes that are the intervals of the construction: 2^level of 3^level see more than one basin
+    ds = uncertainty_exponent(cantor_basins(), method="boxes", epsilons=[3**k for k in range(1, 8)])
+    assert ds["exponent"].item() == pytest.approx(1 - np.log(2) / np.log(3), abs=1e-12)
+    np.testing.assert_allclose(ds["uncertain"], (2 / 3) ** np.arange(7, 0, -1))
+    np.testing.assert_allclose(ds["fitted"], ds["uncertain"])
+    assert ds["exponent_stderr_fit"].item() < 1e-12
+    assert ds["exponent_stderr"].item() > 0.005
+
+
+@pytest.mark.parametrize("dims", [1, 2, 3])
+def test_uncertainty_exponent__plane_boundary_is_exact(dims):
+    side = {1: 400, 2: 200, 3: 60}[dims]
+    labels = np.zeros((side,) * dims, dtype=int)
+    labels[side // 2 :] = 1
+    ds = uncertainty_exponent(labels)
+    assert ds["exponent"].item() == pytest.approx(1.0, abs=1e-12)
+    room = side - 2 * ds["epsilon"].values[-1]
+    np.testing.assert_allclose(ds["uncertain"], 2 * ds["epsilon"] / room / dims)
+
+
+def test_uncertainty_exponent__entropy_of_a_straight_boundary():
+    i = np.arange(400)
+    ds = uncertainty_exponent(
+        (i[:, None] + i < 400).astype(int), method="entropy", epsilons=[8, 10, 20, 40, 50]
+    )
+    # only the boxes on the diagonal are mixed, each about half and half
+    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.03)
+    np.testing.assert_allclose(ds["uncertain"] * 400 / ds["epsilon"], np.log(2), rtol=0.02)
+
+
+def test_uncertainty_exponent__boxes_that_see_nothing_are_no_part_of_the_fit():
+    labels = np.repeat([0, 1], 1200)  # sides of 4, 5 and 6 meet the boundary with an edge
+    ds = uncertainty_exponent(labels, method="boxes", epsilons=[4, 5, 6, 7, 11, 16, 17])
+    assert ds["used"].values.tolist() == [False, False, False, True, True, False, True]
+    np.testing.assert_allclose(ds["uncertain"].values[[3, 4, 6]], [1 / 342, 1 / 218, 1 / 141])
+    slope = np.polyfit(np.log([7, 11, 17]), np.log([1 / 342, 1 / 218, 1 / 141]), 1)[0]
+    assert ds["exponent"].item() == pytest.approx(slope)
+
+
+def test_uncertainty_exponent__random_labels_have_none():
+    labels = np.random.default_rng(1).integers(3, size=(100, 100))
+    ds = uncertainty_exponent(labels)
+    assert abs(ds["exponent"].item()) < 0.02
+
+
+def test_uncertainty_exponent__bootstrap_tells_the_scatter():
+    # smooth random boundaries: many discs thrown at the square
+    rng = np.random.default_rng(4)
+    x = np.arange(120)
+    values, errors = [], []
+    for _ in range(60):
+        centre, radius = rng.uniform(0, 120, (2, 12, 1, 1)), rng.uniform(4, 14, (12, 1, 1))
+        inside = ((x[:, None] - centre[0]) ** 2 + (x - centre[1]) ** 2 < radius**2).any(axis=0)
+        ds = uncertainty_exponent(inside.astype(int), epsilons=[1, 2, 3, 4, 6], resamples=60)
+        values.append(ds["exponent"].item())
+        errors.append(ds["exponent_stderr"].item())
+    assert 0.9 < np.mean(values) < 1.05
+    assert 0.6 < np.mean(errors) / np.std(values) < 1.5
+
+
+def test_uncertainty_exponent__unfinished_cells_are_no_boundary():
+    labels = np.zeros((200, 200), dtype=int)
+    labels[100:] = 1
+    spoilt = labels.copy()
+    spoilt[::7, ::5] = -1
+    ds = uncertainty_exponent(spoilt)
+    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.05)
+    assert ds["fraction_unfinished"].item() > 0.02
+    assert uncertainty_exponent(spoilt, unfinished=())["exponent"].item() < 0.7
+
+
+@pytest.mark.parametrize("method", ["perturbation", "boxes", "entropy"])
+def test_uncertainty_exponent__no_boundary(method):
+    ds = uncertainty_exponent(np.zeros((50, 50), dtype=int), method=method)
+    assert np.isnan(ds["exponent"].item())
+    assert not ds["used"].any()
+
+
+def test_uncertainty_exponent__refuses():
+    labels = np.zeros((50, 50), dtype=int)
+    with pytest.raises(ValueError, match="fewer than 3"):
+        uncertainty_exponent(labels, epsilons=[1, 2, 2])
+    with pytest.raises(ValueError, match="not within 1 and 24"):
+        uncertainty_exponent(labels, epsilons=[1, 2, 25])
+    with pytest.raises(ValueError, match="not within 2 and 50"):
+        uncertainty_exponent(labels, epsilons=[1, 2, 3], method="boxes")
+    with pytest.raises(ValueError, match="'balls'"):
+        uncertainty_exponent(labels, method="balls")
+
+
+# --- Wada ------------------------------------------------------------------------------------------------
+
+
+def test_wada_merge_test__published_toy_cases():
+    # Attractors.jl, test/basins/wada_tests.jl: 12 x 12, smooth and artificially fractal
+    smooth = np.repeat([1, 2, 3], 4)[:, None] * np.ones(12, dtype=int)
+    ds = wada_merge_test(smooth, [1, 2])
+    np.testing.assert_allclose(ds["beyond"], 12 * 2 / 12**2)
+    assert not ds["wada"].any()
+    fractal = np.tile([1, 2, 3], 4)[:, None] * np.ones(12, dtype=int)
+    ds = wada_merge_test(fractal, 1)
+    assert ds["beyond"].item() == 0.0
+    assert ds["wada"].all()
+
+
+def test_wada_merge_test__newton_is_wada():
+    ds = wada_merge_test(newton_basins(), [1, 3, 6])
+    assert ds["wada"].values.tolist() == [False, False, True]
+    assert ds["hausdorff_distance"].item() <= 6
+    assert 0 < ds["beyond"].values[1] < ds["beyond"].values[0] < 0.01
+    assert np.all(ds["beyond_stderr"].values[:2] > 0)
+    assert ds["beyond_low"].values[0] < ds["beyond"].values[0] < ds["beyond_high"].values[0]
+
+
+def test_wada_merge_test__two_boundaries_are_not_wada():
+    # two of three basins finely mixed, the third apart behind a straight line
+    labels = np.random.default_rng(0).integers(2, size=(60, 60))
+    labels[40:] = 2
+    ds = wada_merge_test(labels, 5)
+    assert not ds["wada"].item()
+    assert ds["distance"].sel(label=0, other=2).item() == 39
+    assert ds["distance"].sel(label=2, other=0).item() < 5
+    assert ds["beyond"].item() == pytest.approx(34 / 60, abs=0.05)
+    assert ds["beyond_of_boundary"].item() > 0.8
+
+
+@pytest.mark.parametrize(("metric", "name"), [("taxicab", "cityblock"), ("chessboard", "chebyshev")])
+@pytest.mark.parametrize("shape", [(14, 11), (7, 6, 5)])
+def test_wada_merge_test__agrees_with_all_pairs(metric, name, shape):
+    rng = np.random.default_rng(9)
+    # blobs, so that the boundaries differ
+    labels = np.argmax([np.cumsum(rng.normal(size=shape), axis=0) for _ in range(3)], axis=0)
+    ds = wada_merge_test(labels, 1, metric=metric)
+    edges = []
+    for k in range(3):
+        padded = np.pad(labels == k, 1, mode="edge")
+        inner = (slice(1, -1),) * len(shape)
+        rolled = [np.roll(padded, s, a)[inner] for a in range(len(shape)) for s in (-1, 1)]
+        edges.append(np.argwhere(np.any(np.array(rolled) != (labels == k), axis=0)))
+    assert ds["n_boundary"].values.tolist() == [len(edge) for edge in edges]
+    far = [[cdist(a, b, name).min(axis=1) for b in edges] for a in edges]
+    np.testing.assert_array_equal(ds["distance"], [[d.max() for d in row] for row in far])
+    most = max((d > 1).sum() for row in far for d in row)
+    assert ds["beyond"].item() == pytest.approx(most / labels.size)
+
+
+def test_wada_merge_test__hidden_boundary():
+    labels = np.repeat([0, 1, -1, 2], 5)[:, None] * np.ones(8, dtype=int)
+    ds = wada_merge_test(labels, 50)
+    assert np.isinf(ds["hausdorff_distance"].item())
+    assert not ds["wada"].item()
+    assert ds["n_boundary"].values.tolist() == [16, 16, 0]
+    assert ds["beyond"].item() == 0.1
+    assert ds["fraction_unfinished"].item() == 0.25
+
+
+def test_wada_merge_test__refuses():
+    with pytest.raises(ValueError, match=r"2 labels \[0, 1\].*3 or more"):
+        wada_merge_test([[0, 1], [-1, 0]])
+    with pytest.raises(ValueError, match="radius 0"):
+        wada_merge_test([[0, 1], [2, 0]], [0, 3])
+    with pytest.raises(ValueError, match="'euclidean'"):
+        wada_merge_test([[0, 1], [2, 0]], metric="euclidean")
+
+
+def test_basin_entropy__few_boxes_have_no_error():
+    """Three labels in one box exceed ln 2, and one box proves nothing."""
+    one = np.arange(25).reshape(5, 5) % 3
+    found = basin_entropy(one, 5)
+    assert found["above_ln2"]
+    assert not found["above_ln2_surely"]
+    assert np.isnan([found[f"{name}_stderr"] for name in ("entropy", "boundary_entropy")]).all()
+    # twenty boxes, four of them on the boundary
+    four = np.zeros((100, 5), int)
+    four[:20] = np.tile(one, (4, 1))
+    found = basin_entropy(four, 5)
+    assert np.isfinite(found["entropy_stderr"])
+    assert np.isnan(found["boundary_entropy_low"])
+    assert not found["above_ln2_surely"]
+    many = basin_entropy(np.tile(one, (8, 1)), 5)
+    assert many["above_ln2_surely"]

@@ -1,0 +1,154 @@
+"""Basins of a cube: numbers known on paper, and what is said of cells without an outcome."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magpend_core.status import Status
+from pipeline.analysis.basins.basins import basins
+from pipeline.products import derived
+from pipeline.spec.problems import SpecError
+
+LN_2 = np.log(2.0)
+DIMS = ("frequency", "psi1_0", "psi2_0")
+
+
+def labelled(grids, status=None, spacing=0.1):
+    """Cube and ids of cells whose attractors are given, a grid per frequency."""
+    grids = np.array(grids, np.int32)
+    status = np.where(grids >= 0, Status.PERIODIC, Status.BOUNDED) if status is None else np.array(status)
+    coords = {
+        "frequency": ("frequency", 2.0 + 0.1 * np.arange(len(grids)), {"units": "Hz"}),
+        "psi1_0": spacing * np.arange(grids.shape[1]),
+        "psi2_0": spacing * np.arange(grids.shape[2]),
+    }
+    ids = xr.Dataset(
+        {
+            "attractor_id": (DIMS, grids),
+            "decision": (DIMS, (grids >= 0).astype(np.int8)),
+            "status": (DIMS, status.astype(np.int8)),
+            "kind": (("frequency", "attractor"), np.ones((len(grids), grids.max() + 1), np.int8)),
+        },
+        coords={**coords, "attractor": np.arange(grids.max() + 1)},
+    )
+    cube = ids[["status"]].assign(n_periods=(DIMS, 7 * np.ones(grids.shape, np.int32)))
+    return cube, ids
+
+
+def halves(n=60, at=33):
+    """Two basins with a straight boundary."""
+    return np.broadcast_to(np.arange(n) >= at, (n, n)).astype(np.int32)
+
+
+def thirds(n=60):
+    return np.broadcast_to(np.arange(n) * 3 // n, (n, n)).astype(np.int32)
+
+
+def test_basins__a_straight_boundary():
+    found = basins(*labelled([halves()]), box=6).isel(frequency=0)
+    # the boundary halves one column of ten boxes out of a hundred
+    np.testing.assert_allclose(found["basin_entropy"], 0.1 * LN_2)
+    np.testing.assert_allclose(found["boundary_basin_entropy"], LN_2)
+    np.testing.assert_allclose(found["uncertainty_exponent"], 1.0, atol=1e-12)
+    np.testing.assert_allclose(found["boundary_dimension"], 1.0, atol=1e-12)
+    assert found["above_ln2_surely"] == 0
+    assert found["wada"] == -1
+    assert found["fraction"].values.tolist() == [33 / 60, 27 / 60]
+    assert found["count"].values.tolist() == [33 * 60, 27 * 60]
+    assert found["low"][0] < 33 / 60 < found["high"][0]
+    assert (found["n_periods"] == 7).all()
+    assert found["uncertain"].dims == ("epsilon",)
+    assert found.attrs["not_computed"] == ""
+
+
+def test_basins__wada_test_of_parallel_strips():
+    found = basins(*labelled([thirds(), halves()]), radius=20)
+    # the boundary of the first strip is 20 cells from that of the last
+    assert found["wada_distance"].values[0] == 20
+    assert found["wada"].values.tolist() == [1, -1]
+    assert basins(*labelled([thirds()]), radius=19)["wada"].values.tolist() == [0]
+
+
+def test_basins__cells_without_an_outcome():
+    grid, status = halves(20, 10), np.full((20, 20), Status.PERIODIC)
+    for row, code in enumerate((Status.PENDING, Status.BOUNDED, Status.STEP_LIMIT, Status.DIVERGED)):
+        grid[row, :5], status[row, :5] = -1, code
+    found = basins(*labelled([grid], [status]), interval="clopper-pearson").isel(frequency=0)
+    counts = [int(found[name]) for name in ("n_pending", "n_undecided", "n_failed", "n_unfinished")]
+    assert counts == [5, 5, 5, 15]
+    assert found["label"].values.tolist() == [-2, 0, 1]
+    assert found["count"].values.tolist() == [5, 180, 200]
+    np.testing.assert_allclose(found["fraction"], np.array([5, 180, 200]) / 385)
+    np.testing.assert_allclose(found["fraction_if_all"], np.array([20, 195, 215]) / 400)
+    assert (found["attractor_id"].values[:4, :5] == -1).all()
+    # at most 3/N
+    np.testing.assert_allclose(found["unseen_high"], 3 / 385, rtol=0.01)
+
+
+def test_basins__a_point_without_any_outcome():
+    empty = np.full((20, 20), -1)
+    status = np.stack([np.full((20, 20), Status.PERIODIC), np.full((20, 20), Status.PENDING)])
+    found = basins(*labelled([halves(20, 8), empty], status))
+    assert np.isfinite(found["basin_entropy"].values).tolist() == [True, False]
+    assert np.isnan(found["fraction"].values[1]).all()
+    assert found["n_pending"].values.tolist() == [0, 400]
+
+
+def test_basins__starts_that_are_no_regular_grid():
+    cube, ids = labelled([halves(20)])
+    uneven = np.arange(20.0) ** 2
+    found = basins(cube.assign_coords(psi1_0=uneven), ids.assign_coords(psi1_0=uneven))
+    assert found.attrs["not_computed"] == "boundaries: psi1_0 is not evenly spaced"
+    assert "basin_entropy" not in found
+    sample = [x.isel(psi2_0=0).rename(psi1_0="initial_condition") for x in (cube, ids)]
+    found = basins(*sample)
+    assert found.attrs["not_computed"] == "boundaries: the starts are no grid"
+    assert found["fraction"].dims == ("frequency", "label")
+
+
+def test_basins__a_grid_too_small_for_the_boxes():
+    found = basins(*labelled([halves(20, 8)]), box=21)
+    assert "box (21, 21) is larger than the grid (20, 20)" in found.attrs["not_computed"]
+    assert np.isnan(found["basin_entropy"]).all()
+    assert np.isfinite(found["uncertainty_exponent"]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"box": 1}, "box = 1 is out of bounds: it must be 2 or more"),
+        ({"radius": 0}, "radius = 0"),
+        ({"interval": "wald"}, "interval = 'wald': must be 'wilson' or 'clopper-pearson'"),
+        ({"confidence": 1.0}, "confidence is 1.0"),
+        ({"resamples": 1}, "resamples is 1"),
+    ],
+)
+def test_basins__bad_options(options, message):
+    with pytest.raises(ValueError, match="^" + message.replace("(", "\\(")):
+        basins(*labelled([halves(20)]), **options)
+
+
+def test_derived_basins__refuses_before_it_identifies(made):
+    made.commit(0)
+    said = []
+    with pytest.raises(SpecError, match="box = 1"):
+        derived.basins(made.info.directory, box=1, echo=said.append)
+    with pytest.raises(SpecError, match=r"box = 2\.5: must be a whole number"):
+        derived.basins(made.info.directory, box=2.5)
+    with pytest.raises(SpecError, match='direction = "both"'):
+        derived.hysteresis(made.info.directory, echo=said.append)
+    assert not said
+
+
+def test_derived_basins__of_an_incomplete_run(made):
+    made.commit(0)
+    found = derived.basins(made.info.directory, polish=False, box=2)
+    n = made.plan.cells_in(0)
+    assert int((found["status"] > 0).sum()) == n
+    assert int(found["n_pending"].sum()) == made.plan.n_cells - n
+    per_point = found["n_unfinished"] - found["n_pending"] - found["n_undecided"] - found["n_failed"]
+    assert not per_point.any()
+    again = derived.basins(made.info.directory, polish=False, box=2)
+    xr.testing.assert_identical(found, again)

@@ -1,0 +1,514 @@
+"""Branches of periodic orbits, against exact solutions and scipy's integrators."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import fsolve
+
+from magpend_core import load_preset, run_branches
+from magpend_core.engine.jit import inline
+from magpend_core.engine.system import System
+from magpend_core.engine.vecmath import sincos
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
+from magpend_core.orbits import scaled_distance
+from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
+from pipeline.analysis.branches.arclength import Point, Settings
+from pipeline.analysis.branches.bifurcations import Bifurcation, multipliers_of, n_unstable, tell_apart
+from pipeline.analysis.branches.curves import continue_curves
+from pipeline.analysis.branches.following import first_point
+from pipeline.analysis.branches.lockstep import run_alone, run_together
+from pipeline.analysis.branches.problems import (
+    Family,
+    OrbitProblem,
+    Value,
+    doubling_test,
+    fold_test,
+    torus_test,
+)
+from pipeline.analysis.sides import Side
+
+
+@inline
+def _constants(frequency, p, out):
+    for i in range(5):
+        out[i] = p[i]
+    out[5] = 2.0 * np.pi * frequency
+
+
+@inline
+def _forcing(t, c):
+    return c[4] * sincos(c[5] * t)[1]
+
+
+@inline
+def _rhs(y, u, c):
+    x, v = y
+    return v, u - (c[0] + c[1] * x * x) * v - c[2] * x - c[3] * x * x * x
+
+
+@inline
+def _jacobian(y, u, c):
+    x, v = y
+    zero = 0.0 * x
+    return zero, zero + 1.0, -2.0 * c[1] * x * v - c[2] - 3.0 * c[3] * x * x, zero - c[0] - c[1] * x * x
+
+
+@inline
+def _no_edges(frequency, p, times, half_widths, jumps):
+    return
+
+
+@inline
+def _no_layers(y, dy, c):
+    return ()
+
+
+def _system(**changes):
+    fields = {
+        "name": "branch_oscillator",
+        "state_names": ("x", "v"),
+        "is_angle": (False, False),
+        "scales": (1.0, 1.0),
+        "parameter_names": ("damping", "nonlinear", "linear", "cubic", "amplitude"),
+        "n_constants": 6,
+        "constants": _constants,
+        "forcing": _forcing,
+        "rhs": _rhs,
+        "n_edges": 0,
+        "edges": _no_edges,
+        "layers": _no_layers,
+        "jacobian": _jacobian,
+        "escape": (1e3, 1e3),
+        "has_layers": False,
+    }
+    return System(**{**fields, **changes})
+
+
+# x'' = amplitude cos(2 pi f t) - (damping + nonlinear x^2) x' - linear x - cubic x^3
+OSCILLATOR = _system()
+
+
+def family(frequency, parameters, free, scale, period=1, system=OSCILLATOR):
+    return Family(system, period, frequency, np.array(parameters, float), (free,), (scale,))
+
+
+def flow(state, frequency, parameters, share=1.0):
+    """Image of a state and the derivative of the map, by scipy."""
+    damping, nonlinear, linear, cubic, amplitude = parameters
+    omega = 2.0 * np.pi * frequency
+
+    def rates(t, z):
+        x, v, *m = z
+        stiffness = linear + 3.0 * cubic * x * x + 2.0 * nonlinear * x * v
+        friction = damping + nonlinear * x * x
+        force = amplitude * np.cos(omega * t) - friction * v - linear * x - cubic * x**3
+        m = np.reshape(m, (2, 2))
+        return [v, force, *m[1], *(-stiffness * m[0] - friction * m[1])]
+
+    start = [*state, 1.0, 0.0, 0.0, 1.0]
+    end = solve_ivp(rates, (0.0, share / frequency), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    return end[:2], end[2:].reshape(2, 2)
+
+
+def settled(state, frequency, parameters, n_periods=60):
+    """Section point after some periods, by scipy."""
+
+    def rates(t, z):
+        force = parameters[4] * np.cos(2.0 * np.pi * frequency * t)
+        friction = parameters[0] + parameters[1] * z[0] * z[0]
+        return [z[1], force - friction * z[1] - parameters[2] * z[0] - parameters[3] * z[0] ** 3]
+
+    return solve_ivp(rates, (0.0, n_periods / frequency), state, rtol=1e-8, atol=1e-8).y[:, -1]
+
+
+def recomputed(bifurcation, orbits, test, parameters_at):
+    """Where scipy finds the same bifurcation, from a start that is a little off."""
+
+    def equations(unknowns):
+        frequency, parameters = parameters_at(unknowns[2])
+        image, matrix = flow(unknowns[:2], frequency, parameters)
+        return [*(image - unknowns[:2]), test(matrix)]
+
+    u = bifurcation.point.u
+    start = np.append(orbits.state(u), orbits.values(u)[0]) * (1.0 + 1e-4)
+    found, _, good, _ = fsolve(equations, start, xtol=1e-13, full_output=True)
+    assert good == 1
+    return found[2]
+
+
+def only(branch, kind):
+    return [b for b in branch.bifurcations if b.kind == kind]
+
+
+def test_explore__linear_oscillator():
+    """The exact orbit and multipliers at every frequency."""
+    damping, linear, amplitude = 0.3, 4.0, 1.0
+    orbits = family(0.2, [damping, 0, linear, 0, amplitude], "frequency_hz", 0.5)
+    (branch,) = explore([Start(orbits, np.zeros(2), 0.2)], Scope(0.1, 0.6))
+    assert branch.ends == ("bound", "bound")
+    assert not branch.bifurcations
+    np.testing.assert_array_equal(branch.values[[0, -1]], [0.1, 0.6])
+    omega = 2.0 * np.pi * branch.values
+    response = amplitude / (linear - omega**2 + 1j * damping * omega)
+    states = np.array([orbits.state(p.u) for p in branch.points])
+    np.testing.assert_allclose(states, np.stack([response.real, -omega * response.imag], axis=1), atol=1e-9)
+    root = -damping / 2.0 + 1j * np.sqrt(linear - damping**2 / 4.0)
+    exact = np.exp(root / branch.values)
+    for point, value in zip(branch.points, exact, strict=True):
+        assert np.abs(multipliers_of(point) - value).min() < 1e-9
+
+
+@pytest.fixture(scope="module")
+def resonance():
+    """The bent resonance of a hardening spring: stable, unstable, stable again."""
+    orbits = family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency_hz", 0.3)
+    (branch,) = explore([Start(orbits, np.array([0.3, 0.0]), 0.1)], Scope(0.1, 0.4))
+    return orbits, branch
+
+
+def test_explore__folds_of_duffing(resonance):
+    orbits, branch = resonance
+    upper, lower = only(branch, "fold")
+    assert branch.bifurcations == [upper, lower]
+    for fold, sides in ((upper, (0, 1)), (lower, (1, 0))):
+        assert (fold.n_unstable_before, fold.n_unstable_after) == sides
+        assert fold.bracket < 1e-8
+        assert abs(fold.critical_multiplier - 1.0) < 1e-6
+        there = recomputed(fold, orbits, fold_test, lambda f: (f, orbits.parameters))
+        assert orbits.values(fold.point.u)[0] == pytest.approx(there, abs=1e-8)
+
+
+def test_explore__starts_on_one_branch(resonance):
+    """All coexisting orbits at one frequency lie on the one bent branch, which is followed once."""
+    orbits, branch = resonance
+    folds = [orbits.values(b.point.u)[0] for b in branch.bifurcations]
+    middle = float(np.mean(folds))
+    crossings = np.flatnonzero(np.diff(branch.values > middle))
+    guesses = [np.append(branch.points[i].u[:2], middle / 0.3) for i in crossings]
+    points = run_together([first_point(OrbitProblem(orbits), u, Settings()) for u in guesses])
+    starts = [Start(orbits, orbits.state(p.u), middle) for p in points]
+    assert len({round(float(s.state[0]), 3) for s in starts}) == 3
+    assert len(explore(starts, Scope(0.1, 0.4, settings=Settings(longest_step=0.03)))) == 1
+
+
+def test_explore__determinant(resonance):
+    """Liouville: the flow contracts areas by exp(-damping T), on stable and unstable orbits."""
+    _, branch = resonance
+    found = [np.linalg.det(p.value.monodromy) for p in branch.points]
+    np.testing.assert_allclose(found, np.exp(-0.1 / branch.values), rtol=1e-9)
+    assert {n_unstable(p) for p in branch.points} == {0, 1}
+    assert max(p.residual for p in branch.points) < 1e-10
+
+
+def test_dataset_of__resonance(resonance):
+    """Three stable segments' worth of tables: numbers as on the branch."""
+    _, branch = resonance
+    ds = dataset_of([branch], "frequency_hz", None)
+    upper, lower = sorted(table_of(ds), key=lambda row: -row["value"])
+    assert [upper["type"], lower["type"]] == ["fold", "fold"]
+    assert (upper["unstable_below"], upper["unstable_above"]) == ("0|1", "none")
+    assert (lower["unstable_below"], lower["unstable_above"]) == ("none", "0|1")
+    first, second = windows_of(ds)
+    assert (first["begins"], first["ends"]) == ("bound", "fold")
+    assert (second["begins"], second["ends"]) == ("fold", "bound")
+    assert (first["to"], second["from"]) == (upper["value"], lower["value"])
+
+
+@pytest.fixture(scope="module")
+def cascade():
+    """Two wells, amplitude as the parameter: the first doublings of one well's orbit."""
+    parameters = [0.3, 0, -1.0, 1.0, 0.2]
+    orbits = family(1.2 / (2.0 * np.pi), parameters, "amplitude", 0.1)
+    return orbits, explore(
+        [Start(orbits, settled([1.2, 0.0], orbits.frequency_hz, parameters), 0.2)],
+        Scope(0.2, 0.3, max_period=4),
+    )
+
+
+def test_explore__period_doublings(cascade):
+    orbits, branches = cascade
+    assert [b.family.period for b in branches] == [1, 2, 4]
+    first, second = (only(b, "period_doubling")[0] for b in branches[:2])
+    there = recomputed(
+        first, orbits, doubling_test, lambda a: (orbits.frequency_hz, [*orbits.parameters[:4], a])
+    )
+    assert orbits.values(first.point.u)[0] == pytest.approx(there, abs=1e-8)
+    assert (first.n_unstable_before, first.n_unstable_after) == (0, 1)
+    assert first.criticality == second.criticality == "supercritical"
+    assert first.child is branches[1]
+    assert branches[1].origin is first
+    # the doubled orbit is stable until its own doubling, and not the single one
+    point = branches[1].points[5]
+    assert n_unstable(point) == 0
+    image, _ = flow(
+        branches[1].family.state(point.u),
+        orbits.frequency_hz,
+        [*orbits.parameters[:4], branches[1].values[5]],
+    )
+    assert np.abs(image - branches[1].family.state(point.u)).max() > 1e-3
+
+
+def test_explore__start_on_doubled_orbit(cascade):
+    """From the doubled orbit the single one is found as the branch that it ends on."""
+    orbits, branches = cascade
+    middle = branches[1].points[10]
+    state, value = branches[1].family.state(middle.u), branches[1].values[10]
+    again = explore([Start(branches[1].family, state, float(value))], Scope(0.2, 0.3, max_period=2))
+    assert sorted(b.family.period for b in again) == [1, 2]
+    single, double = sorted(again, key=lambda b: b.family.period)
+    assert only(single, "period_doubling")[0].child is double
+    np.testing.assert_allclose(
+        orbits.values(only(single, "period_doubling")[0].point.u),
+        orbits.values(only(branches[0], "period_doubling")[0].point.u),
+        atol=1e-8,
+    )
+
+
+def test_explore__neimark_sacker():
+    """A forced van der Pol oscillator leaves entrainment through a torus."""
+    parameters = [-0.2, 0.2, 1.0, 0.0, 0.4]
+    orbits = family(0.16, parameters, "frequency_hz", 0.05)
+    (branch,) = explore(
+        [Start(orbits, settled([1.0, 1.5], 0.16, parameters), 0.16)],
+        Scope(0.15, 0.22, settings=Settings(longest_step=0.03)),
+    )
+    tori = only(branch, "neimark_sacker")
+    assert tori
+    for torus in tori:
+        assert abs(abs(torus.critical_multiplier) - 1.0) < 1e-7
+        assert torus.critical_multiplier.imag > 0.1
+        assert sorted((torus.n_unstable_before, torus.n_unstable_after)) == [0, 2]
+        there = recomputed(torus, orbits, torus_test, lambda f: (f, parameters))
+        assert orbits.values(torus.point.u)[0] == pytest.approx(there, abs=1e-8)
+
+
+def test_explore__symmetry_breaking():
+    """The symmetric orbit of a symmetric spring; scipy finds the pitchfork with the half-period map."""
+    parameters = [0.1, 0, 0.0, 1.0, 0.3]
+    orbits = family(1.0 / (2.0 * np.pi), parameters, "amplitude", 1.0)
+    branches = explore(
+        [Start(orbits, settled([0.0, 0.0], orbits.frequency_hz, parameters), 0.3)],
+        Scope(0.02, 3.0, max_period=1),
+    )
+    pitchfork = only(branches[0], "branch_point")[0]
+    broken = pitchfork.child
+    assert broken is not None
+
+    def equations(unknowns):
+        image, matrix = flow(unknowns[:2], orbits.frequency_hz, [*parameters[:4], unknowns[2]], share=0.5)
+        # the symmetry: x(t + T/2) = -x(t), so that the half-period map with a turn has the orbit as its
+        # fixed point, and the multiplier -1 where the symmetry breaks
+        return [*(-image - unknowns[:2]), doubling_test(-matrix)]
+
+    u = pitchfork.point.u
+    start = np.append(orbits.state(u), orbits.values(u)[0])
+    there, _, good, _ = fsolve(equations, start * (1 + 1e-5), xtol=1e-13, full_output=True)
+    assert good == 1
+    assert orbits.values(u)[0] == pytest.approx(there[2], abs=1e-7)
+    far = broken.points[-1] if broken.points[0] is pitchfork.point else broken.points[0]
+    half, _ = flow(orbits.state(far.u), orbits.frequency_hz, [*parameters[:4], orbits.values(far.u)[0]], 0.5)
+    assert np.abs(half + orbits.state(far.u)).max() > 1e-2
+
+
+def test_continue_curves__fold_of_duffing(resonance):
+    """The fold at another amplitude, against scipy."""
+    orbits, branch = resonance
+    family_2 = Family(OSCILLATOR, 1, 0.1, orbits.parameters, ("frequency_hz", "amplitude"), (0.3, 0.2))
+    fold = only(branch, "fold")[0]
+    start = family_2.unknowns(orbits.state(fold.point.u), [orbits.values(fold.point.u)[0], 0.3])
+    (curve,) = continue_curves([(0, family_2, "fold", start)], ((0.1, 0.4), (0.2, 0.4)))
+    assert max(p.residual for p in curve.points) <= 1e-8
+    far = min(curve.points, key=lambda p: abs(family_2.values(p.u)[1] - 0.35))
+    frequency, amplitude = family_2.values(far.u)
+    parameters = [*orbits.parameters[:4], amplitude]
+
+    def equations(unknowns):
+        image, matrix = flow(unknowns[:2], unknowns[2], parameters)
+        return [*(image - unknowns[:2]), fold_test(matrix)]
+
+    there = fsolve(equations, np.append(family_2.state(far.u), frequency) * (1 + 1e-5), xtol=1e-13)
+    assert frequency == pytest.approx(there[2], abs=1e-8)
+    assert abs(frequency - orbits.values(fold.point.u)[0]) > 1e-3
+    # a second point of the same curve is recognised
+    both = [(0, family_2, "fold", start), (1, family_2, "fold", far.u)]
+    assert [c.start for c in continue_curves(both, ((0.1, 0.4), (0.2, 0.4)))] == [0]
+
+
+@inline
+def _turning_rhs(y, u, c):
+    x, v = y
+    return v, u + c[3] - c[0] * v - c[2] * sincos(x)[0]
+
+
+@inline
+def _turning_jacobian(y, u, c):
+    zero = 0.0 * y[0]
+    return zero, zero + 1.0, -c[2] * sincos(y[0])[1], zero - c[0]
+
+
+@pytest.mark.slow
+def test_explore__rotation():
+    """A pendulum that turns over once per period: closed on its circle, one turn, round a fold."""
+    system = _system(
+        name="branch_turning", is_angle=(True, False), rhs=_turning_rhs, jacobian=_turning_jacobian,
+        parameter_names=("damping", "nothing", "gravity", "torque", "amplitude"),
+    )  # fmt: skip
+    frequency, parameters = 0.32, [0.5, 0.0, 1.0, 1.0, 1.0]
+
+    def rates(t, z):
+        force = parameters[4] * np.cos(2.0 * np.pi * frequency * t) + parameters[3]
+        return [z[1], force - parameters[0] * z[1] - parameters[2] * np.sin(z[0])]
+
+    end = solve_ivp(rates, (0.0, 80 / frequency), [0.0, 2.0], rtol=1e-8, atol=1e-8).y[:, -1]
+    end[0] = np.remainder(end[0], 2.0 * np.pi)
+    orbits = family(frequency, parameters, "amplitude", 1.0, system=system)
+    (branch,) = explore([Start(orbits, end, 1.0)], Scope(0.05, 1.2, max_period=1))
+    folds = only(branch, "fold")
+    assert len(folds) == 1
+    ds = dataset_of([branch], "amplitude", None)
+    assert ds["rotation"].values.tolist() == [[1.0]]
+    parameters[4] = float(branch.values[7])
+    state = orbits.state(branch.points[7].u)
+    image = solve_ivp(rates, (0.0, 1 / frequency), state, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(image - state, [2.0 * np.pi, 0.0], atol=1e-9)
+
+
+def test_orbits_near__chaotic_well():
+    """Recurrences of a chaotic trajectory lead to unstable orbits, each a fixed point by scipy too."""
+    parameters = [0.3, 0, -1.0, 1.0, 0.5]
+    frequency = 1.2 / (2.0 * np.pi)
+    points = [np.array([1.0, 0.0])]
+    for _ in range(150):
+        points.append(settled(points[-1], frequency, parameters, 1))
+    found = orbits_near(np.array(points)[None, 30:], frequency, np.array(parameters), 4, OSCILLATOR)
+    assert len(found) >= 3
+    seen = []
+    for state, period in found:
+        assert not any(np.abs(state - other).max() < 1e-6 for other in seen)
+        image = state
+        matrix = np.eye(2)
+        for k in range(period):
+            image, step = flow(image, frequency, parameters)
+            seen.append(image)
+            matrix = step @ matrix
+            assert (np.abs(image - state).max() < 1e-8) == (k == period - 1)
+        assert np.abs(np.linalg.eigvals(matrix)).max() > 1.0
+
+
+def test_run_together__same_bits():
+    """Values do not depend on what else is computed, nor on the periods beside."""
+    settings = Settings()
+    problems = [
+        (OrbitProblem(o), o.unknowns(np.array([0.4, 0.1]), [0.1]))
+        for o in (family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency_hz", 0.3, period=p) for p in (1, 2, 3))
+    ]
+    alone = [run_alone(first_point(p, u, settings)) for p, u in problems]
+    for count in (3, 9):
+        together = run_together([first_point(p, u, settings) for p, u in problems * (count // 3)])
+        for a, b in zip(alone * (count // 3), together, strict=True):
+            np.testing.assert_array_equal(a.u, b.u)
+            np.testing.assert_array_equal(a.value.monodromy, b.value.monodromy)
+
+
+def test_watch__neutral_saddle():
+    """A real pair of product 1 makes the torus test vanish and is dropped; a complex pair is kept."""
+    saddle, angle = np.diag([2.0, 0.5]), 1.0
+    torus = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    found = []
+    for matrix in (saddle, torus):
+        assert torus_test(matrix) == pytest.approx(0.0)
+        value = Value(np.zeros(2), np.zeros((2, 3)), np.zeros((1, 2)), matrix)
+        point = Point(np.zeros(3), np.array([0.0, 0.0, 1.0]), value, 0)
+        found.append(Bifurcation("neimark_sacker", point, 0.0, 1, 1, True))
+    assert tell_apart(found, found[0].point) == found[1:]
+
+
+def test_explore__closed_branch():
+    """A weakly forced van der Pol oscillator: the entrained orbits and their saddles form a closed curve."""
+    parameters = [-0.2, 0.2, 1.0, 0.0, 0.1]
+    frequency = 1.0 / (2.0 * np.pi)
+    orbits = family(frequency, parameters, "frequency_hz", 0.02)
+    start = Start(orbits, settled([1.0, 1.5], frequency, parameters, 200), frequency)
+    (branch,) = explore([start], Scope(0.15, 0.17, max_period=1, settings=Settings(longest_step=0.05)))
+    assert branch.ends == ("closed", "closed")
+    assert sorted(b.kind for b in branch.bifurcations) == ["fold", "fold"]
+    assert np.abs(branch.points[-1].u - branch.points[0].u).max() < 0.1
+    # stable from fold to fold, across the start
+    (window,) = windows_of(dataset_of([branch], "frequency_hz", None))
+    folds = sorted(orbits.values(b.point.u)[0] for b in branch.bifurcations)
+    assert [window["from"], window["to"]] == folds
+    # another orbit of it is recognised
+    again = Start(orbits, orbits.state(branch.points[9].u), float(branch.values[9]))
+    assert len(explore([start, again], Scope(0.15, 0.17, max_period=1))) == 1
+
+
+# ---- the pendulum ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def right_family():
+    """The right one-sided orbit of period 1 and what hangs on it, around the period halving near 2.5 Hz."""
+    parameters = load_preset()
+    state = [0.01421118, 0.19932267, -2.74881127, 3.65512389]
+    orbits = family(2.2, parameters.pack(), "frequency_hz", 1.0, system=PENDULUM_FITTED)
+    scope = Scope(2.15, 2.55, max_period=2, max_generations=1, settings=Settings(longest_step=0.02))
+    return parameters, orbits, explore([Start(orbits, np.array(state), 2.2)], scope)
+
+
+def test_explore__right_family(right_family):
+    """Where stability ends and comes back: the abrupt end is a subcritical doubling, the halving none."""
+    _, orbits, branches = right_family
+    single, double = branches
+    abrupt, halving = only(single, "period_doubling")
+    assert orbits.values(abrupt.point.u)[0] == pytest.approx(2.3722244, abs=2e-7)
+    assert orbits.values(halving.point.u)[0] == pytest.approx(2.4986082, abs=2e-7)
+    assert (abrupt.criticality, halving.criticality) == ("subcritical", "supercritical")
+    assert abrupt.child is halving.child is double
+    assert double.ends == ("start", "period_halving")
+
+
+def test_explore__brute_force_agrees(right_family):
+    """Inside the stable segments, sections of trajectories lie on the branch to 1e-6."""
+    parameters, _, branches = right_family
+    ds = dataset_of(branches, "frequency_hz", parameters)
+    chosen = [
+        (i, j)
+        for i, branch in enumerate(branches)
+        for j in range(1, len(branch.points), 2)
+        # nearer to a bifurcation the approach takes thousands of periods
+        if np.abs(multipliers_of(branch.points[j])).max() < 0.985
+    ]
+    orbits = [ds["section"].values[i, j, : branches[i].family.period] for i, j in chosen]
+    n = len(chosen)
+    result = run_branches(
+        np.tile(parameters.pack(), (n, 1, 1)), np.array([[branches[i].values[j]] for i, j in chosen]),
+        np.array([orbit[0] for orbit in orbits]) + [1e-3, -1e-3, 1e-2, 1e-2],
+        n_transient=1500, n_keep=4, rtol=1e-9, atol=1e-9, stop_when_closed=True, closure_tolerance=1e-7,
+    )  # fmt: skip
+    assert result.orbit_period[:, 0].tolist() == [branches[i].family.period for i, _ in chosen]
+    for orbit, sections in zip(orbits, result.section[:, 0], strict=True):
+        for section in sections:
+            assert scaled_distance(orbit, section).min() < 1e-6
+    assert {i for i, _ in chosen} == {0, 1}
+    assert n > 15
+    assert set(np.unique(ds["side"].values[:, 0])) == {Side.RIGHT}
+
+
+def test_locate__at_a_velocity_reversal(right_family):
+    """The multipliers next to a located doubling move on smoothly: friction's corner leaves no trace here."""
+    _, orbits, (single, _) = right_family
+    halving = only(single, "period_doubling")[1]
+    at = orbits.values(halving.point.u)[0]
+    tests = []
+    for offset in (-2e-4, -1e-4, 1e-4, 2e-4):
+        u = halving.point.u + offset / halving.point.tangent[-1] * halving.point.tangent
+        u[-1] = at + offset
+        tests.append(
+            doubling_test(run_alone(first_point(OrbitProblem(orbits), u, Settings())).value.monodromy)
+        )
+    left, right = tests[1] - tests[0], tests[3] - tests[2]
+    # the slope changes by its own derivative only: with a corner, the two would differ at any offset
+    assert left == pytest.approx(right, rel=1e-2)
+    assert tests[1] * tests[2] < 0.0

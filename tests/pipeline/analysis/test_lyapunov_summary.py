@@ -1,0 +1,241 @@
+"""What stored exponents say, and how they are drawn."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.collections import PolyCollection
+
+from magpend_core import Status, load_preset, lyapunov_exponents
+from magpend_core.orbits import stroboscopic_map
+from pipeline.analysis.chaos.lyapunov import Motion, spectrum_of_jacobians, summarise
+from pipeline.plots import plot_lyapunov, plot_lyapunov_map
+
+STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+
+
+def make_cube(rates, *, stderr=0.02, n_exponents=4, blocks=8, **dims):
+    """Cube of made-up exponents; `rates` are the largest, with the given dims."""
+    names, shape = list(dims), tuple(len(v) for v in dims.values())
+    rates = np.asarray(rates, float).reshape(shape)
+    spectrum = rates[..., None] + np.array([0.0, -0.4, -0.9, -1.5])[:n_exponents]
+    wave = 0.05 * np.array([1, -1] * (blocks // 2))
+    series = spectrum[..., None, :] + wave[:, None]
+    section = np.full((*shape, 5, 4), 0.3)
+    return xr.Dataset(
+        {
+            "section": ((*names, "period_index", "state"), section),
+            "status": (names, np.full(shape, Status.BOUNDED, np.int8)),
+            "orbit_period": (names, np.zeros(shape, np.int16)),
+            "turns": ((*names, "link"), np.zeros((*shape, 2), np.int32)),
+            "lyapunov": ((*names, "exponent"), spectrum, {"units": "1/s"}),
+            "lyapunov_stderr": ((*names, "exponent"), np.full(spectrum.shape, stderr)),
+            "lyapunov_blocks": ((*names, "block", "exponent"), series),
+            "divergence": (names, spectrum.sum(-1) + 0.001),
+            "lyapunov_flag": (names, np.ones(shape, np.int8)),
+        },
+        coords={
+            **dims,
+            "state": STATES,
+            "exponent": np.arange(1, n_exponents + 1),
+            "frequency": dims["frequency"],
+        },
+    )
+
+
+FREQUENCY = np.array([1.0, 2.0, 4.0])
+
+
+@pytest.fixture
+def cube():
+    return make_cube([[1.0, 0.2], [0.01, -0.3], [0.9, 0.8]], frequency=FREQUENCY, initial_condition=[0, 1])
+
+
+def test_summarise__per_period_is_per_time_over_frequency(cube):
+    found = summarise(cube)
+    assert found.lyapunov_per_period.dims == cube.lyapunov.dims
+    assert found.lyapunov_per_period.values[:, 0, 0] == pytest.approx([1.0, 0.005, 0.225])
+    assert found.lyapunov_per_period_stderr.values[:, 0, 0] == pytest.approx([0.02, 0.01, 0.005])
+
+
+def test_summarise__running_means_end_at_the_mean(cube):
+    running = summarise(cube).lyapunov_running
+    assert running.isel(block=-1).values == pytest.approx(cube.lyapunov.values)
+    assert running.values[0, 0, 0, 0] == pytest.approx(1.05)
+    assert running.values[0, 0, 2, 0] == pytest.approx(1.0 + 0.05 / 3)
+
+
+def test_summarise__motion(cube):
+    cube["status"][2, 1] = Status.PERIODIC
+    cube["lyapunov_flag"][0, 1] = 4
+    found = summarise(cube).motion.values
+    # 1.0 and 0.6 are both positive, 0.01 is within three errors, and a closed orbit is regular
+    assert found.tolist() == [
+        [Motion.HYPERCHAOTIC, Motion.UNKNOWN],
+        [Motion.UNDECIDED, Motion.REGULAR],
+        [Motion.HYPERCHAOTIC, Motion.REGULAR],
+    ]
+    assert summarise(cube.isel(exponent=slice(1))).motion.values[0, 0] == Motion.CHAOTIC
+    cube["lyapunov_flag"][0, 0] = 3  # only the first exponent is resolved
+    assert summarise(cube).motion.values[0, 0] == Motion.CHAOTIC
+
+
+def test_summarise__a_transient_drifts(cube):
+    blocks = cube["lyapunov_blocks"].copy()
+    blocks[0, 0, 4:, 0] -= 1.2
+    found = summarise(cube.assign(lyapunov_blocks=blocks))
+    assert found.drift.values[0, 0] == pytest.approx(-1.2)
+    # blocks scatter by 0.05, four on either side: sample variance 0.0025 * 4/3
+    assert found.drift_sigma.values[0, 0] == pytest.approx(-1.2 / np.sqrt(2 * 0.0025 * 4 / 3 / 4))
+    assert abs(found.drift_sigma.values[1, 0]) < 1e-9
+
+
+def test_summarise__audit(cube):
+    assert summarise(cube).audit.values == pytest.approx(-0.001)
+    assert np.isnan(summarise(cube.isel(exponent=slice(2))).audit).all()
+
+
+def test_summarise__a_cube_without_exponents_is_refused(cube):
+    with pytest.raises(ValueError, match=r"no Lyapunov exponents; run it with \[products\]"):
+        summarise(cube.drop_vars("lyapunov"))
+
+
+def test_spectrum_of_jacobians__henon():
+    # a = 1.4, b = 0.3: l1 = 0.419 (0.4192), l1 + l2 = ln 0.3
+    n_cells, n_transient, n = 100, 50, 4096
+    x, y = np.random.default_rng(0).uniform(-0.1, 0.1, (2, n_cells))
+    jacobians = np.zeros((n_cells, n_transient + n, 2, 2))
+    jacobians[..., 0, 1], jacobians[..., 1, 0] = 1.0, 0.3
+    for i in range(n_transient + n):
+        jacobians[:, i, 0, 0] = -2.8 * x
+        x, y = 1.0 - 1.4 * x * x + y, 0.3 * x
+    found = spectrum_of_jacobians(jacobians, n_transient=n_transient)
+    assert found.exponents[:, 0].mean() == pytest.approx(0.419, abs=0.001)
+    assert found.exponents.sum(axis=1) == pytest.approx(np.log(0.3), abs=1e-12)
+    # the errors of the trajectories are what they scatter by
+    assert found.exponents[:, 0].std(ddof=1) == pytest.approx(found.stderr[:, 0].mean(), rel=0.25)
+    alone = spectrum_of_jacobians(jacobians[3], n_transient=n_transient)
+    assert alone.exponents == pytest.approx(found.exponents[3], abs=1e-13)
+    assert alone.blocks.mean(axis=0) == pytest.approx(alone.exponents)
+    assert alone.blocks.shape == (16, 2)
+
+
+def test_spectrum_of_jacobians__falling_order_and_singular_maps():
+    # the basis stays where it began: in rising order
+    found = spectrum_of_jacobians(np.tile(np.diag([0.5, 2.0]), (8, 1, 1)), n_blocks=2)
+    assert found.exponents == pytest.approx(np.log([2.0, 0.5]))
+    assert found.stderr == pytest.approx(0.0)
+    flat = spectrum_of_jacobians(np.tile(np.diag([2.0, 0.0]), (8, 1, 1)), n_blocks=2)
+    assert flat.exponents.tolist() == [pytest.approx(np.log(2.0)), -np.inf]
+
+
+@pytest.mark.parametrize(
+    ("shape", "options", "message"),
+    [
+        ((8, 2), {}, "give .*n, state, state"),
+        ((8, 2, 3), {}, "give .*n, state, state"),
+        ((20, 2, 2), {}, "20 Jacobians after the transient .* give 16"),
+        ((20, 2, 2), {"n_transient": 5}, "15 Jacobians"),
+        ((16, 2, 2), {"n_blocks": 1}, "n_blocks = 1, n_transient = 0: give 2 or more"),
+    ],
+)
+def test_spectrum_of_jacobians__mistakes(shape, options, message):
+    with pytest.raises(ValueError, match=message):
+        spectrum_of_jacobians(np.ones(shape), **options)
+    with pytest.raises(ValueError, match="not all finite"):
+        spectrum_of_jacobians(np.full((16, 2, 2), np.nan))
+
+
+def test_spectrum_of_jacobians__is_the_spectrum_of_the_engine():
+    # few periods: chaos separates the two computations
+    start, one, frequency = np.array([[0.5, -0.3, 0.0, 0.0]]), load_preset().pack()[None], np.array([2.4])
+    jacobians, point = [], start
+    for _ in range(26):
+        image, derivative = stroboscopic_map(one, frequency, point, 1, rtol=1e-11)
+        jacobians.append(derivative[0])
+        point = image[:, -1]
+    expected = spectrum_of_jacobians(jacobians, n_blocks=4, n_transient=10)
+    found = lyapunov_exponents(
+        one, frequency, start, n_transient=10, n_periods=16, rtol=1e-11, atol=1e-11, n_blocks=4
+    )
+    assert found.exponents[0] == pytest.approx(expected.exponents * 2.4, abs=1e-4)
+    assert found.blocks[0] == pytest.approx(expected.blocks * 2.4, abs=1e-4)
+    assert found.stderr[0] == pytest.approx(expected.stderr * 2.4, abs=1e-4)
+
+
+def artists(fig, gid):
+    return [a for a in fig.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)]
+
+
+def test_plot_lyapunov__points_are_the_largest_exponents(cube):
+    fig = plot_lyapunov(cube)
+    (line,) = artists(fig, "exponent:right")  # psi1 = psi2 = 0.3
+    drawn = sorted(zip(line.get_xdata(), line.get_ydata(), strict=True))
+    expected = sorted(
+        (f, v) for f, row in zip(FREQUENCY, cube.lyapunov.values[..., 0], strict=True) for v in row
+    )
+    assert np.array(drawn) == pytest.approx(np.array(expected))
+    top, bottom = fig.axes
+    assert bottom.get_shared_x_axes().joined(top, bottom)
+    assert bottom.get_ylabel() == "largest exponent [1/s]"
+    assert bottom.get_xlabel() == "drive frequency [Hz]"
+
+
+def test_plot_lyapunov__bands_are_one_error_wide_and_joined(cube):
+    cube["lyapunov"][0, 1, 0] = 0.97
+    (band,) = [
+        a for a in artists(plot_lyapunov(cube), "band:exponent:right") if isinstance(a, PolyCollection)
+    ]
+    spans = {(round(p.vertices[:, 1].min(), 9), round(p.vertices[:, 1].max(), 9)) for p in band.get_paths()}
+    assert (0.95, 1.02) in spans  # 1.0 and 0.97 overlap
+    assert (-0.32, -0.28) in spans
+    assert len(spans) == 5
+
+
+def test_plot_lyapunov__spectrum_per_period(cube):
+    fig = plot_lyapunov(cube, spectrum=True, per="period")
+    for k in range(4):
+        (line,) = artists(fig, f"exponent:{k + 1}")
+        assert sorted(line.get_ydata()) == pytest.approx(
+            sorted((cube.lyapunov.values[..., k] / FREQUENCY[:, None]).ravel())
+        )
+    assert fig.axes[1].get_ylabel() == "exponents [1/drive period]"
+    assert fig.data["exponent_value"].attrs["per"] == "drive period"
+
+
+def test_plot_lyapunov__flagged_cells_are_open(cube):
+    cube["lyapunov_flag"][1, 1] = 2
+    fig = plot_lyapunov(cube)
+    (line,) = artists(fig, "flagged:exponent:right")
+    assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([2.0], pytest.approx([-0.3]))
+    assert line.get_markerfacecolor() == "none"
+    assert "flagged" in [t.get_text() for t in fig.axes[1].get_legend().get_texts()]
+
+
+def test_plot_lyapunov__mistakes(cube):
+    with pytest.raises(ValueError, match="unknown unit"):
+        plot_lyapunov(cube, per="second")
+    with pytest.raises(ValueError, match="no Lyapunov exponents"):
+        plot_lyapunov(cube.drop_vars("lyapunov"))
+    two = make_cube(np.zeros((2, 2)), frequency=[1.0, 2.0], q=[1.0, 1.5])
+    with pytest.raises(ValueError, match="choose a value first"):
+        plot_lyapunov(two)
+    assert plot_lyapunov(two, at={"q": 1.4}).data.sizes == {"frequency": 2, "exponent": 1}
+
+
+def test_plot_lyapunov_map__the_largest_over_the_cells():
+    rates = np.array([[[0.5, -0.1], [-0.2, -0.3]], [[0.1, 0.7], [np.nan, np.nan]]])
+    cube = make_cube(rates, frequency=[1.0, 2.0], q=[1.0, 1.5], initial_condition=[0, 1])
+    fig = plot_lyapunov_map(cube)
+    (mesh,) = artists(fig, "map")
+    expected = np.array([[0.5, 0.7], [-0.2, np.nan]])  # rows q, columns frequency
+    assert np.ma.filled(mesh.get_array(), np.nan) == pytest.approx(expected, nan_ok=True)
+    assert fig.data["chaotic_share"].values.tolist() == [[0.5, 1.0], [0.0, 0.0]]
+    per_period = plot_lyapunov_map(cube, per="period").data["exponent_value"].values
+    assert per_period == pytest.approx(expected / np.array([1.0, 2.0]), nan_ok=True)
+    # white is zero on both sides of the scale
+    assert mesh.norm(0.0) == 0.5
+
+
+def test_plot_lyapunov_map__needs_two_parameters(cube):
+    with pytest.raises(ValueError, match=r"two swept parameters, and 1 are left \(frequency\)"):
+        plot_lyapunov_map(cube)

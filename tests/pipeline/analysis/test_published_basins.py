@@ -1,0 +1,223 @@
+"""Published basins, through the engine's and the analyses' public functions: Duffing, a pendulum."""
+
+import importlib
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.integrate import solve_ivp
+
+from magpend_core import polish_orbits, run_branches
+from magpend_core.engine.vecmath import TWO_PI
+from pipeline.analysis.attractors.attractors import identify
+from pipeline.analysis.basins.numbers import basin_fractions
+
+UNIT_FREQUENCY = 1.0 / TWO_PI  # forcing cos t
+
+
+TWO_WELLS = np.array([0.15, 0.2])  # x'' = .2 cos t + x - x^3 - .15 x'
+
+# recomputed independently, also in issue 139 of DynamicalSystemsBase.jl
+POINTS = np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]])
+MULTIPLIERS = [-0.226806 - 0.581567j, -0.226806 + 0.581567j]
+
+
+def cube_of(result, system, frequency, **axis):
+    """Sections of run_branches as a cube over starts and, before them, an axis if one is given."""
+    lengths = [len(values) for values in axis.values()]
+    shape = (*lengths, len(result.status) // math.prod(lengths))
+
+    def variable(name, *own):
+        values = getattr(result, name)[:, 0]
+        return (*axis, "initial_condition", *own), values.reshape(*shape, *values.shape[1:])
+
+    return xr.Dataset(
+        {
+            "section": variable("section", "period_index", "state"),
+            "status": variable("status"),
+            "orbit_period": variable("orbit_period"),
+            "turns": variable("turns", "link"),
+        },
+        coords={**axis, "state": list(system.state_names), "frequency": frequency},
+    )
+
+
+def grid(n, x, y):
+    """Middles of n x n cells on x times y, shape (n * n, 2)."""
+    middles = (np.arange(n) + 0.5) / n
+    sides = (low + (high - low) * middles for low, high in (x, y))
+    return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+# ---- two wells ---------------------------------------------------------------------------------
+
+STARTS = grid(60, (-2.2, 2.2), (-2.2, 2.2))
+
+
+@pytest.fixture(scope="module")
+def two_wells(duffing):
+    """The starts integrated until their orbits close, as a cube."""
+    n = len(STARTS)
+    result = run_branches(
+        np.broadcast_to(TWO_WELLS, (n, 1, 2)), np.full((n, 1), UNIT_FREQUENCY), STARTS, system=duffing,
+        n_transient=400, n_keep=16, rtol=1e-8, atol=1e-8, stop_when_closed=True, max_orbit_period=4,
+    )  # fmt: skip
+    return cube_of(result, duffing, UNIT_FREQUENCY)
+
+
+@pytest.fixture(scope="module")
+def found_wells(two_wells, duffing):
+    return identify(two_wells, system=duffing, parameters=TWO_WELLS)
+
+
+def test_polish_orbits__duffing_from_sections_of_the_grid(two_wells, duffing):
+    guesses = two_wells["section"].values[[0, -1, 1800], -1]
+    n = len(guesses)
+    orbits = polish_orbits(
+        np.tile(TWO_WELLS, (n, 1)), np.full(n, UNIT_FREQUENCY), guesses, np.ones(n, int), system=duffing
+    )
+    nearest = np.abs(orbits.section[:, None] - POINTS).max(axis=-1).min(axis=1)
+    assert orbits.converged.all()
+    assert nearest.max() < 1e-9
+    assert np.prod(orbits.multipliers, axis=1).real == pytest.approx([np.exp(-0.15 * TWO_PI)] * n, abs=1e-8)
+
+
+def test_identify__duffing_has_its_two_published_attractors(found_wells):
+    found = found_wells
+    assert found["orbit_period"].values.tolist() == [1, 1]
+    assert found["is_stable"].values.tolist() == [1, 1]
+    # by the least point: the left one first
+    assert np.max(abs(found["attractor_points"].values[:, 0] - POINTS)) < 1e-9
+    multipliers = found["multiplier_real"].values + 1j * found["multiplier_imag"].values
+    for row in multipliers:
+        assert np.sort_complex(row) == pytest.approx(MULTIPLIERS, abs=1e-6)
+    # the moduli are alike and their product is exp(-damping T): the exponent is half the damping
+    assert found["lyapunov_max"].values == pytest.approx([-0.075] * 2, abs=1e-9)
+    assert (found["attractor_id"] >= 0).all()
+
+
+def test_basin_fractions__duffing_as_published(found_wells):
+    fractions = basin_fractions(found_wells["attractor_id"], method="clopper-pearson")
+    # on 200 x 200 cells; the interval, which takes the cells for independent, has room for our 60 x 60
+    for label, published in enumerate((0.498, 0.502)):
+        row = fractions.sel(label=label)
+        assert row.low <= published <= row.high
+        assert float(row.fraction) == pytest.approx(published, abs=0.01)
+
+
+def runge_kutta(starts, n_periods, n_steps):
+    """Duffing sections after `n_periods`, by the classical method with fixed steps."""
+    x, v = starts.T.copy()
+    h = TWO_PI / n_steps
+
+    def rates(t, x, v):
+        return v, 0.2 * np.cos(t) + x - x * x * x - 0.15 * v
+
+    for i in range(n_periods * n_steps):
+        t = h * (i % n_steps)
+        a, b = rates(t, x, v)
+        c, d = rates(t + 0.5 * h, x + 0.5 * h * a, v + 0.5 * h * b)
+        e, f = rates(t + 0.5 * h, x + 0.5 * h * c, v + 0.5 * h * d)
+        g, k = rates(t + h, x + h * e, v + h * f)
+        x, v = x + h / 6.0 * (a + 2.0 * (c + e) + g), v + h / 6.0 * (b + 2.0 * (d + f) + k)
+    return np.stack([x, v], axis=-1)
+
+
+def test_identify__duffing_cells_go_where_another_integrator_takes_them(found_wells):
+    # transients are chaotic: after 30 periods each integrator and tolerance has labels of its own for
+    # hundreds of cells. What is settled after ten is not in doubt, but for errors of a long step.
+    ends = runge_kutta(STARTS, 10, 200)
+    distance = np.abs(ends[:, None] - POINTS).max(axis=-1)
+    settled = distance.min(axis=1) < 0.05
+    assert settled.mean() > 0.4
+    differ = found_wells["attractor_id"].values != distance.argmin(axis=1)
+    assert np.count_nonzero(differ & settled) <= 3
+
+
+# ---- rest and rotation -------------------------------------------------------------------------
+
+TORQUES = np.array([0.11, 0.16, 0.26, 0.36, 0.51, 0.71, 0.96])
+REST_FRACTIONS = [1.0, 0.483, 0.327, 0.238, 0.147, 0.065, 0.007]
+"""Of the pendulum with constant torque, recomputed after bSTAB's first case; each +- .02."""
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """The benchmark that defines the pendulum."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[2] / "bench")
+        return importlib.import_module("multistable_pendulum")
+
+
+def rest_fraction(bench, torques, n):
+    """Fractions of rest on n x n starts, and what `identify` found."""
+    rest = np.arcsin(0.5)
+    starts = grid(n, (rest - np.pi, rest + np.pi), (-10.0, 10.0))
+    cells = len(torques) * len(starts)
+    packed = np.full((cells, 1, 2), 0.1)
+    packed[:, 0, 1] = np.repeat(torques, len(starts))
+    # without forcing any time between sections will do; ten time units have a rotation's phase drift
+    result = run_branches(
+        packed, np.full((cells, 1), 0.1), np.tile(starts, (len(torques), 1)), system=bench.PENDULUM,
+        n_transient=40, n_keep=30, rtol=1e-8, atol=1e-8, closure_tolerance=1e-4, max_orbit_period=1,
+    )  # fmt: skip
+    ds = cube_of(result, bench.PENDULUM, 0.1, torque=torques)
+    # not polished: at rest, steps that the trajectory alone controls grow too long for its tangents
+    found = identify(ds, system=bench.PENDULUM, parameters=np.array([0.1, 0.0]), polish=False, tolerance=1e-3)
+    turning = np.abs(found["rotation"].isel(link=0)) > 0.1
+    at_rest = (found["kind"] == 1) & (np.abs(found["rotation"].isel(link=0)) < 1e-3)
+    assert ((found["kind"] == 0) | turning | at_rest).all()
+    ids = found["attractor_id"]
+    assert (ids >= 0).all()
+    label = ids.copy(data=np.take_along_axis(turning.values, ids.values, axis=1).astype(int))
+    return basin_fractions(label, dims=("initial_condition",), ids=(0, 1)), found
+
+
+def test_basin_fractions__rest_against_torque_as_published(bench):
+    fractions, found = rest_fraction(bench, TORQUES, 40)
+    assert fractions["fraction"].sel(label=0).values == pytest.approx(REST_FRACTIONS, abs=0.02)
+    # below 4 damping/pi (to first order) no rotation lasts; above, two attractors at each torque
+    assert (found["kind"] > 0).sum("attractor").values.tolist() == [1, 2, 2, 2, 2, 2, 2]
+
+
+def test_basin_fractions__rest_at_torque_one_half_as_published(bench):
+    fractions, found = rest_fraction(bench, np.array([0.5]), 100)
+    assert fractions["fraction"].sel(label=0).item() == pytest.approx(0.152, abs=0.004)
+    at_rest = found.isel(torque=0, attractor=found["kind"].values[0].argmin())
+    assert at_rest["attractor_points"].values[0] == pytest.approx([np.arcsin(0.5), 0.0], abs=1e-5)
+
+
+@pytest.mark.parametrize("torque", [0.2, 0.5])
+def test_regions__rotation_begins_at_the_unstable_manifold(bench, torque):
+    """Speed over angle from the saddle on, d(w^2/2)/d(angle) = torque - damping w - sin(angle)."""
+    saddle = np.pi - np.arcsin(torque) - TWO_PI
+    slope = -0.05 + np.sqrt(0.05**2 + np.sqrt(1.0 - torque**2))  # the saddle's larger eigenvalue
+    angles = saddle + np.linspace(0.1, TWO_PI, 50)
+    speed = solve_ivp(
+        lambda angle, w: (torque - 0.1 * w - np.sin(angle)) / w,
+        (saddle + 1e-5, angles[-1]), [slope * 1e-5], t_eval=angles, rtol=1e-9, atol=1e-12,
+    ).y[0]  # fmt: skip
+    regions = bench.Regions.of(torque)
+    for shift in (1e-4, -1e-4):
+        label = regions.certain(np.stack([angles, speed + shift], axis=-1))
+        assert ((label == bench.ROTATION) == (shift > 0.0)).all()
+
+
+def test_regions__certain_states_go_there(bench):
+    """What the two regions promise, against scipy; and they leave room for the boundary alone."""
+    regions = bench.Regions.of(bench.TORQUE)
+    starts = bench.draw_starts(300, seed=5)
+    label = regions.certain(starts)
+    assert set(label) == {bench.UNDECIDED, bench.REST, bench.ROTATION}
+    rows = np.flatnonzero(label != bench.UNDECIDED)[:25]
+    for start, code in zip(starts[rows], label[rows], strict=True):
+        end = solve_ivp(
+            lambda t, y: (y[1], bench.TORQUE - bench.DAMPING * y[1] - np.sin(y[0])),
+            (0.0, 150.0), start, rtol=1e-8, atol=1e-8,
+        ).y[:, -1]  # fmt: skip
+        assert (end[1] > 1.0) == (code == bench.ROTATION)
+    # no rotation where none lasts
+    assert bench.Regions.of(0.11).manifold is None
+    assert bench.Regions.of(0.16).manifold is not None

@@ -1,0 +1,233 @@
+"""The command line: what it prints, what it creates, how it exits."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.cli.exits import Exit
+from pipeline.layout.plan import make_plan
+from pipeline.runs import run as runs
+from pipeline.runs.run import first_figure
+from pipeline.spec.parsing import parse_spec
+
+BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
+
+
+def test_help__is_light(environment):
+    code = (
+        "import sys\n"
+        "from pipeline.cli.main import app\n"
+        "try:\n"
+        "    app(['--help'])\n"
+        "finally:\n"
+        "    heavy = ('numba', 'numpy', 'dask', 'zarr', 'xarray', 'matplotlib', 'pydantic', 'scipy')\n"
+        "    print([m for m in heavy if m in sys.modules])\n"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert found.stdout.splitlines()[-1] == "[]"
+    for command in ("run", "status", "verify", "analyse", "plot", "simulate", "presets"):
+        assert command in found.stdout
+
+
+def test_help__exit_codes(magpend):
+    for arguments in (["--help"], ["run", "--help"]):
+        text = " ".join(re.sub(r"[│╭╰╮╯─]", " ", magpend(*arguments).stdout).split())
+        for code in Exit:
+            assert f"{int(code)} {code.sentence}" in text
+
+
+@pytest.mark.parametrize("option", [[], ["--dry-run"]])
+def test_run__bad_spec_creates_nothing(magpend, write_spec, tmp_path, option):
+    path = write_spec(BAD)
+    before = sorted(p for p in tmp_path.rglob("*") if "__pycache__" not in p.parts)
+    found = magpend("run", path, "--out", "somewhere", *option)
+    assert found.returncode == Exit.REFUSED
+    assert "axes.q.nun: unknown key; did you mean num?" in found.stderr
+    assert "integration.rtol = -1" in found.stderr
+    assert "initial_conditions: missing" in found.stderr
+    assert "Traceback" not in found.stderr
+    assert sorted(p for p in tmp_path.rglob("*") if "__pycache__" not in p.parts) == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run"],
+        ["run", "no-such-workflow"],
+        ["run", "absent.toml"],
+        ["run", "spec.toml", "--workers", "-1"],
+        ["run", "spec.toml", "--workers", "nan"],
+        ["run", "spec.toml", "--smoke"],
+        ["status", "."],
+        ["verify", "."],
+        ["analyse", ".", "attractors"],
+        ["analyse", ".", "basins", "--box", "x"],
+        ["analyse", ".", "nonsense"],
+        ["plot", "bifurcation", "."],
+        ["plot", "bifurcation", ".", "--state", "psi3"],
+        ["plot", "bifurcation", ".", "--out", "a.gif"],
+        ["presets", "wojna2019"],
+        ["simulate", "--frequency-hz", "nan"],
+        ["simulate", "--set", "q"],
+        ["simulate", "--set", "q=nan"],
+        ["simulate", "--psi1", "1", "--psi1-deg", "1"],
+        ["simulate", "--out", "a.txt"],
+        ["simulate", "--figure", "a.gif"],
+        ["nonsense"],
+    ],
+    ids=" ".join,
+)
+def test_bad_input__refused_without_a_trace(main, write_spec, sweep_text, tmp_path, arguments):
+    write_spec(sweep_text)
+    before = sorted(tmp_path.rglob("*"))
+    code, _, err = main(*arguments)
+    assert code == Exit.REFUSED
+    assert err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_run__dry_run_creates_nothing(main, write_spec, sweep_text, tmp_path):
+    write_spec(sweep_text)
+    before = sorted(tmp_path.rglob("*"))
+    code, out, _ = main("run", "spec.toml", "--dry-run")
+    assert code == 0
+    for words in (
+        "120 cells",
+        "frequency 5, q 2, psi1_0 3, psi2_0 4",
+        "5 of 1 x 2 x 3 x 4 cells",
+        "runs/spec (not created)",
+    ):
+        assert words in out
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("axes", "starts", "figure"),
+    [
+        ({"frequency_hz": 3}, {}, "bifurcation"),
+        ({"frequency_hz": 1}, {"psi1": 2, "psi2": 2}, "basins"),
+        ({"frequency_hz": 3, "q": 1}, {"psi1": 2, "psi2": 2}, "bifurcation"),
+        ({"frequency_hz": 2, "q": 2}, {"psi1": 2}, "regimes"),
+        ({}, {"psi1": 2, "psi2": 2, "psi1_dot": 2}, "basins"),
+        ({}, {"psi1": 2}, "gallery"),
+    ],
+)
+def test_first_figure__fits_the_axes(axes, starts, figure):
+    spec = {"kind": "sweep", "parameters": {} if "frequency_hz" in axes else {"frequency_hz": 2.2}}
+    spec["axes"] = {name: {"values": [1.5 + i for i in range(n)]} for name, n in axes.items()}
+    grid = {name: {"start": 0.0, "stop": 1.0, "num": n} for name, n in starts.items()}
+    spec["initial_conditions"] = {"kind": "grid", "psi1": 0.1, **grid}
+    assert first_figure(make_plan(parse_spec(spec))) == figure
+
+
+def test_run__plot_of_a_map_is_refused_before_it_is_computed(main, write_spec, sweep_text, tmp_path):
+    write_spec(sweep_text)
+    code, _, err = main("run", "spec.toml", "--plot")
+    assert code == Exit.REFUSED
+    assert "magpend plot regimes" in err
+    assert not (tmp_path / "runs").exists()
+
+
+def test_run__status__verify__plot(main, write_spec, walk_text, tmp_path):
+    write_spec(walk_text + "\n[smoke]\ninitial_conditions.n = 2\n")
+    code, out, _ = main("run", "spec.toml", "--smoke", "--workers", "0", "--plot")
+    assert code == 0
+    assert "cube: runs/spec-smoke/cube.zarr" in out
+    assert out.splitlines()[-1] == "figure: runs/spec-smoke/figures/bifurcation_psi1.png"
+    directory = tmp_path / "runs" / "spec-smoke"
+    assert (directory / "figures" / "bifurcation_psi1.png").stat().st_size > 0
+
+    code, out, _ = main("status", directory)
+    assert code == 0
+    assert "complete" in out
+    assert "24 of 24 cells (100.0 %), 2 of 2 tasks" in out
+    assert re.search(r"bounded +\d+ ", out)
+
+    assert main("verify", directory)[0] == 0
+    code, out, _ = main("plot", "bifurcation", directory, "--state", "psi2", "--degrees", "--format", "svg")
+    assert code == 0
+    assert (directory / "figures" / "bifurcation_psi2.svg").read_text().startswith("<?xml")
+
+    code, _, err = main("plot", "bifurcation", directory, "--layout", "side", "--out", tmp_path / "a.pdf")
+    assert code == 0
+    chunk = next((directory / "cube.zarr" / "section").glob("c.*"))
+    chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0")
+    code, out, _ = main("verify", directory)
+    assert code == Exit.DAMAGED
+    assert "--repair" in out
+    code, _, err = main("plot", "bifurcation", directory)
+    assert code == Exit.DAMAGED
+    assert "magpend verify" in err
+    assert main("verify", directory, "--repair")[0] == 0
+    code, out, _ = main("status", directory)
+    assert "incomplete" in out
+    assert "pending" in out
+    assert main("run", "spec.toml", "--smoke", "--workers", "0")[0] == 0
+    assert main("verify", directory)[0] == 0
+
+
+def test_run__locked_directory_has_its_own_code(main, write_spec, sweep_text, tmp_path):
+    from filelock import FileLock
+
+    write_spec(sweep_text)
+    (tmp_path / "run").mkdir()
+    with FileLock(tmp_path / "run" / "lock", is_singleton=False):
+        code, _, err = main("run", "spec.toml", "--out", "run", "--workers", "0")
+    assert code == Exit.LOCKED
+    assert "another magpend run" in err
+
+
+def test_run__failed_task_has_its_own_code(main, write_spec, sweep_text, monkeypatch):
+    from pipeline.compute import task
+
+    write_spec(sweep_text)
+    monkeypatch.setattr(
+        task, "compute", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    )
+    code, _, err = main("run", "spec.toml", "--workers", "0")
+    assert code == Exit.FAILED
+    assert "No space left on device" in err
+
+
+def test_simulate__writes_series_and_figure(main, tmp_path):
+    code, out, _ = main("simulate", "--psi1-deg", "10", "--periods", "2", "--samples", "20", "--out", "a.nc")
+    assert code == 0
+    assert out.split() == ["series:", "a.nc", "figure:", "a.png"]
+    assert (tmp_path / "a.png").stat().st_size > 0
+    assert main("simulate", "--periods", "2", "--no-figure")[0] == 0
+    assert not (tmp_path / "trajectory.png").exists()
+
+
+def test_presets__values_units_and_source(main):
+    _, out, _ = main("presets")
+    assert re.search(r"m1 .*4\.275.*kg.*mass of link 1.*paper", out)
+    assert re.search(r"delta .*0\.003265.*m .*calibrated", out)
+
+
+def test_find_spec__shipped_workflows():
+    shipped = runs.shipped_workflows()
+    assert "quickstart" in shipped
+    assert runs.find_spec("quickstart") == shipped["quickstart"]
+    for path in shipped.values():
+        assert runs.describe_plan(path, os.devnull + "-absent")
+        assert runs.describe_plan(path, os.devnull + "-absent", smoke=True)
+
+
+def test_modules__each_library_has_one_room():
+    """Only `store` knows zarr, only `compute` knows dask."""
+    import pipeline
+
+    top = Path(pipeline.__file__).parent
+    for path in top.rglob("*.py"):
+        text, room = path.read_text("utf-8"), path.relative_to(top).parts[0]
+        for library, home in (("zarr", "store"), ("dask", "compute"), ("distributed", "compute")):
+            imports = re.search(rf"^\s*(import|from) {library}\b", text, re.MULTILINE)
+            assert not imports or room == home, (path.name, library)

@@ -1,0 +1,273 @@
+"""``magpend analyse``: what it prints and stores, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pipeline.analysis.basins.basins import basins as basins_of
+from pipeline.cli.analyse import ATTRACTOR_OPTIONS, BASIN_OPTIONS, SETTLING_OPTIONS
+from pipeline.cli.exits import Exit
+from pipeline.products import derived
+from pipeline.products import tables as report
+
+SPIRALS = """
+kind = "sweep"
+[axes]
+frequency_hz = { values = [2.2, 2.25] }
+[initial_conditions]
+kind = "grid"
+psi1_deg = { start = -20, stop = 20, num = 4 }
+psi2_deg = { start = -20, stop = 20, num = 4 }
+[integration]
+rtol = 1e-7
+atol = 1e-7
+n_transient = 300
+n_keep = 32
+[execution]
+trajectories_per_task = 16
+"""
+
+
+@pytest.fixture(scope="module")
+def spirals(tmp_path_factory):
+    """A run at 2.2 and 2.25 Hz that finds the left and the right orbit."""
+    from pipeline.runs import run as runs
+
+    folder = tmp_path_factory.mktemp("spirals")
+    (folder / "spirals.toml").write_text(SPIRALS)
+    runs.run(folder / "spirals.toml", folder / "run", workers=0, echo=lambda _: None)
+    return folder / "run"
+
+
+def test_options__are_those_of_the_analyses():
+    """Names and defaults on the command line are those of the functions."""
+    shown = {p.name: p.default for p in (*ATTRACTOR_OPTIONS, *BASIN_OPTIONS)}
+    assert {
+        name: str(v) if isinstance(v, str) else v for name, v in shown.items()
+    } == derived.basin_defaults()
+    settling = {p.name: p.default for p in (*ATTRACTOR_OPTIONS, *SETTLING_OPTIONS)}
+    assert settling == derived.settling_defaults()
+    assert derived.attractor_defaults().keys() == {p.name for p in ATTRACTOR_OPTIONS}
+
+
+def test_attractors__table_per_point(main, spirals, tmp_path):
+    code, out, err = main("analyse", spirals, "attractors", "--csv", tmp_path / "a.csv")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert "attractors at 2 parameter points" in out
+    at = lines.index("frequency 2.2 Hz:")
+    assert lines[at + 1].split()[:4] == ["id", "kind", "period", "side"]
+    left, right = (next(line for line in lines[at:] if f" {side} " in line) for side in ("left", "right"))
+    assert re.search(r"closed orbit +1 +left +0\.000 0\.000 +0\.9[67]\d\d ", left)
+    assert re.search(r"0\.\d{4} \(0\.\d{4} to 0\.\d{4}\)", right)
+    ds = derived.attractors(spirals)
+    assert lines[-1] == f"stored: {ds.encoding['source']}"
+    with (tmp_path / "a.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        i, at = int(row["attractor_id"]), {"frequency": float(row["frequency"])}
+        one = ds.sel(at).isel(attractor=i)
+        assert int(row["n_cells"]) == int(one["n_cells"])
+        assert float(row["low"]) < float(row["fraction"]) < float(row["high"])
+        decided = sum(int(count) for name, count in row.items() if name.startswith("by_"))
+        assert decided == int(row["n_cells"])
+        modulus = abs(complex(one["multiplier_real"][0], one["multiplier_imag"][0]))
+        assert row["multiplier_modulus"] == ("" if np.isnan(modulus) else repr(modulus))
+    by_side = {row["side"]: row for row in rows if row["frequency"] == "2.2"}
+    assert by_side["left"]["mirror_partner"] == by_side["right"]["attractor_id"]
+
+    code, out, _ = main("analyse", spirals, "attractors")
+    assert out.startswith("attractors: taken from")
+
+
+def test_basins__fractions_and_boundaries(main, spirals, tmp_path):
+    arguments = ["analyse", spirals, "basins", "--box", "2", "--interval", "clopper-pearson"]
+    code, out, err = main(*arguments, "--csv", tmp_path / "b.csv")
+    assert (code, err) == (0, "")
+    assert "clopper-pearson, 95 %" in out
+    # four boxes are too few for an error
+    assert re.search(r"basin entropy: 0\.\d+ \(error not known\)", out)
+    assert "not computed: uncertainty exponent" in out
+    assert "an attractor that no cell shows: at most 0.171 of the region" in out
+    with (tmp_path / "b.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for frequency in ("2.2", "2.25"):
+        counts = [int(row["n_cells"]) for row in rows if row["frequency"] == frequency]
+        assert sum(counts) == 16
+    code, out, _ = main(*arguments, "--box", "3")
+    assert "attractors: taken from" in out
+    assert "basins: computed" in out
+
+
+def test_settling__says_what_stays(main, spirals, tmp_path):
+    arguments = ("--n-sample", "4", "--n-periods", "64", "--csv", tmp_path / "s.csv")
+    code, out, err = main("analyse", spirals, "settling", *arguments)
+    assert (code, err) == (0, "")
+    ds = derived.settling(spirals, n_sample=4, n_periods=64)
+    n_sets = int((ds["verdict"] > 0).sum())
+    assert n_sets > 0
+    assert f"bounded sets: {n_sets}; run on for 64 drive periods" in out
+    with (tmp_path / "s.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert sum(int(row["n_sampled"]) for row in rows) == int(ds["n_sampled"].sum())
+    for row in rows:
+        words = (
+            "attractor"
+            if int(ds["verdict"].sel(frequency=float(row["frequency"]))[int(row["attractor_id"])]) == 1
+            else "transient"
+        )
+        assert row["verdict"] == words
+    assert re.search(r"frequency Hz +id +verdict +sampled +near an orbit +left later +mean lifetime +to", out)
+
+
+def test_hysteresis__loops_and_jumps(main, write_spec, walk_text, tmp_path):
+    write_spec(walk_text)
+    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
+    code, out, err = main("analyse", "run", "hysteresis", "--no-polish", "--csv", "h.csv")
+    assert (code, err) == (0, "")
+    ds = derived.hysteresis(tmp_path / "run", polish=False)
+    assert f"jumps of the branches: {int(ds['jump_count'].sum()) or 'none'}" in out
+    assert re.search(rf"^{ds.sizes['loop'] or 'no'} loop", out, re.MULTILINE)
+    with (tmp_path / "h.csv").open() as file:
+        assert sum(int(row["count"]) for row in csv.DictReader(file)) == int(ds["jump_count"].sum())
+    # a continuation's branches are no sample of initial conditions
+    code, out, _ = main("analyse", "run", "attractors", "--no-polish")
+    assert code == 0
+    assert "share" not in out
+    code, _, err = main("analyse", "run", "basins")
+    assert code == Exit.REFUSED
+    assert "independent initial conditions" in err
+
+
+def test_analyse__incomplete_run_and_prune(main, made):
+    directory = made.info.directory
+    made.commit(0)
+    code, out, err = main("analyse", directory, "attractors", "--no-polish")
+    assert (code, err) == (0, "")
+    assert f"{made.plan.n_cells - made.plan.cells_in(0)} pending" in out
+    assert main("analyse", directory, "prune")[1] == "nothing to remove\n"
+    made.commit(1)
+    _, out, _ = main("analyse", directory, "prune", "--dry-run")
+    assert len(re.findall("stale: .*(attractors|identified)-", out)) == 2
+    assert main("analyse", directory, "prune", "--dry-run")[1] == out
+    assert main("analyse", directory, "prune")[1] == out.replace("stale", "removed")
+    assert not any((directory / "derived").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["attractors", "--tolerance", "-1"], "tolerance = -1.0 is out of bounds: it must be 0 (default) or"),
+        (["attractors", "--threshold", "0"], "threshold = 0.0 is out of bounds: it must be greater than 0."),
+        (["settling", "--n-sample", "0"], "n_sample = 0 is out of bounds: it must be 1 or more."),
+        (["settling", "--confidence", "1"], "confidence = 1.0 is out of bounds: it must lie"),
+        (["attractors", "--look-back", "0"], "look_back = 0 is out of bounds: it must be 1 or more."),
+        (["basins", "--rule-same-share", "1.5"], "rule_same_share = 1.5 is out of bounds: it must be at"),
+        (["basins", "--confidence", "nan"], "confidence = nan: must be a number."),
+        (["basins", "--box", "1"], "box = 1 is out of bounds: it must be 2 or more."),
+        (["hysteresis"], 'hysteresis needs a continuation with direction = "both".'),
+        (["attractors", "--csv", "no/where.csv"], "--csv no/where.csv: must be a file in a folder"),
+    ],
+    ids=lambda x: " ".join(x) if isinstance(x, list) else "",
+)  # fmt: skip
+def test_analyse__refused_before_computing(main, made, arguments, message):
+    made.commit(0)
+    code, out, err = main("analyse", made.info.directory, *arguments)
+    assert code == Exit.REFUSED
+    assert message in err
+    assert out == ""
+    assert not (made.info.directory / "derived").exists()
+
+
+def test_report__a_line_per_attractor_if_there_are_many_points():
+    n = report.FEW_POINTS + 1
+    frequency = 2.0 + 0.5 * np.arange(n)
+    kind = np.ones((n, 2), np.int8)
+    kind[:4, 1] = 0
+    cells = np.zeros((n, 10), np.int32)
+    cells[4:, :3] = 1
+    cells[5, :8] = 1
+    nan = np.full((n, 2), np.nan)
+    cells_of = ("frequency", "initial_condition")
+    flags = {"flag_values": [0, 1, 2], "flag_meanings": "pending periodic bounded"}
+    ds = xr.Dataset(
+        {
+            "attractor_id": (cells_of, cells),
+            "decision": (
+                cells_of,
+                np.ones_like(cells, np.int8),
+                {"flag_meanings": "undecided closed run_on"},
+            ),
+            "status": (cells_of, np.ones_like(cells, np.int8), flags),
+            "kind": (("frequency", "attractor"), kind, {"flag_meanings": "absent closed_orbit bounded_set"}),
+            "orbit_period": (("frequency", "attractor"), kind * np.array([1, 2])),
+            "side": (("frequency", "attractor"), 0 * kind, {"flag_meanings": "unknown left right"}),
+            "rotation": (("frequency", "attractor", "link"), np.zeros((n, 2, 2))),
+            "multiplier_real": (("frequency", "attractor", "multiplier"), nan[..., None]),
+            "multiplier_imag": (("frequency", "attractor", "multiplier"), nan[..., None]),
+            "n_cells": (("frequency", "attractor"), np.stack([(cells == i).sum(1) for i in (0, 1)], 1)),
+            "is_stable": (("frequency", "attractor"), -kind),
+            "mirror_partner": (("frequency", "attractor"), -kind),
+            "mirror_distance": (("frequency", "attractor"), nan),
+        },
+        coords={"frequency": ("frequency", frequency, {"units": "Hz"}), "attractor": [0, 1]},
+    )
+    lines = report.attractor_lines(ds, report.attractor_rows(ds))
+    assert lines[0] == f"2 attractors at {n} parameter points"
+    assert lines[1].split()[:3] == ["id", "kind", "periods"]
+    assert re.search(r"^  0 +closed orbit +1 +unknown +2 to 5 +7 +56 +1\.0000 at 2 Hz", lines[2])
+    assert re.search(r"^  1 +closed orbit +2 +unknown +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz", lines[3])
+    assert lines[4] == "all 70 cells belong to an attractor"
+    cube = ds[["status"]].assign(n_periods=ds["status"])
+    measured = basins_of(cube, ds)
+    lines = report.basin_lines(measured, report.basin_rows(measured))
+    assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz", lines[3])
+    assert lines[4] == "not computed: boundaries: the starts are no grid"
+    assert not any("inferred" in line for line in lines)
+    refined = ds["status"].where(cells == 0, 7).astype(np.int8).assign_attrs(flags)
+    measured = basins_of(cube, ds.assign(status=refined))
+    rows = report.basin_rows(measured)
+    assert [row["n_inferred"] for row in rows] == [row["n_cells"] * (row["label"] == 1) for row in rows]
+    lines = report.basin_lines(measured, rows)
+    assert lines[1].endswith("inferred cells")
+    assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz +14$", lines[3])
+
+
+def test_analyse__run_without_attractors(main, write_spec, tmp_path):
+    """Every cell diverged at once: tables and figures say so, none fails."""
+    write_spec("""
+kind = "sweep"
+[axes]
+frequency_hz = { values = [2.6, 2.8] }
+[initial_conditions]
+kind = "grid"
+psi1_deg = { start = -10, stop = 10, num = 3 }
+psi2_deg = { start = -10, stop = 10, num = 2 }
+psi1_dot = 1e9
+[integration]
+n_transient = 8
+n_keep = 16
+""")
+    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
+    code, out, err = main("analyse", "run", "attractors", "--csv", "a.csv")
+    assert (code, err) == (0, "")
+    assert "0 attractors at 2 parameter points" in out
+    assert "0 of 12 cells belong to an attractor; 12 diverged" in out
+    code, out, err = main("analyse", "run", "basins")
+    assert (code, err) == (0, "")
+    assert re.search(r"diverged +6 +1\.0000 \(0\.6097 to 1\.0000\)", out)
+    code, out, err = main("analyse", "run", "settling")
+    assert (code, err) == (0, "")
+    assert "bounded sets: none" in out
+    for figure in ("fractions", "attractors"):
+        code, _, err = main("plot", figure, "run")
+        assert (code, err) == (0, "")
+    assert main("plot", "basins", "run", "--at", "frequency=2.6")[0] == 0
+    code, _, err = main("plot", "gallery", "run", "--at", "frequency=2.6")
+    assert code == Exit.REFUSED
+    assert "there is no attractor" in err

@@ -1,0 +1,124 @@
+"""Plans: every cell once, whole chunks, nothing that depends on the machine."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.layout import plan as planning
+from pipeline.layout.identity import differences, digest_of, identity_of
+from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.schema import VARIABLES
+from pipeline.spec.parsing import parse_spec
+
+ROOT = Path(__file__).parents[3]
+
+SHAPES = st.lists(st.integers(1, 9), min_size=0, max_size=4)
+
+
+@given(SHAPES, st.integers(1, 40), st.data())
+def test_tasks__every_cell_in_one_task(shape, wanted, data):
+    path = data.draw(st.sampled_from([None, *range(len(shape))]))
+    block = planning._block(tuple(shape), path, wanted)
+    plan = Plan("sweep", tuple("abcd"[: len(shape)]), tuple(shape), path, block, 3, 1.0)
+    seen = np.zeros(shape, dtype=int)
+    for task in plan.tasks():
+        seen[task] += 1
+    assert (seen == 1).all()
+    assert sum(plan.cells_in(i) for i in range(plan.n_tasks)) == plan.n_cells
+    if path is not None:
+        assert block[path] == shape[path]
+
+
+@given(st.integers(1, 400), st.integers(1, 70), st.integers(1, 300))
+def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
+    shape = (n_points, n_branches)
+    block = planning._block(shape, 0, 16)
+    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, n_keep, 1.0)
+    for variable in VARIABLES:
+        chunks = plan.chunks(variable)
+        for task in plan.tasks():
+            for s, c, n in zip(task, chunks, shape, strict=False):
+                assert s.start % c == 0
+                assert s.stop % c == 0 or s.stop == n
+        size = np.dtype(variable.dtype).itemsize * np.prod(chunks)
+        assert size <= planning.CHUNK_BYTES or chunks[0] == 1
+
+
+def test_make_plan__multiples_of_lanes_and_sizes():
+    text = """
+    kind = "sweep"
+    [axes]
+    frequency_hz = { start = 2.0, stop = 3.0, num = 101 }
+    [initial_conditions]
+    kind = "grid"
+    psi1_deg = { start = -57, stop = 57, num = 400 }
+    psi2_deg = { start = -57, stop = 57, num = 400 }
+    """
+    plan = make_plan(parse_spec(tomllib.loads(text)))
+    assert plan.n_cells == 101 * 400 * 400
+    cells = plan.cells_in(0)
+    assert (
+        1e6 < cells * sum(v.itemsize({"period_index": 60, "state": 4, "link": 2}) for v in VARIABLES) <= 8.1e6
+    )
+    assert plan.n_tasks < 20_000
+
+
+def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
+    import os
+
+    spec = parse_spec(tomllib.loads(sweep_text))
+    plan = make_plan(spec)
+    monkeypatch.setattr(os, "cpu_count", lambda: 97)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(97)), raising=False)
+    assert make_plan(spec) == plan
+
+
+def test_task__out_of_range(sweep_text):
+    plan = make_plan(parse_spec(tomllib.loads(sweep_text)))
+    with pytest.raises(IndexError, match="does not exist"):
+        plan.task(plan.n_tasks)
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["pipeline.layout.plan", "pipeline.layout.schema", "pipeline.spec.parsing", "pipeline.layout.identity"],
+)
+def test_import__pure(module):
+    heavy = "('dask', 'zarr', 'xarray', 'matplotlib')"
+    code = f"import sys, {module}; print([m for m in {heavy} if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_identity__what_counts(sweep_text):
+    def digest(text, kernel="k"):
+        spec = parse_spec(tomllib.loads(text))
+        return digest_of(identity_of(spec, make_plan(spec), kernel))
+
+    same = digest(sweep_text)
+    assert digest(sweep_text.replace("small sweep", "another title")) == same
+    assert digest(sweep_text.replace("stop = 30", "stop = 30.0")) == same
+    assert digest(sweep_text + "\n", "other kernel") != same
+    for old, new in [
+        ("n_keep = 3", "n_keep = 4"),
+        ("1.6]", "1.7]"),
+        ("= 24", "= 12"),
+        ("rtol = 1e-6", "rtol = 1e-7"),
+    ]:
+        assert digest(sweep_text.replace(old, new)) != same
+
+
+def test_differences__key_by_key():
+    old = {"a": {"b": 1, "c": [1, 2]}, "d": "x"}
+    new = {"a": {"b": 1.0, "c": [1, 3]}, "e": 5}
+    lines = differences(old, new)
+    assert [line.split(":")[0] for line in lines] == ["a.c", "d", "e"]
+    assert lines[0] == "a.c: [1.0, 2.0] in the directory, [1.0, 3.0] now"

@@ -1,0 +1,148 @@
+"""Figures of branches and their command line, from made-up datasets and a small run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.lines import Line2D
+
+from magpend_core.models.parameters import ParameterError
+from pipeline.plots import plot_branches, plot_curves, plot_multipliers
+from pipeline.products import branches as derived_branches
+from pipeline.spec.problems import SpecError
+
+
+@pytest.fixture
+def made_up():
+    """A branch that folds at 3 Hz: stable going there, unstable coming back; psi1 = +-sqrt(3 - f)."""
+    psi = np.linspace(1.0, -1.0, 21) + 0.02
+    frequency = 3.0 - psi**2
+    n = len(psi)
+    section = np.zeros((1, n, 1, 4))
+    section[0, :, 0, 0] = psi
+    multipliers = np.stack([1.0 - psi, 0.5 + 0 * psi, 0.2 + 0.1j + 0 * psi, 0.2 - 0.1j + 0 * psi], axis=1)[
+        None
+    ]
+    after = int(np.flatnonzero(psi > 0)[-1])
+    event = {
+        "kind": 0, "value": 3.0, "of_branch": 0, "after": after,
+        "n_unstable_before": 0, "n_unstable_after": 1, "critical_real": 1.0,
+        "critical_imag": 0.0, "bifurcation_side": 2,
+    }  # fmt: skip
+    return xr.Dataset(
+        {
+            "parameter": (("branch", "point"), frequency[None]),
+            "section": (("branch", "point", "phase", "state"), section),
+            "multiplier_real": (("branch", "point", "multiplier"), multipliers.real),
+            "multiplier_imag": (("branch", "point", "multiplier"), multipliers.imag),
+            "n_unstable": (("branch", "point"), (psi < 0)[None].astype(np.int8)),
+            "n_points": ("branch", [n]),
+            "orbit_period": ("branch", [1]),
+            "bifurcation_section": (("bifurcation", "phase", "state"), np.zeros((1, 1, 4))),
+            **{name: ("bifurcation", [value]) for name, value in event.items()},
+        },
+        coords={"state": ["psi1", "psi2", "psi1_dot", "psi2_dot"]},
+        attrs={"parameter": "frequency_hz", "parameter_units": "Hz"},
+    )
+
+
+def branch_lines(figure):
+    """Lines of branches: not single markers."""
+    return [line for line in figure.axes[0].lines if isinstance(line, Line2D) and len(line.get_xdata()) > 1]
+
+
+def test_plot_branches__solid_and_dashed(made_up):
+    figure = plot_branches(made_up)
+    solid, dashed = sorted(branch_lines(figure), key=lambda line: line.get_linestyle() != "-")
+    assert solid.get_linestyle() == "-"
+    assert dashed.get_linestyle() == "--"
+    assert (np.asarray(solid.get_ydata()) >= 0.0).all()
+    assert (np.asarray(dashed.get_ydata()) <= 0.0).all()
+    # both go up to the fold itself
+    assert np.max(solid.get_xdata()) == np.max(dashed.get_xdata()) == 3.0
+    assert [text.get_text() for text in figure.axes[0].texts] == ["F1"]
+
+
+def test_plot_branches__cut_where_an_angle_wraps(made_up):
+    made_up["section"][0, 10:, 0, 0] -= 2.0 * np.pi
+    lines = branch_lines(plot_branches(made_up))
+    steps = np.concatenate([np.abs(np.diff(np.asarray(line.get_ydata(), float))) for line in lines])
+    assert np.nanmax(steps) < np.pi
+
+
+def test_plot_branches__longest_period(made_up):
+    assert not branch_lines(plot_branches(made_up, max_period=0))
+
+
+def test_plot_branches__unknown_state(made_up):
+    with pytest.raises(ValueError, match="unknown state"):
+        plot_branches(made_up, state="psi3")
+
+
+def test_plot_multipliers__all_points(made_up):
+    figure = plot_multipliers(made_up)
+    (points,) = figure.axes[0].collections
+    assert len(points.get_offsets()) == 84
+    with pytest.raises(ValueError, match="branches 0 to 0"):
+        plot_multipliers(made_up, 1)
+
+
+def test_plot_curves__lines():
+    x = np.array([[2.0, 2.5, 3.0], [2.1, 2.2, np.nan]])
+    ds = xr.Dataset(
+        {
+            "first": (("curve", "point"), x, {"units": "Hz"}),
+            "second": (("curve", "point"), x / 2, {"units": "N m"}),
+            "kind": ("curve", [0, 1]),
+            "orbit_period": ("curve", [1, 2]),
+            "n_points": ("curve", [3, 2]),
+        },
+        attrs={"first_parameter": "frequency_hz", "second_parameter": "q"},
+    )
+    ax = plot_curves(ds).axes[0]
+    assert [len(line.get_xdata()) for line in ax.lines] == [3, 2]
+    assert ax.get_ylabel() == "q [N m]"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"parameter": "ep"}, "did you mean eps"),
+        ({"parameter": "c"}, "--from and --to"),
+        ({"low": 2.5, "high": 2.4}, "is empty"),
+        ({"max_period": 0}, "max_period = 0"),
+        ({"low": -1.0}, "greater than 0"),
+        ({"parameter": "m1", "low": -1.0, "high": 1.0}, "m1 = -1.0 is out of bounds"),
+    ],
+)
+def test_branches__bad_input(made, options, message):
+    with pytest.raises((SpecError, ParameterError), match=message):
+        derived_branches.branches(made.info.directory, **options)
+
+
+@pytest.mark.slow
+def test_branches__command(magpend, tmp_path):
+    """The shipped workflow's small size, its table, a figure."""
+    assert magpend("run", "branches_2_3hz", "--smoke", "--workers", 0, "--out", "run").returncode == 0
+    options = ("--from", 2.45, "--to", 2.7, "--period", 2, "--generations", 1)
+    done = magpend("branches", "run", *options, "--csv", "table.csv")
+    assert done.returncode == 0, done.stderr
+    rows = [line.split(",") for line in (tmp_path / "table.csv").read_text().splitlines()]
+    halvings = [row for row in rows if row[2:5] == ["period_doubling", "supercritical", "1"]]
+    assert sorted(round(float(row[0]), 5) for row in halvings) == [2.49861, 2.50566]
+    assert {row[5] for row in halvings} == {"left", "right"}
+    drawn = magpend("plot", "branches", "run", *options)
+    assert drawn.returncode == 0, drawn.stderr
+    assert "taken from" in drawn.stdout
+    assert (tmp_path / "run" / "figures" / "branches_psi1.png").stat().st_size > 10_000
+    curved = magpend(
+        "plot", "curves", "run", *options, "--second", "q", "--second-from", 1.5, "--second-to", 1.6
+    )
+    assert curved.returncode == 0, curved.stderr
+    assert (tmp_path / "run" / "figures" / "curves_q.png").stat().st_size > 10_000
+    refused = magpend(
+        "plot", "curves", "run", *options, "--second", "q", "--second-from", 2, "--second-to", 1
+    )
+    assert refused.returncode == 2
+    assert "is empty" in refused.stderr

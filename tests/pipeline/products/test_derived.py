@@ -1,0 +1,234 @@
+"""Analysis products: what is computed again and what is not, damage, concurrent writers."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pipeline.products.derived import Snapshot, attractors, derive
+from pipeline.spec.problems import SpecError
+from pipeline.store import directory as store
+
+QUICK = {"polish": False, "rule_n_anchors": 16}
+
+
+@pytest.fixture
+def whole(made):
+    """A run directory whose tasks are all committed."""
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    return made
+
+
+class Counted:
+    """An analysis that counts its calls."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, snapshot):
+        self.calls += 1
+        ds = snapshot.open()
+        words = ("row", ["left", "right", "left"], {"long_name": "words"})
+        return xr.Dataset(
+            {
+                "mean": (("frequency",), ds["section"].mean(set(ds["section"].dims) - {"frequency"}).values),
+                "seen": ((), bool((ds["status"] > 0).any())),
+                "none": (("empty", "frequency"), np.zeros((0, ds.sizes["frequency"]), np.int16)),
+                "by_link": ("link", np.array([np.nan, 1.0]), {"flag_values": np.arange(2, dtype=np.int8)}),
+            },
+            coords={"frequency": ds["frequency"], "link": ds["link"], "row": words, "fixed": 2.5},
+            attrs={"parameters": ds.attrs["parameters"], "number": np.float64(0.1)},
+        )
+
+
+def products(made, name="mean"):
+    return sorted((made.info.directory / "derived").glob(f"{name}-*.zarr"))
+
+
+def test_derive__the_second_call_computes_nothing(whole):
+    compute, said = Counted(), []
+    first = derive(whole.info.directory, "mean", {"a": 1}, compute, said.append)
+    second = derive(whole.info.directory, "mean", {"a": 1}, compute, said.append)
+    assert compute.calls == 1
+    xr.testing.assert_identical(first, second)
+    assert "computed in" in said[0]
+    assert "taken from" in said[1]
+    assert first.encoding["source"] == str(products(whole)[0])
+
+
+def test_derive__returns_what_was_computed(whole):
+    compute = Counted()
+    expected = compute(Snapshot.of(whole.info.directory))
+    found = derive(whole.info.directory, "mean", {}, compute)
+    assert set(found.coords) == set(expected.coords)
+    for name in expected.variables:
+        np.testing.assert_array_equal(found[name].values, expected[name].values)
+        assert found[name].dtype.kind == expected[name].dtype.kind
+        assert found[name].dims == expected[name].dims
+    assert found["by_link"].attrs == {"flag_values": [0, 1]}
+    assert found["link"].attrs == expected["link"].attrs
+    assert found.attrs["number"] == 0.1
+
+
+def test_derive__is_plain_zarr_with_checksums(whole):
+    derive(whole.info.directory, "mean", {"a": [1, 2]}, Counted())
+    (path,) = products(whole)
+    ds = xr.open_zarr(path, consolidated=False)
+    assert json.loads(ds.attrs["derived_options"]) == {"a": [1, 2]}
+    assert ds.attrs["parameters"]
+    assert [ds["row"].attrs["words"][code] for code in ds["row"].values] == ["left", "right", "left"]
+    codecs = [c["name"] for c in json.loads((path / "mean" / "zarr.json").read_text())["codecs"]]
+    assert codecs[-1] == "crc32c"
+
+
+def test_derive__other_options_and_further_cells_compute_again(made):
+    compute = Counted()
+    made.commit(0)
+    directory = made.info.directory
+    before = derive(directory, "mean", {"a": 1}, compute)
+    derive(directory, "mean", {"a": 2}, compute)
+    assert compute.calls == 2
+    made.commit(1)
+    after = derive(directory, "mean", {"a": 1}, compute)
+    assert compute.calls == 3
+    assert not after["mean"].equals(before["mean"])
+    assert len(products(made)) == 3
+    store.withdraw(made.info, [1])
+    xr.testing.assert_identical(derive(directory, "mean", {"a": 1}, compute), before)
+    assert compute.calls == 3
+
+
+def test_derive__other_code_computes_again(whole, monkeypatch):
+    from pipeline.products import derived
+
+    compute = Counted()
+    derive(whole.info.directory, "mean", {}, compute)
+    monkeypatch.setattr(derived, "analysis_version", lambda: "another")
+    derive(whole.info.directory, "mean", {}, compute)
+    assert compute.calls == 2
+
+
+def test_snapshot__does_not_see_later_commits(made):
+    made.commit(0)
+    snapshot = Snapshot.of(made.info.directory)
+    made.commit(1)
+    assert int((snapshot.open()["status"] > 0).sum()) == made.plan.cells_in(0)
+    assert int((Snapshot.of(made.info.directory).open()["status"] > 0).sum()) > made.plan.cells_in(0)
+
+
+def flip(path: Path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda path: flip(path / "mean" / "c.0"),
+        lambda path: (path / "mean" / "c.0").unlink(),
+        lambda path: (path / "zarr.json").unlink(),
+        lambda path: (path / "zarr.json").write_text("{"),
+        lambda path: (path / "mean" / "zarr.json").unlink(),
+        lambda path: (path / "zarr.json").write_text(
+            (path / "zarr.json").read_text().replace('"number": 0.1', '"number": 0.2')
+        ),
+        lambda path: (path / "more").write_text(""),
+    ],
+    ids=["flipped", "chunk gone", "metadata gone", "metadata cut", "array gone", "attribute", "more"],
+)
+def test_derive__damage_is_said_and_mended(whole, harm):
+    compute, said = Counted(), []
+    first = derive(whole.info.directory, "mean", {}, compute)
+    harm(products(whole)[0])
+    again = derive(whole.info.directory, "mean", {}, compute, said.append)
+    assert compute.calls == 2
+    assert "damaged" in said[0]
+    xr.testing.assert_identical(again, first)
+    xr.testing.assert_identical(derive(whole.info.directory, "mean", {}, compute), first)
+    assert compute.calls == 2
+    assert len(list((whole.info.directory / "derived").iterdir())) == 1
+
+
+def test_derive__a_damaged_cube_is_no_result(whole):
+    chunk = next((whole.info.directory / "cube.zarr" / "section").glob("c.*"))
+    flip(chunk)
+    with pytest.raises(store.DamagedError, match="magpend verify"):
+        derive(whole.info.directory, "mean", {}, Counted())
+    assert not products(whole)
+
+
+def test_derive__an_error_leaves_nothing(whole):
+    def fail(snapshot):
+        return xr.Dataset({"a": ("x", np.array([object()], dtype=object))})
+
+    with pytest.raises(TypeError, match="a: objects other than words"):
+        derive(whole.info.directory, "mean", {}, fail)
+    assert not any((whole.info.directory / "derived").iterdir())
+
+
+def _write_often(directory, barrier, n):
+    compute = Counted()
+    for i in range(n):
+        barrier.wait()
+        derive(directory, "mean", {"i": i}, compute)
+
+
+def test_derive__writers_at_once(whole):
+    context = multiprocessing.get_context("spawn")
+    barrier = context.Barrier(2)
+    writers = [
+        context.Process(target=_write_often, args=(whole.info.directory, barrier, 5)) for _ in range(2)
+    ]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert [w.exitcode for w in writers] == [0, 0]
+    assert len(products(whole)) == len(list((whole.info.directory / "derived").iterdir())) == 5
+    compute = Counted()
+    for i in range(5):
+        derive(whole.info.directory, "mean", {"i": i}, compute)
+    assert compute.calls == 0
+
+
+def test_attractors__matching_again_identifies_nothing_again(whole):
+    said = []
+    found = attractors(whole.info.directory, echo=said.append, **QUICK)
+    assert found.attrs["matched"] == 1
+    assert found["state"].values.tolist() == ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+    again = attractors(whole.info.directory, echo=said.append, threshold=0.2, **QUICK)
+    assert [line for line in said if "taken from" in line] == [f"identified: taken from {_identified(whole)}"]
+    assert again.attrs["match_threshold"] == 0.2
+    assert len(products(whole, "attractors")) == 2
+
+
+def _identified(made):
+    (path,) = products(made, "identified")
+    return path
+
+
+def test_attractors__a_default_given_is_no_other_option(whole):
+    one = attractors(whole.info.directory, **QUICK)
+    two = attractors(whole.info.directory, threshold=0.3, look_back=3, rule_box=0.1, n_points=64.0, **QUICK)
+    assert one.encoding["source"] == two.encoding["source"]
+
+
+def test_attractors__pending_cells_stay_pending(made):
+    made.commit(0)
+    found = attractors(made.info.directory, **QUICK)
+    pending = found["status"] == 0
+    assert int((~pending).sum()) == made.plan.cells_in(0)
+    assert (found["attractor_id"].where(pending, -1) == -1).all()
+
+
+def test_attractors__unknown_option(whole):
+    with pytest.raises(SpecError, match="did you mean threshold"):
+        attractors(whole.info.directory, treshold=0.2)
+    assert not products(whole, "*")

@@ -1,0 +1,39 @@
+"""Progress in plain lines."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.runs.progress import LINE_EVERY_S, Progress, duration, size
+
+
+def test_progress__rate_and_time_left_count_this_session_only():
+    now = [0.0]
+    lines: list[str] = []
+    with Progress(1000, 500, terminal=False, echo=lines.append, clock=lambda: now[0]) as progress:
+        progress.add(10)
+        assert lines == []
+        now[0] = LINE_EVERY_S
+        progress.add(90)
+        assert lines == ["600/1000 cells (60 %), 10 cells/s, 40 s left"]
+        progress.add(400)
+    assert lines[-1].startswith("1000/1000 cells (100 %)")
+
+
+def test_progress__bar(capsys):
+    with Progress(10, 0, terminal=True, echo=print) as progress:
+        progress.add(10)
+    shown = capsys.readouterr()
+    assert "10/10" in shown.out + shown.err
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(3.21, "3.2 s"), (42.4, "42 s"), (200, "3 min 20 s"), (7260, "2 h 1 min")]
+)
+def test_duration(seconds, text):
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize(("n", "text"), [(12, "12 bytes"), (6.28e6, "6.3 MB"), (2e13, "20.0 TB")])
+def test_size(n, text):
+    assert size(n) == text

@@ -1,0 +1,275 @@
+"""Runs with the kernel: same bytes whatever happens on the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+import tomllib
+
+import numpy as np
+import pytest
+
+from magpend_core import load_preset, run_branches
+from pipeline import open_run
+from pipeline.compute import task
+from pipeline.compute.execute import TaskFailedError
+from pipeline.runs.run import InterruptedRunError, describe_plan, run, state
+from pipeline.spec.parsing import parse_spec
+from pipeline.store import directory as store
+
+MANY = """
+[axes]
+frequency_hz = { start = 2.0, stop = 2.5, num = 3 }
+[initial_conditions]
+kind = "random"
+n = 64
+psi1_deg = [-40, 40]
+[integration]
+n_transient = 100
+n_keep = 4
+"""
+EIGHT = "[execution]\ntrajectories_per_task = 8"
+MANY_SWEEP = f'kind = "sweep"\n{MANY}\n{EIGHT}'
+MANY_WALK = f'kind = "continuation"\n{MANY}\n[continuation]\ndirection = "both"\n{EIGHT}'
+
+
+def silent(line):
+    pass
+
+
+def test_run__walk_is_what_the_kernel_says(write_spec, walk_text, tmp_path):
+    run(write_spec(walk_text), tmp_path / "run", workers=0, echo=silent)
+    ds = open_run(tmp_path / "run")
+    assert ds.section.dims == ("frequency", "branch", "period_index", "state")
+    assert ds.direction.values.tolist() == ["up"] * 5 + ["down"] * 5
+    assert ds.attrs["path"] == "frequency"
+    spec = parse_spec(tomllib.loads(walk_text))
+    path = spec.axes["frequency_hz"].array()
+    starts = np.column_stack([ds[f"{s}_0"] for s in ("psi1", "psi2", "psi1_dot", "psi2_dot")])
+    frequency = np.array([path] * 5 + [path[::-1]] * 5)
+    packed = np.broadcast_to(load_preset().pack(), (10, 6, len(load_preset().names)))
+    expected = run_branches(packed, frequency, starts, **spec.integration.model_dump())
+    for name in ("section", "turns", "status", "orbit_period", "n_steps"):
+        found = ds[name].transpose("branch", "frequency", ...).values
+        wanted = getattr(expected, name).copy()
+        wanted[5:] = wanted[5:, ::-1]
+        assert np.array_equal(found, wanted, equal_nan=True), name
+
+
+def test_run__sweep_is_what_the_kernel_says(write_spec, sweep_text, tmp_path):
+    run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
+    ds = open_run(tmp_path / "run")
+    cell = ds.isel(frequency=3, q=1, psi1_0=2, psi2_0=1)
+    start = [float(cell[f"{s}_0"]) for s in ("psi1", "psi2", "psi1_dot", "psi2_dot")]
+    packed = load_preset(q=1.6).pack().reshape(1, 1, -1)
+    options = parse_spec(tomllib.loads(sweep_text)).integration.model_dump()
+    expected = run_branches(packed, np.array([[2.75]]), np.array([start]), **options)
+    assert np.array_equal(cell.section.values, expected.section[0, 0])
+    assert int(cell.n_steps) == expected.n_steps[0, 0]
+
+
+@pytest.mark.parametrize("kind", ["sweep", "walk"])
+def test_run__same_bytes_with_workers(write_spec, sweep_text, walk_text, tmp_path, bytes_of, kind):
+    path = write_spec(sweep_text if kind == "sweep" else walk_text)
+    found = []
+    for workers in (0, 1, 2):
+        directory = tmp_path / f"run{workers}"
+        assert run(path, directory, workers=workers, echo=silent).complete
+        found.append(bytes_of(directory))
+    assert found[0] == found[1] == found[2]
+
+
+def test_run__numbers_do_not_depend_on_the_tasks(write_spec, sweep_text, tmp_path):
+    for n in (24, 7):
+        text = sweep_text.replace("trajectories_per_task = 24", f"trajectories_per_task = {n}")
+        run(write_spec(text), tmp_path / f"run{n}", workers=0, echo=silent)
+    one, other = open_run(tmp_path / "run24").load(), open_run(tmp_path / "run7").load()
+    assert one.drop_attrs(deep=False).identical(other.drop_attrs(deep=False))
+
+
+def counted(monkeypatch, fail_at=None, error=None):
+    """Count the tasks computed in this process; let one of them fail."""
+    calls = []
+    original = task.compute
+
+    def compute(spec, cells, block):
+        calls.append(block)
+        if len(calls) == fail_at:
+            raise error or RuntimeError("out of luck")
+        return original(spec, cells, block)
+
+    monkeypatch.setattr(task, "compute", compute)
+    return calls
+
+
+def test_run__again_does_nothing(write_spec, sweep_text, tmp_path, monkeypatch, bytes_of):
+    path = write_spec(sweep_text)
+    run(path, tmp_path / "run", workers=0, echo=silent)
+    before = bytes_of(tmp_path / "run")
+    calls = counted(monkeypatch)
+    lines = []
+    run(path, tmp_path / "run", workers=0, echo=lines.append)
+    assert calls == []
+    assert "nothing to do" in lines[0]
+    assert bytes_of(tmp_path / "run") == before
+
+
+def test_run__failed_task_then_only_the_rest(write_spec, sweep_text, tmp_path, monkeypatch, bytes_of):
+    path = write_spec(sweep_text)
+    run(path, tmp_path / "whole", workers=0, echo=silent)
+    n_tasks = state(tmp_path / "whole").plan.n_tasks
+    with monkeypatch.context() as patch:
+        counted(patch, fail_at=3)
+        with pytest.raises(TaskFailedError, match="task 2: RuntimeError: out of luck"):
+            run(path, tmp_path / "run", workers=0, echo=silent)
+    assert state(tmp_path / "run").done == {0, 1}
+    for leftover in (
+        "cube.zarr/section/c.4.0.0.0.0.abc.partial",
+        "cube.zarr/status/c.4.0.0.0",
+        "commits/.3.tmp",
+    ):
+        (tmp_path / "run" / leftover).write_bytes(b"left by a crash")
+    calls = counted(monkeypatch)
+    run(path, tmp_path / "run", workers=0, echo=silent)
+    assert len(calls) == n_tasks - 2
+    assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
+
+
+def test_run__ctrl_c_in_process(write_spec, sweep_text, tmp_path, monkeypatch):
+    counted(monkeypatch, fail_at=2, error=KeyboardInterrupt())
+    with pytest.raises(InterruptedRunError, match="the same command goes on") as caught:
+        run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
+    assert caught.value.signal_number == signal.SIGINT
+    assert state(tmp_path / "run").done == {0}
+
+
+def test_run__changed_spec_is_refused(write_spec, sweep_text, tmp_path, bytes_of):
+    run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
+    before = bytes_of(tmp_path / "run")
+    changed = write_spec(sweep_text.replace("rtol = 1e-6", "rtol = 1e-5"), "changed.toml")
+    for function in (
+        lambda: run(changed, tmp_path / "run", workers=0),
+        lambda: describe_plan(changed, tmp_path / "run"),
+    ):
+        with pytest.raises(
+            store.RefusedError, match=r"spec\.integration\.rtol: 1e-06 in the directory, 1e-05 now"
+        ):
+            function()
+    assert bytes_of(tmp_path / "run") == before
+
+
+def test_run__other_kernel_is_refused(write_spec, sweep_text, tmp_path, monkeypatch):
+    import magpend_core
+
+    path = write_spec(sweep_text)
+    run(path, tmp_path / "run", workers=0, echo=silent)
+    monkeypatch.setattr(magpend_core, "kernel_version", lambda: "newer")
+    with pytest.raises(store.RefusedError, match=r"kernel_version: \w+ in the directory, newer now"):
+        run(path, tmp_path / "run", workers=0, echo=silent)
+
+
+def test_task__other_kernel_on_a_worker_is_refused(write_spec, sweep_text, tmp_path, monkeypatch):
+    run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
+    digest = store.read_run(tmp_path / "run").digest
+    task._prepare.cache_clear()
+    monkeypatch.setattr(task, "kernel_version", lambda: "older")
+    with pytest.raises(store.RefusedError, match="would not compute the same run"):
+        task.run_task(str(tmp_path / "run"), digest, 0)
+
+
+def test_run__locked(write_spec, sweep_text, tmp_path):
+    from filelock import FileLock
+
+    (tmp_path / "run").mkdir()
+    with FileLock(tmp_path / "run" / "lock", is_singleton=False), pytest.raises(store.LockedError):
+        run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
+
+
+def wait_for_commits(process, directory, n):
+    """Wait until a running command has committed `n` tasks."""
+    end = time.monotonic() + 120
+    while time.monotonic() < end and process.poll() is None:
+        folder = directory / "commits"
+        if folder.is_dir() and len(list(folder.glob("*.json"))) >= n:
+            return
+        time.sleep(0.002)
+    raise AssertionError((process.poll(), process.communicate()))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """Both kinds of run, done at a stretch."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    for name, text in (("sweep", MANY_SWEEP), ("walk", MANY_WALK)):
+        (folder / f"{name}.toml").write_text(text)
+        run(folder / f"{name}.toml", folder / name, workers=0, echo=silent)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("kind", "workers", "seed"), [("sweep", 2, 0), ("walk", 2, 1), ("sweep", 0, 2), ("walk", 0, 3)]
+)
+def test_kill__resumed_run_has_the_same_bytes(uninterrupted, start, tmp_path, bytes_of, kind, workers, seed):
+    rng = np.random.default_rng(seed)
+    spec, directory = uninterrupted / f"{kind}.toml", tmp_path / "run"
+    n_tasks = state(uninterrupted / kind).plan.n_tasks
+    for share in np.sort(rng.uniform(0, 0.8, 2 if workers else 1)):
+        process = start("run", spec, "--out", directory, "--workers", workers)
+        wait_for_commits(process, directory, int(share * n_tasks))
+        time.sleep(rng.uniform(0, 0.05))
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+    assert not state(directory).complete
+    assert run(spec, directory, workers=0, echo=silent).complete
+    assert bytes_of(directory) == bytes_of(uninterrupted / kind)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signal__stops_cleanly_and_resumes(uninterrupted, start, tmp_path, bytes_of, number, code):
+    spec, directory = uninterrupted / "sweep.toml", tmp_path / "run"
+    process = start("run", spec, "--out", directory, "--workers", 2)
+    wait_for_commits(process, directory, 2)
+    # a terminal sends Ctrl-C to the whole group
+    os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == code, (out, err)
+    assert "the same command goes on" in err
+    assert "Traceback" not in err
+    assert not state(directory).complete
+    assert run(spec, directory, workers=0, echo=silent).complete
+    assert bytes_of(directory) == bytes_of(uninterrupted / "sweep")
+
+
+def test_scheduler__existing_one(write_spec, sweep_text, tmp_path, bytes_of, monkeypatch):
+    from distributed import LocalCluster
+
+    path = write_spec(sweep_text)
+    run(path, tmp_path / "alone", scheduler="none", echo=silent)
+    with LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, host="127.0.0.1", protocol="tcp",
+        scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+    ) as cluster:  # fmt: skip
+        run(path, tmp_path / "address", scheduler=cluster.scheduler_address, echo=silent)
+        monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", cluster.scheduler_address)
+        run(path, tmp_path / "environment", echo=silent)
+        assert cluster.scheduler_info["workers"]
+    for name in ("address", "environment"):
+        assert bytes_of(tmp_path / name) == bytes_of(tmp_path / "alone")
+
+
+def test_local_cluster__listens_on_loopback_only():
+    import psutil
+
+    from pipeline.compute import execute
+
+    with execute._client(None, 1) as client:
+        assert len(client.nthreads()) == 1
+        processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        listening = {
+            c.laddr.ip
+            for p in processes
+            for c in p.net_connections(kind="inet")
+            if c.status == psutil.CONN_LISTEN
+        }
+    assert listening == {"127.0.0.1"}

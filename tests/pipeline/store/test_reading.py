@@ -1,0 +1,73 @@
+"""An opened cube explains itself and reads nothing before it is asked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magpend_core import Status
+from pipeline import open_run
+from pipeline.layout.schema import VARIABLES
+from pipeline.store import directory as store
+
+
+def test_open_run__explains_itself(made):
+    made.commit(0)
+    ds = open_run(made.info.directory)
+    assert ds.section.dims == ("frequency", "q", "psi1_0", "psi2_0", "period_index", "state")
+    assert list(ds.data_vars) == [v.name for v in VARIABLES]
+    assert ds.frequency.attrs["units"] == "Hz"
+    assert ds.q.attrs["units"] == "N m"
+    assert ds.psi1_0.attrs["units"] == "rad"
+    assert ds.psi1_dot_0.item() == 0.1
+    assert np.allclose(np.rad2deg(ds.psi1_0), [-30, 0, 30])
+    assert ds.state.values.tolist() == ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+    meanings = dict(
+        zip(ds.status.attrs["flag_values"], ds.status.attrs["flag_meanings"].split(), strict=True)
+    )
+    assert meanings == {int(s): s.name.lower() for s in Status}
+    assert ds.attrs["spec"] == made.info.spec_text
+    assert ds.attrs["title"] == "small sweep"
+    assert "q = 1.543" in ds.attrs["parameters"]
+    assert ds.attrs["closure_tolerance"] == 1e-6
+    assert ds.attrs["n_transient"] == 2
+    assert ds.attrs["stop_when_closed"] == 0
+    for name in ds.data_vars:
+        assert ds[name].attrs["units"]
+        assert ds[name].attrs["long_name"]
+
+
+def test_open_run__selects_by_label(made):
+    made.commit(0)
+    ds = open_run(made.info.directory)
+    assert ds.section.sel(frequency=2.26, method="nearest").frequency == 2.25
+    assert ds.section.sel(frequency=2.25, q=1.6, state="psi1").dims == ("psi1_0", "psi2_0", "period_index")
+
+
+def test_open_run__reads_no_chunk_before_it_is_used(made, monkeypatch):
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    asked = []
+    original = store.CommittedStore.get
+
+    async def get(self, key, *arguments, **options):
+        asked.append(key)
+        return await original(self, key, *arguments, **options)
+
+    monkeypatch.setattr(store.CommittedStore, "get", get)
+    names = tuple(f"{v.name}/c" for v in VARIABLES)
+    for chunks in (None, {}):
+        ds = open_run(made.info.directory, chunks=chunks)
+        ds.section.sel(frequency=2.25)
+        assert not [key for key in asked if key.startswith(names)]
+        ds.status.isel(frequency=0, q=0).values  # noqa: B018
+        read = [key for key in asked if key.startswith(names)]
+        assert read
+        assert {key.split("/")[0] for key in read} == {"status"}
+        assert len(set(read)) < made.plan.n_tasks
+        asked.clear()
+
+
+def test_open_run__no_run_there(tmp_path):
+    with pytest.raises(store.RefusedError, match="no run directory"):
+        open_run(tmp_path)

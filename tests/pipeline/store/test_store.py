@@ -1,0 +1,352 @@
+"""The commit protocol: what is not committed is never data, what is damaged is never read."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import shutil
+
+import numpy as np
+import pytest
+import zarr
+
+from pipeline import open_run
+from pipeline.layout.schema import VARIABLES
+from pipeline.runs.verify import describe, verify_run
+from pipeline.store import directory as store
+
+CUBE_WRITES = len(VARIABLES)
+
+
+def read_all(directory):
+    """Every variable as `open_run` shows it."""
+    ds = open_run(directory)
+    return {v.name: ds[v.name].values for v in VARIABLES}
+
+
+def assert_pending(directory, plan, index):
+    block = plan.task(index)
+    for variable in VARIABLES:
+        found = read_all(directory)[variable.name][block]
+        assert np.array_equal(found, np.full_like(found, variable.fill), equal_nan=True), variable.name
+
+
+def assert_data(directory, made, index):
+    for name, values in made.values(index).items():
+        assert np.array_equal(read_all(directory)[name][made.plan.task(index)], values), name
+
+
+def test_create__schema_versus_store(made):
+    group = zarr.open_group(made.info.directory / "cube.zarr", mode="r")
+    for v in VARIABLES:
+        array = group[v.name]
+        assert str(array.dtype) == v.dtype
+        assert array.metadata.dimension_names == (*made.plan.dims, *v.own_dims)
+        assert array.chunks == made.plan.chunks(v)
+        assert np.array_equal(array.fill_value, v.fill, equal_nan=True)
+        assert array.attrs["units"] == v.units
+        codecs = array.metadata.to_dict()["codecs"]
+        assert codecs[-1]["name"] == "crc32c"
+    assert "consolidated_metadata" not in json.loads(
+        (made.info.directory / "cube.zarr/zarr.json").read_text()
+    ) or (
+        json.loads((made.info.directory / "cube.zarr/zarr.json").read_text())["consolidated_metadata"] is None
+    )
+
+
+def test_write_task__reads_back(made):
+    made.commit(1)
+    assert_data(made.info.directory, made, 1)
+    assert_pending(made.info.directory, made.plan, 0)
+    assert set(store.read_commits(made.info, made.plan)) == {1}
+
+
+def test_write_task__fill_values_leave_files(made):
+    made.commit(0)
+    marker = json.loads(store.marker_path(made.info.directory, 0).read_text())
+    assert sorted({key.split("/")[0] for key in marker["objects"]}) == sorted(v.name for v in VARIABLES)
+    for key in marker["objects"]:
+        assert (made.info.directory / "cube.zarr" / key).is_file()
+
+
+def test_write_task__refuses_wrong_shapes_and_cut_chunks(made):
+    values = made.values(0)
+    values["status"] = values["status"][..., :1]
+    with pytest.raises(ValueError, match="status"):
+        store.write_task(made.info, made.plan, 0, values, {})
+    with pytest.raises(ValueError, match="cuts chunks"):
+        store._chunk_keys("x", (slice(1, 4),), (4,), (8,))
+    with pytest.raises(ValueError, match="cuts chunks"):
+        store._chunk_keys("x", (slice(0, 3),), (4,), (8,))
+    assert store._chunk_keys("x", (slice(4, 7),), (4,), (7,)) == ["x/c.1"]
+
+
+class CrashError(Exception):
+    """Stands for a power cut."""
+
+
+def crash_at(monkeypatch, name, n):
+    """Let the n-th call of a function of `store` crash; return the list of calls."""
+    calls = []
+    original = getattr(store, name)
+
+    def wrapped(*arguments, **options):
+        calls.append(arguments)
+        if len(calls) == n:
+            raise CrashError
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(store, name, wrapped)
+    return calls
+
+
+STEPS = [
+    *(("_write_block", n) for n in range(1, CUBE_WRITES + 1)),
+    ("_sync", 1),
+    *(("_sync_file", n) for n in (1, CUBE_WRITES)),
+    ("_sync_folder", 1),
+    ("_object_entry", 1),
+    ("_object_entry", CUBE_WRITES),
+    ("_write_atomically", 1),
+]
+
+
+@pytest.mark.parametrize(("name", "n"), STEPS)
+def test_write_task__crash_between_steps_leaves_pending(made, monkeypatch, name, n):
+    made.commit(1)
+    with monkeypatch.context() as patch:
+        crash_at(patch, name, n)
+        with pytest.raises(CrashError):
+            made.commit(0)
+    assert_pending(made.info.directory, made.plan, 0)
+    commits = store.read_commits(made.info, made.plan)
+    assert set(commits) == {1}
+    store.sweep(made.info, commits)
+    assert_data(made.info.directory, made, 1)
+    made.commit(0)
+    assert_data(made.info.directory, made, 0)
+
+
+def test_write_task__crash_before_the_marker_is_renamed(made, monkeypatch):
+    from pathlib import Path
+
+    def crash(self, target):
+        if target.parent.name == "commits":
+            raise CrashError
+        return original(self, target)
+
+    original = Path.replace
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", crash)
+        with pytest.raises(CrashError):
+            made.commit(0)
+    leftovers = list((made.info.directory / "commits").iterdir())
+    assert len(leftovers) == 1
+    assert_pending(made.info.directory, made.plan, 0)
+    assert store.sweep(made.info, {}) == 1 + CUBE_WRITES
+    assert list((made.info.directory / "commits").iterdir()) == []
+
+
+def test_write_task__order_of_syncs(made, monkeypatch):
+    """Files, then folders, then the marker under a temporary name, then its folder."""
+    import os
+
+    log = []
+    original = os.fsync
+
+    def fsync(handle):
+        path = os.readlink(f"/proc/self/fd/{handle}")
+        log.append(os.path.relpath(path, made.info.directory))
+        original(handle)
+
+    if not os.path.isdir("/proc/self/fd"):
+        pytest.skip("needs /proc to name open files")
+    monkeypatch.setattr(os, "fsync", fsync)
+    made.commit(0)
+    kinds = [
+        "marker" if p.endswith(".tmp") else "commits" if p == "commits" else "file" if "/c" in p else "folder"
+        for p in log
+    ]
+    order = [k for i, k in enumerate(kinds) if i == 0 or kinds[i - 1] != k]
+    assert order == ["file", "folder", "marker", "commits"]
+    assert kinds.count("file") == CUBE_WRITES
+    assert {p for p, k in zip(log, kinds, strict=True) if k == "folder"} == {
+        "cube.zarr", *(f"cube.zarr/{v.name}" for v in VARIABLES)
+    }  # fmt: skip
+
+
+def test_read__leftover_chunk_is_not_data(made):
+    made.commit(0)
+    store.marker_path(made.info.directory, 0).unlink()
+    assert_pending(made.info.directory, made.plan, 0)
+    ds = open_run(made.info.directory, chunks={})
+    assert (ds.status.compute() == 0).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: text.replace('"digest": "', '"digest": "0'),
+        lambda text: text.replace('"task": 0', '"task": 1'),
+        lambda text: text.replace('"task": 0', '"task": 99'),
+        lambda text: text.replace('"objects"', '"object"'),
+        lambda text: "[]",
+        lambda text: text.replace('"size": ', '"size": 1'),
+    ],
+)
+def test_read_commits__invalid_markers_do_not_count(made, change):
+    made.commit(0)
+    path = store.marker_path(made.info.directory, 0)
+    changed = change(path.read_text())
+    assert changed != path.read_text()
+    path.write_text(changed)
+    assert store.read_commits(made.info, made.plan) == {}
+    assert_pending(made.info.directory, made.plan, 0)
+
+
+def test_read_commits__missing_or_short_chunk(made):
+    made.commit(0)
+    made.commit(1)
+    objects = store.read_commits(made.info, made.plan)[0].objects
+    chunk = made.info.directory / "cube.zarr" / next(k for k in objects if k.startswith("section"))
+    whole = chunk.read_bytes()
+    chunk.write_bytes(whole[:-1])
+    assert set(store.read_commits(made.info, made.plan)) == {1}
+    chunk.unlink()
+    assert set(store.read_commits(made.info, made.plan)) == {1}
+    assert_pending(made.info.directory, made.plan, 0)
+
+
+@pytest.mark.parametrize("name", [v.name for v in VARIABLES])
+def test_flipped_bit__is_never_read_as_data(made, name):
+    made.commit(0)
+    key = next(k for k in store.read_commits(made.info, made.plan)[0].objects if k.startswith(f"{name}/"))
+    chunk = made.info.directory / "cube.zarr" / key
+    whole = chunk.read_bytes()
+    for place in np.random.default_rng(0).integers(0, 8 * len(whole), 20):
+        damaged = bytearray(whole)
+        damaged[place // 8] ^= 1 << (place % 8)
+        chunk.write_bytes(damaged)
+        with pytest.raises(Exception, match=r"(?i)checksum|crc32c"):
+            open_run(made.info.directory)[name].values  # noqa: B018
+    found = verify_run(made.info.directory)
+    assert not found.sound
+    assert list(found.damaged) == [0]
+    assert key in found.damaged[0]
+
+
+def test_flipped_bit__repair_makes_it_pending(made):
+    made.commit(0)
+    made.commit(1)
+    chunk = made.info.directory / "cube.zarr/status" / "c.0.0.0.0"
+    data = bytearray(chunk.read_bytes())
+    data[0] ^= 1
+    chunk.write_bytes(data)
+    found = verify_run(made.info.directory, repair=True)
+    assert "withdrawn" in describe(found, "d", repaired=True)[-1]
+    assert verify_run(made.info.directory).sound
+    assert_pending(made.info.directory, made.plan, 0)
+    assert_data(made.info.directory, made, 1)
+
+
+def test_verify__metadata_and_leftovers(made):
+    made.commit(0)
+    (made.info.directory / "cube.zarr/status/c.9.9").write_bytes(b"x")
+    assert verify_run(made.info.directory).leftovers == ["status/c.9.9"]
+    assert verify_run(made.info.directory).sound
+    metadata = made.info.directory / "cube.zarr/status/zarr.json"
+    metadata.write_text(metadata.read_text().replace('"fill_value": 0', '"fill_value": 1'))
+    found = verify_run(made.info.directory)
+    assert found.skeleton == ["status/zarr.json: its content has changed"]
+    assert not found.sound
+
+
+def test_sweep__touches_nothing_else(made):
+    made.commit(0)
+    directory = made.info.directory
+    for name in ("derived", "figures"):
+        (directory / name).mkdir()
+        (directory / name / "kept.txt").write_text("x")
+    (directory / "cube.zarr/section/c.0.0.abc.partial").write_bytes(b"x")
+    before = sorted(p for p in directory.rglob("*") if p.is_file() and not p.name.endswith("partial"))
+    assert store.sweep(made.info, store.read_commits(made.info, made.plan)) == 1
+    assert sorted(p for p in directory.rglob("*") if p.is_file()) == before
+
+
+def test_check__difference_key_by_key(made):
+    assert store.check(made.info.directory, made.identity) == made.info
+    other = {**made.identity, "kernel_version": "newer"}
+    with pytest.raises(store.RefusedError, match="kernel_version: test-kernel in the directory, newer now"):
+        store.check(made.info.directory, other)
+
+
+def test_check__foreign_directories_are_refused(made, tmp_path):
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    assert store.check(foreign, made.identity) is None
+    (foreign / "thesis.tex").write_text("x")
+    with pytest.raises(store.RefusedError, match=r"thesis\.tex"):
+        store.check(foreign, made.identity)
+    with pytest.raises(store.RefusedError, match="is a file"):
+        store.check(foreign / "thesis.tex", made.identity)
+    made.commit(0)
+    (made.info.directory / "run.json").unlink()
+    with pytest.raises(store.RefusedError, match=r"commits without run\.json"):
+        store.check(made.info.directory, made.identity)
+
+
+def test_create__crash_during_set_up_starts_again(made, monkeypatch, tmp_path):
+    directory = tmp_path / "again"
+    with monkeypatch.context() as patch:
+        crash_at(patch, "_write_atomically", 1)
+        with pytest.raises(CrashError):
+            store.create(directory, made.spec, made.plan, made.identity, "text")
+    with pytest.raises(store.RefusedError, match="no run directory"):
+        store.read_run(directory)
+    assert store.check(directory, made.identity) is None
+    store.create(directory, made.spec, made.plan, made.identity, "text")
+    assert store.check(directory, made.identity) is not None
+
+
+def test_read_run__damaged(made):
+    path = made.info.directory / "run.json"
+    for text in (path.read_text()[:-20], path.read_text().replace('"n_keep": 3', '"n_keep": 4')):
+        path.write_text(text)
+        with pytest.raises(store.RefusedError, match="damaged"):
+            store.read_run(made.info.directory)
+
+
+def _hold(directory, ready, done):
+    with store.writer_lock(directory):
+        ready.set()
+        done.wait(30)
+
+
+def test_writer_lock__another_process(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    ready, done = context.Event(), context.Event()
+    process = context.Process(target=_hold, args=(tmp_path, ready, done))
+    process.start()
+    try:
+        assert ready.wait(60)
+        with pytest.raises(store.LockedError, match="another magpend run"), store.writer_lock(tmp_path):
+            pass
+    finally:
+        process.kill()
+        process.join()
+    with store.writer_lock(tmp_path):
+        pass
+
+
+def test_same_bytes__whatever_the_order(made, tmp_path, bytes_of):
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    first = bytes_of(made.info.directory)
+    shutil.rmtree(made.info.directory)
+    store.create(made.info.directory, made.spec, made.plan, made.identity, made.info.spec_text)
+    for index in reversed(range(made.plan.n_tasks)):
+        made.commit(index)
+        made.commit(index)
+    assert bytes_of(made.info.directory) == first
