@@ -35,14 +35,12 @@ from magpend_core.engine.simd import (
     load_rows,
     maximum,
     minimum,
-    multiply_add,
-    sqrt,
     store,
     store_rows,
     where_less,
 )
 from magpend_core.engine.system import System
-from magpend_core.engine.vecmath import TWO_PI, exp2_rough, log2_rough
+from magpend_core.engine.vecmath import TWO_PI, exp2_rough, hypot_rough, log2_rough
 from magpend_core.status import Status
 
 # Dormand and Prince, J. Comput. Appl. Math. 6 (1980) 19-26, RK5(4)7M
@@ -61,6 +59,9 @@ STAGES = np.array(
 ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
 N_STAGES = 7
 ZERO: Any = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
+
+UNROLLED_STATES = 3
+"""Systems of so many states at most have their stages written out (see `unrolled_stages`)."""
 
 FIRST_STEP = 1e-3
 """First step of a branch in drive periods; error control finds the right size within a few steps."""
@@ -82,6 +83,7 @@ class Rows(NamedTuple):
     slopes: int  # N_STAGES * n_states rows
     trial: int  # the stage's state, at the end the new state
     constants: int
+    forcing: int  # at the last stage's time
     time: int  # s, since the last section
     wish: int  # s, step size that the error control wants
     step: int  # s, step size of this attempt
@@ -93,6 +95,7 @@ class Rows(NamedTuple):
     target_width: int  # s
     start_ratio: int  # step_ratio of the edge at the start
     target_ratio: int
+    target_share: int  # target_ratio/(1 + target_ratio)
     period: int  # s
     steps: int  # accepted in this cell
     rejected: int  # rejected attempts in this cell
@@ -104,7 +107,7 @@ class Rows(NamedTuple):
 def rows_of(system: System) -> Rows:
     """Lay out a group for a system."""
     counts = [
-        system.n_states, N_STAGES * system.n_states, system.n_states, system.n_constants, *[1] * 16,
+        system.n_states, N_STAGES * system.n_states, system.n_states, system.n_constants, *[1] * 18,
     ]  # fmt: skip
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
     return Rows(*(int(x) for x in offsets))
@@ -126,8 +129,8 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     The step is the least of what error control wants and, for each layer and edge, what keeps it in
     proportion to the distance from the nearest complex singularity: with D the distance in time to
     the crossing, d the half-width in time and c the layer's `step_ratio`, at most
-    max(c D/(1 + c), c d) towards the crossing and c sqrt(D^2 + d^2) away from it. It ends on the
-    segment's end exactly, and the last two steps before that share the rest.
+    max(c D/(1 + c), c d) towards the crossing and, to 2 %, c sqrt(D^2 + d^2) away from it. It ends on
+    the segment's end exactly, and the last two steps before that share the rest.
     """
     y = load_rows(w, base + ROWS.state, N)
     dy = load_rows(w, base + ROWS.slopes, N)
@@ -136,6 +139,8 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     remaining = load(w, base + ROWS.target) - t
     h = load(w, base + ROWS.wish)
     if HAS_LAYERS:  # numba cannot loop over an empty tuple
+        # the least quotient, kept as one until the end: one division for all layers
+        speed_h = 1.0 + 0.0 * h
         for value, rate, half_width, per_strength in layers(y, dy, c):
             speed = absolute(rate)
             ratio = step_ratio(slack * speed * per_strength)
@@ -143,17 +148,19 @@ def choose_step(w: Any, base: int, slack: float) -> None:
             nearing = value * rate
             # the two bounds of the docstring over one common division
             towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
-            away = ratio * sqrt(multiply_add(value, value, half_width * half_width))
+            away = ratio * hypot_rough(distance, half_width)
             length = where_less(nearing, 0.0, towards, away)
-            h = minimum(length / (speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)), h)
+            speed = speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)
+            mine, other = length * speed_h, h * speed
+            h = where_less(mine, other, length, h)
+            speed_h = where_less(mine, other, speed, speed_h)
+        h = h / speed_h
     if NE > 0:
         passed = t - load(w, base + ROWS.start)
-        width = load(w, base + ROWS.start_width)
-        ratio = load(w, base + ROWS.start_ratio)
-        h = minimum(ratio * sqrt(multiply_add(passed, passed, width * width)), h)
-        width = load(w, base + ROWS.target_width)
-        ratio = load(w, base + ROWS.target_ratio)
-        h = minimum(maximum(ratio / (1.0 + ratio) * remaining, ratio * width), h)
+        away = hypot_rough(passed, load(w, base + ROWS.start_width))
+        h = minimum(load(w, base + ROWS.start_ratio) * away, h)
+        least = load(w, base + ROWS.target_ratio) * load(w, base + ROWS.target_width)
+        h = minimum(maximum(load(w, base + ROWS.target_share) * remaining, least), h)
     shared = where_less(remaining, 2.0 * h, 0.5 * remaining, h)
     h = where_less(h, remaining, shared, remaining)
     h = where_less(0.5, load(w, base + ROWS.fresh), 0.0, h)
@@ -169,10 +176,48 @@ def run_stage(w: Any, base: int, s: int) -> None:
         for j in range(1, s):
             total = total + STAGES[s, j] * load(w, row + ROWS.slopes + j * N * WIDTH)
         store(w, row + ROWS.trial, load(w, row + ROWS.state) + h * total)
+    if NODES[s] != NODES[s - 1]:
+        c = load_rows(w, base + ROWS.constants, NC)
+        store(w, base + ROWS.forcing, forcing(load(w, base + ROWS.time) + NODES[s] * h, c))
+    # read after the last store, so that they can be operands in memory instead of spilled registers
     c = load_rows(w, base + ROWS.constants, NC)
-    u = forcing(load(w, base + ROWS.time) + NODES[s] * h, c)
-    slopes = rhs(load_rows(w, base + ROWS.trial, N), u, c)
+    slopes = rhs(load_rows(w, base + ROWS.trial, N), load(w, base + ROWS.forcing), c)
     store_rows(w, base + ROWS.slopes + s * N * WIDTH, slopes)
+
+
+def run_stages(w: Any, base: int) -> None:
+    """Compute the states and slopes of all stages but the first, which is the last step's last."""
+    for s in range(1, N_STAGES):
+        run_stage(w, base, s)
+
+
+def unrolled_stages(system: System) -> Callable[..., None]:
+    """Return `run_stages` written out for a small system.
+
+    The slopes stay in registers, the tableau's zeros cost nothing. Not for larger systems: six copies
+    of a long right-hand side compile for long and gain little.
+    """
+    n = system.n_states
+    lines = [
+        "def run_stages(w, base):",
+        "h, t = load(w, base + ROWS.step), load(w, base + ROWS.time)",
+        "c = load_rows(w, base + ROWS.constants, NC)",
+        "y = load_rows(w, base + ROWS.state, N)",
+        "k0 = load_rows(w, base + ROWS.slopes, N)",
+    ]
+    for s in range(1, N_STAGES):
+        terms = [(j, STAGES[s, j]) for j in range(s) if STAGES[s, j] != 0.0]
+        sums = (" + ".join(f"{float(a)!r} * k{j}[{i}]" for j, a in terms) for i in range(n))
+        lines.append("trial = (" + ", ".join(f"y[{i}] + h * ({x})" for i, x in enumerate(sums)) + ",)")
+        if NODES[s] != NODES[s - 1]:
+            lines.append(f"u = forcing(t + {float(NODES[s])!r} * h, c)")
+        lines.append(f"k{s} = rhs(trial, u, c)")
+        lines.append(f"store_rows(w, base + ROWS.slopes + {s * n * WIDTH}, k{s})")
+    lines.append("store_rows(w, base + ROWS.trial, trial)")
+    scope = dict(globals())
+    exec("\n    ".join(lines), scope)
+    function: Callable[..., None] = scope["run_stages"]
+    return function
 
 
 def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
@@ -244,8 +289,7 @@ def attempt(
     for group in range(n_groups):
         base = group * ROWS.size
         choose_step(w, base, slack)
-        for s in range(1, N_STAGES):
-            run_stage(w, base, s)
+        run_stages(w, base)
         events[group] = finish_step(w, base, rtol, atol, max_attempts)
 
 
@@ -283,7 +327,9 @@ def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge:
     """Let a segment end at `time`, with the layer of the edge number `edge` (none for n_edges)."""
     w[base + ROWS.target + lane] = time
     w[base + ROWS.target_width + lane] = edge_table[1, edge] if edge < NE else np.inf
-    w[base + ROWS.target_ratio + lane] = edge_table[2, edge] if edge < NE else 1.0
+    ratio = edge_table[2, edge] if edge < NE else 1.0
+    w[base + ROWS.target_ratio + lane] = ratio
+    w[base + ROWS.target_share + lane] = ratio / (1.0 + ratio)
 
 
 def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> int:
@@ -548,7 +594,7 @@ _INLINE = (
     "in_bounds", "take_section", "renew_state", "move_lane", "has_failed",
 )  # fmt: skip
 _CALLED = (
-    "choose_step", "run_stage", "finish_step", "attempt",
+    "choose_step", "run_stage", "run_stages", "finish_step", "attempt",
     "forget", "end_cell", "end_branch", "start_point", "start_branch", "serve", "copy_lane",
 )  # fmt: skip
 
@@ -580,8 +626,11 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
         bindings[key] = inline(specialise(getattr(observers, key), name, **bindings))
     bindings["observe"] = inline(specialise(observer.observe, name, **bindings))
     bindings["renew"] = inline(specialise(observer.renew, name, **bindings))
-    for key in (*_INLINE, *_CALLED):
-        function = specialise(globals()[key], name, **bindings)
+    templates: dict[str, Any] = {key: globals()[key] for key in (*_INLINE, *_CALLED)}
+    if system.n_states <= UNROLLED_STATES:
+        templates["run_stages"] = unrolled_stages(system)
+    for key, template in templates.items():
+        function = specialise(template, name, **bindings)
         bindings[key] = inline(function) if key in _INLINE else njit(**UNCOUNTED)(function)
     return bindings
 
