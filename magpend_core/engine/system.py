@@ -3,9 +3,39 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections import namedtuple
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
+
+
+def positions(names: Iterable[str]) -> Any:
+    """Return where each name stands: a named tuple of integers 0, 1, 2, ...
+
+    Compiled functions read it as a global, so that they say ``p[AT.q]`` and not ``p[16]``; the number
+    is a constant of the machine code.
+
+    Parameters
+    ----------
+    names
+        Distinct Python identifiers that do not begin with an underscore, such as the parameters of a
+        system in the order of its packed vector.
+
+    Raises
+    ------
+    ValueError
+        If a name is given twice, or cannot be an attribute.
+    AttributeError
+        From the result, for a name that it does not have.
+
+    Examples
+    --------
+    >>> AT = positions(("mass", "stiffness"))
+    >>> AT.stiffness
+    1
+    """
+    ordered = tuple(names)
+    return namedtuple("Positions", ordered)(*range(len(ordered)))
 
 
 @dataclass(frozen=True)
