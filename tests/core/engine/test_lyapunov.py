@@ -19,7 +19,7 @@ def of_duffing(duffing, parameters, n_cells=32, **options):
     rng = np.random.default_rng(4)
     return lyapunov_exponents(
         np.tile(np.array(parameters), (n_cells, 1)), np.full(n_cells, UNIT_FREQUENCY),
-        rng.uniform(-1.0, 1.0, (n_cells, 2)), n_exponents=2, system=duffing, **options,
+        rng.uniform(-1.0, 1.0, (n_cells, 2)), system=duffing, **options,
     )  # fmt: skip
 
 
