@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from magpend_core import Status, kernel_version, lyapunov_exponents, run_branches
+from pipeline.compute.exponents import exponents
 from pipeline.compute.refinement import infer
 from pipeline.layout.cells import CellMap
 from pipeline.layout.identity import digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import VARIABLES
-from pipeline.products.lyapunov import exponents
 from pipeline.spec.parsing import Spec, parse_spec
 from pipeline.store.directory import RefusedError, RunInfo, read_run, write_task
 
