@@ -13,22 +13,28 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from magpend_core.engine.lyapunov import LyapunovExponents, lyapunov_exponents
-    from magpend_core.models.pendulum.mechanics import Torques, accelerations, energy, jacobian, torques
-    from magpend_core.models.pendulum.parameters import (
-        ParameterError,
-        Parameters,
+    from magpend_core.meaning import kernel_version
+    from magpend_core.models import (
+        ModelError,
+        load_model,
         load_preset,
+        model_names,
         preset_names,
         preset_provenance,
     )
+    from magpend_core.models.model import Model
+    from magpend_core.models.parameters import ParameterError, Parameters
+    from magpend_core.models.pendulum.mechanics import Torques, accelerations, energy, torques
     from magpend_core.orbits import PeriodicOrbits, polish_orbits
+    from magpend_core.pointwise import evaluate, jacobian, rates
     from magpend_core.sections import Sections, run_branches, sections
     from magpend_core.status import Status
     from magpend_core.trajectory import trajectory
-    from magpend_core.version import kernel_version
 
 __all__ = [
     "LyapunovExponents",
+    "Model",
+    "ModelError",
     "ParameterError",
     "Parameters",
     "PeriodicOrbits",
@@ -37,13 +43,17 @@ __all__ = [
     "Torques",
     "accelerations",
     "energy",
+    "evaluate",
     "jacobian",
     "kernel_version",
+    "load_model",
     "load_preset",
     "lyapunov_exponents",
+    "model_names",
     "polish_orbits",
     "preset_names",
     "preset_provenance",
+    "rates",
     "run_branches",
     "sections",
     "torques",
@@ -52,15 +62,18 @@ __all__ = [
 
 _HOMES = {
     "engine.lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
-    "models.pendulum.mechanics": ("Torques", "accelerations", "energy", "jacobian", "torques"),
-    "models.pendulum.parameters": (
-        "ParameterError", "Parameters", "load_preset", "preset_names", "preset_provenance",
+    "meaning": ("kernel_version",),
+    "models": (
+        "ModelError", "load_model", "load_preset", "model_names", "preset_names", "preset_provenance",
     ),
+    "models.model": ("Model",),
+    "models.parameters": ("ParameterError", "Parameters"),
+    "models.pendulum.mechanics": ("Torques", "accelerations", "energy", "torques"),
     "orbits": ("PeriodicOrbits", "polish_orbits"),
+    "pointwise": ("evaluate", "jacobian", "rates"),
     "sections": ("Sections", "run_branches", "sections"),
     "status": ("Status",),
     "trajectory": ("trajectory",),
-    "version": ("kernel_version",),
 }  # fmt: skip
 _HOME_OF = {name: f"{__name__}.{module}" for module, names in _HOMES.items() for name in names}
 

@@ -87,6 +87,10 @@ class System:
         How many of the states, from the first, enter the error control; None for all.
     has_layers : bool
         False if there are none; then `layers` is never called.
+    quantity_names : tuple of str
+    quantities : callable or None
+        ``quantities(t, y, dy, u, c)``: a tuple of the named quantities at time `t` [s] since the last
+        section, from the states, their rates, the forcing and the constants.
     """
 
     name: str
@@ -105,11 +109,14 @@ class System:
     escape: tuple[float, ...]
     n_controlled: int | None = None
     has_layers: bool = True
+    quantity_names: tuple[str, ...] = ()
+    quantities: Callable[..., Any] | None = None
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
         """All compiled functions."""
-        return self.constants, self.forcing, self.rhs, self.edges, self.layers, self.jacobian
+        own = self.constants, self.forcing, self.rhs, self.edges, self.layers, self.jacobian
+        return own if self.quantities is None else (*own, self.quantities)
 
     @property
     def label(self) -> str:

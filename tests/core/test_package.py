@@ -3,16 +3,17 @@
 import pytest
 
 import magpend_core
-from magpend_core.version import kernel_version, meaning_digest
+from magpend_core.meaning import kernel_version, meaning_digest
 
 
 def test_import__leaves_the_compiler_out(run_python):
     script = (
         "import sys, magpend_core\n"
-        "from magpend_core import ParameterError, Parameters, Status, kernel_version, load_preset\n"
+        "from magpend_core import ParameterError, Parameters, Status, kernel_version\n"
+        "from magpend_core import load_model, load_preset\n"
         "from magpend_core.status import Status as same\n"
         "assert Status is same and Status.PERIODIC == 1\n"
-        "kernel_version(), load_preset(q=1.5).pack(), dir(magpend_core)\n"
+        "kernel_version(), load_preset(q=1.5).pack(), load_model('duffing').digest, dir(magpend_core)\n"
         "print([m for m in ('numba', 'llvmlite', 'scipy') if m in sys.modules])\n"
     )
     assert run_python(script).strip() == "[]"
@@ -125,7 +126,7 @@ def test_kernel_version__follows_the_engines_meaning(run_python, copied):
 
 
 def test_kernel_version__leaves_models_to_their_own_digests(run_python, copied):
-    name = "models/pendulum/parameters.py"
+    name = "models/parameters.py"
     assert (
         version_after(run_python, copied, name, 'FRACTION = "between', 'FRACTION = "in') == kernel_version()
     )

@@ -1,4 +1,4 @@
-"""What a computation means, as a digest of its sources: results carry it, so that they can be compared.
+"""What sources mean, as a digest: results carry it, so that they can be compared with what would be computed.
 
 Two sources mean the same if they differ in comments, docstrings, layout, or the wording of errors alone. A
 run that was begun with one is completed with the other.
@@ -26,8 +26,8 @@ def meaning_digest(paths: Iterable[Path]) -> str:
     Parameters
     ----------
     paths
-        Files, and folders for all ``*.py`` below them. A file counts with its name, one in a folder with
-        its path from there.
+        Files, and folders for all ``*.py`` below them, in any order. A file counts with its name, one in a
+        folder with its path from there; what is not Python, with its bytes.
 
     Returns
     -------
@@ -43,9 +43,12 @@ def meaning_digest(paths: Iterable[Path]) -> str:
     """
     digest = hashlib.sha256()
     for name, path in sorted(_files(paths)):
-        meaning: list[str] = []
-        _write(ast.parse(path.read_bytes()), meaning)
-        digest.update(f"{name}\0{''.join(meaning)}\0".encode())
+        content = path.read_bytes()
+        if path.suffix == ".py":
+            tokens: list[str] = []
+            _write(ast.parse(content), tokens)
+            content = "".join(tokens).encode()
+        digest.update(name.encode() + b"\0" + hashlib.sha256(content).digest())
     return digest.hexdigest()[:16]
 
 
