@@ -59,6 +59,8 @@ class LyapunovExponents:
         exponents are not resolved.
     status : ndarray of int8, (cell,)
         ``BOUNDED`` if all went well, or how the trajectory failed.
+    is_whole : bool
+        Whether there is an exponent for each state. Only then does their sum have to be `divergence`.
     """
 
     exponents: np.ndarray
@@ -68,6 +70,7 @@ class LyapunovExponents:
     divergence: np.ndarray
     loss: np.ndarray
     status: np.ndarray
+    is_whole: bool
 
 
 LENGTH = 1e-3
@@ -248,6 +251,7 @@ def lyapunov_exponents(
         divergence=sums[:, :, n_exponents].mean(axis=1),
         loss=measures[:, n_exponents + 2],
         status=cells.status[:, 0].astype(np.int8),
+        is_whole=n_exponents == n,
     )
 
 

@@ -8,7 +8,7 @@ from magpend_core import LyapunovExponents, Sections, Status, lyapunov_exponents
 from magpend_core.engine.lyapunov import MOST_LOSS
 from magpend_core.engine.system import System
 from pipeline.layout.schema import LYAPUNOV_VARIABLES, LyapunovFlag
-from pipeline.spec.parsing import STATES, Spec
+from pipeline.spec.parsing import Spec
 
 AUDIT = 0.01
 """Largest allowed difference between the sum of the exponents and the divergence, in units of the sum of
@@ -69,7 +69,7 @@ def _falling(rates: np.ndarray) -> np.ndarray:
 def flags(found: LyapunovExponents) -> np.ndarray:
     """Codes of `LyapunovFlag`; only a whole spectrum can be held against the divergence."""
     flag = np.full(len(found.status), LyapunovFlag.GOOD, np.int8)
-    if found.exponents.shape[1] == len(STATES):
+    if found.is_whole:
         missing = np.abs(found.exponents.sum(axis=1) - found.divergence)
         flag[missing > AUDIT * np.abs(found.exponents).sum(axis=1)] = LyapunovFlag.AUDIT_FAILED
     flag[found.loss > MOST_LOSS] = LyapunovFlag.UNRESOLVED

@@ -39,6 +39,7 @@ def test_duffing__exponents_add_up_to_minus_the_damping(duffing, parameters):
     found = of_duffing(duffing, parameters, 4, n_periods=64, rtol=1e-11, atol=1e-11)
     assert found.exponents.sum(axis=1) == pytest.approx(-parameters[0], abs=1e-8)
     assert found.divergence == pytest.approx(-parameters[0], abs=1e-12)
+    assert found.is_whole
 
 
 def test_linear_oscillator__exponents_are_half_the_damping(duffing):
