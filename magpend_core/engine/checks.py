@@ -93,7 +93,7 @@ def check_system(
     key = (subject, system.tangents_of is not None)
     if not frequency_hz.size:
         return
-    packed = parameters.reshape(-1, parameters.shape[-1])
+    packed = parameters.reshape(frequency_hz.size, parameters.shape[-1])
     low = np.append(packed.min(axis=0), frequency_hz.min())
     high = np.append(packed.max(axis=0), frequency_hz.max())
     checked = _CHECKED.get(key)
