@@ -7,7 +7,7 @@ from magpend_core import LyapunovExponents, Status, load_preset, lyapunov_expone
 from pipeline import open_run
 from pipeline.compute.exponents import flags
 from pipeline.layout.plan import make_plan
-from pipeline.layout.schema import LYAPUNOV_VARIABLES, LyapunovFlag
+from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag
 from pipeline.runs.run import run
 from pipeline.spec.parsing import load_spec
 from pipeline.spec.problems import SpecError
@@ -139,12 +139,12 @@ def made_up(**changes):
     ],
 )
 def test_flags__say_what_is_wrong(changes, expected):
-    assert flags(made_up(**changes)).tolist() == [LyapunovFlag.GOOD, expected]
+    assert flags(made_up(**changes), 4).tolist() == [LyapunovFlag.GOOD, expected]
 
 
 def test_flags__a_part_of_the_spectrum_is_not_held_against_the_divergence():
     part = made_up(exponents=np.tile([0.5], (2, 1)))
-    assert flags(part).tolist() == [LyapunovFlag.GOOD] * 2
+    assert flags(part, 4).tolist() == [LyapunovFlag.GOOD] * 2
 
 
 @pytest.mark.parametrize(
