@@ -123,6 +123,7 @@ def made_up(**changes):
         "exponents": np.tile([0.5, 0.0, -0.2, -1.0], (2, 1)), "stderr": np.zeros((2, 4)),
         "weighted": np.zeros((2, 4)), "blocks": np.zeros((2, 4, 4)), "divergence": np.full(2, -0.7),
         "loss": np.full(2, 1e3), "status": np.full(2, Status.BOUNDED, np.int8),
+        "is_whole": True,
     }  # fmt: skip
     return LyapunovExponents(**{**values, **changes})
 
@@ -139,12 +140,17 @@ def made_up(**changes):
     ],
 )
 def test_flags__say_what_is_wrong(changes, expected):
-    assert flags(made_up(**changes), 4).tolist() == [LyapunovFlag.GOOD, expected]
+    assert flags(made_up(**changes)).tolist() == [LyapunovFlag.GOOD, expected]
 
 
 def test_flags__a_part_of_the_spectrum_is_not_held_against_the_divergence():
-    part = made_up(exponents=np.tile([0.5], (2, 1)))
-    assert flags(part, 4).tolist() == [LyapunovFlag.GOOD] * 2
+    part = made_up(exponents=np.tile([0.5], (2, 1)), is_whole=False)
+    assert flags(part).tolist() == [LyapunovFlag.GOOD] * 2
+
+
+def test_flags__audit_a_whole_spectrum_of_any_length():
+    two = made_up(exponents=np.tile([0.1, -0.3], (2, 1)), divergence=np.array([-0.2, -0.3]))
+    assert flags(two).tolist() == [LyapunovFlag.GOOD, LyapunovFlag.AUDIT_FAILED]
 
 
 @pytest.mark.parametrize(
