@@ -1,0 +1,101 @@
+"""What a computation means, as a digest of its sources: results carry it, so that they can be compared.
+
+Two sources mean the same if they differ in comments, docstrings, layout, or the wording of errors alone. A
+run that was begun with one is completed with the other.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterable, Iterator
+from functools import cache
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parent
+_NOT_KERNEL = ("models",)  # a model has a digest of its own
+_WITHOUT_MEANING = ("type_comment", "kind", "ctx")
+
+
+def meaning_digest(paths: Iterable[Path]) -> str:
+    """Digest of what Python sources do, whatever is said about it and where they lie.
+
+    Left out are comments, docstrings and other bare strings, layout and line numbers, and what errors say
+    (their types count). Names count, and so does the order of statements.
+
+    Parameters
+    ----------
+    paths
+        Files, and folders for all ``*.py`` below them. A file counts with its name, one in a folder with
+        its path from there.
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits, the same with every version of Python that reads the sources alike.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read.
+    SyntaxError
+        If one is not Python.
+    """
+    digest = hashlib.sha256()
+    for name, path in sorted(_files(paths)):
+        meaning: list[str] = []
+        _write(ast.parse(path.read_bytes()), meaning)
+        digest.update(f"{name}\0{''.join(meaning)}\0".encode())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def kernel_version() -> str:
+    """Digest of the numerical core without its models: what stored results carry as ``kernel_version``.
+
+    It follows the meaning of the sources (see `meaning_digest`): an edited sentence bars nobody from
+    completing a run.
+    """
+    own = (path for path in _PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir())
+    return meaning_digest(path for path in own if path.name not in _NOT_KERNEL)
+
+
+def _files(paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
+    for path in paths:
+        if path.is_dir():
+            for file in path.rglob("*.py"):
+                yield f"{path.name}/{file.relative_to(path).as_posix()}", file
+        else:
+            yield path.name, path
+
+
+def _write(node: object, out: list[str]) -> None:
+    """Write a syntax tree as text.
+
+    `ast.dump` would do but for its changes from one version of Python to the next: empty fields come and
+    go, new ones are added.
+    """
+    if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+        node = ast.Raise(node.exc.func, node.cause)
+    if isinstance(node, ast.AST):
+        out.append(f"{type(node).__name__}(")
+        for field, value in ast.iter_fields(node):
+            if field not in _WITHOUT_MEANING and value is not None and value != []:
+                out.append(f"{field}=")
+                _write(value, out)
+        out.append(")")
+    elif isinstance(node, list):
+        out.append("[")
+        for entry in node:
+            if not _is_remark(entry):
+                _write(entry, out)
+        out.append("]")
+    else:
+        out.append(f"{node!r},")
+
+
+def _is_remark(node: object) -> bool:
+    """Whether a statement does nothing: a docstring, another bare string, ``pass`` or ``...``."""
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        return isinstance(node.value.value, str) or node.value.value is ...
+    return isinstance(node, ast.Pass)
