@@ -75,7 +75,7 @@ def curves(run: Any, options: CurveOptions) -> xr.Dataset:
 
 def _interval(run: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
     """Check the parameter and complete its interval from the run's axis."""
-    from magpend_core.models.pendulum.parameters import unknown_name_problem
+    from magpend_core.models.parameters import unknown_name_problem
     from pipeline.analysis.attractors.attractors import parameters_of
     from pipeline.spec.problems import SpecError
 
