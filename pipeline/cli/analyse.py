@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from pipeline.cli.common import Csv, Directory, Json, check_csv, tell
 from pipeline.cli.groups import SETTINGS, made, registry_group
 from pipeline.cli.options import speaking, taking
-
-if TYPE_CHECKING:
-    from pipeline.products.product import Options
 
 
 def _names() -> list[str]:
@@ -25,7 +22,7 @@ def _make(name: str) -> Any:
 
     analysis = ANALYSES[name]
 
-    def command(directory: Directory, options: Options, csv: Csv = None, json: Json = False) -> None:
+    def command(directory: Directory, options: Any, csv: Csv = None, json: Json = False) -> None:
         from pipeline.cli import console
         from pipeline.products.product import function_of
         from pipeline.runs.derive import derive

@@ -49,12 +49,27 @@ class RegistryGroup(TyperGroup):
             later = [a for a in args[1:] if a in self.list_commands(ctx)]
             if later:
                 rest = [a for a in args if a != later[0]]
-                raise UsageError(
-                    f"the directory comes last: magpend {self.verb} {later[0]} {' '.join(rest)}"
-                )
+                raise UsageError(f"the directory comes last: magpend {self.verb} {later[0]} {' '.join(rest)}")
             from pipeline.spec.problems import unknown_name
 
-            raise UsageError(unknown_name(f"name after 'magpend {self.verb}':", args[0], self.list_commands(ctx)))
+            raise UsageError(unknown_name(f"magpend {self.verb}", args[0], self.list_commands(ctx)))
+        return super().resolve_command(ctx, args)
+
+
+_MOVED = {"branches": "magpend analyse branches DIR", "analyze": "magpend analyse X DIR"}
+
+
+class TopGroup(TyperGroup):
+    """``magpend``: its commands, and where those went that it had."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find a command, or name the nearest."""
+        if args and args[0] not in self.list_commands(ctx) and not args[0].startswith("-"):
+            from pipeline.spec.problems import unknown_name
+
+            if args[0] in _MOVED:
+                raise UsageError(f"no command {args[0]!r}; it is: {_MOVED[args[0]]}")
+            raise UsageError(unknown_name("command", args[0], self.list_commands(ctx)))
         return super().resolve_command(ctx, args)
 
 

@@ -104,15 +104,16 @@ def _parameter(model: type[Options], name: str) -> inspect.Parameter:
 
     info, flag = model.model_fields[name], flag_of(model, name)
     kind, default = kind_of(info), default_of(model, name)
-    shown = {} if default in (None, "", [], {}) or isinstance(default, bool) else {"show_default": f"{default}"}
-    declared: dict[str, Any] = {"help": help_of(info), **shown}
+    text = help_of(info) + (
+        f" Default: {_shown(default)}." if default not in (None, "", [], {}, False) else ""
+    )
+    declared: dict[str, Any] = {"help": text}
     if get_origin(kind) is Literal:
         choices = [c for c in get_args(kind) if c]
         declared |= {"metavar": "|".join(choices), "autocompletion": lambda: choices}
         kind = str
     elif kind is bool:
         flag = f"{flag}/--no-{flag[2:]}" if default else flag
-        declared |= {"help": f"{help_of(info)} Default: yes."} if default else {}
     elif get_origin(kind) is dict:
         declared |= {"metavar": "AXIS=VALUE"}
         kind = list[str]
@@ -123,6 +124,10 @@ def _parameter(model: type[Options], name: str) -> inspect.Parameter:
         Annotated[kind if info.is_required() else kind | None, typer.Option(flag, **declared)],
         inspect.Parameter.empty if info.is_required() else None,
     )
+
+
+def _shown(default: Any) -> str:
+    return "yes" if default is True else f"{default:g}" if isinstance(default, float) else str(default)
 
 
 def _value(info: FieldInfo, flag: str, value: Any) -> Any:

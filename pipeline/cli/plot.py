@@ -26,7 +26,7 @@ def _names() -> list[str]:
 def _make(name: str) -> Any:
     from pipeline.products.registry import FIGURES
 
-    def command(directory: Directory, options: FigureOptions) -> None:
+    def command(directory: Directory, options: Any) -> None:
         draw(directory, name, options)
 
     figure = FIGURES[name]

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
+from pipeline.runs.naming import named
 from pipeline.runs.versions import code_version
 from pipeline.spec.problems import SpecError, unknown_name, validated
 from pipeline.store import directory as store
@@ -124,7 +125,7 @@ def derive(
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
-    """Return options completed from the run, once it has been found to have what a product takes.
+    """Return options with the run's own names, completed from it, once it has what a product takes.
 
     Raises
     ------
@@ -132,6 +133,7 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
         If it has not, with the directory's name.
     """
     with refused(run.directory):
+        options = named(run, options)
         if product.needs:
             function_of(product.needs)(run, options)
         settle = getattr(product, "settle", "")

@@ -7,6 +7,7 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
+from magpend_core.meaning import meaning_digest
 from pipeline.products.registry import ANALYSES
 
 _ROOT = Path(__file__).parents[2]
@@ -22,7 +23,6 @@ def code_version(name: str) -> str:
     count.
     """
     from magpend_core import kernel_version
-    from magpend_core.version import meaning_digest
 
     digest = hashlib.sha256(kernel_version().encode())
     for module in sorted(modules_of(name)):
