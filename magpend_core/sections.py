@@ -10,8 +10,8 @@ import numpy as np
 from magpend_core.engine.lanes import Cells, engine_of
 from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD_CLOSED, RECORD_LAST, Settings
 from magpend_core.engine.system import System
-from magpend_core.models.pendulum.parameters import Parameters
-from magpend_core.models.pendulum.systems import PENDULUM_FITTED, system_of
+from magpend_core.models.parameters import Parameters
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.validation import (
     check_array,
     check_count,
@@ -262,7 +262,8 @@ def sections(
     >>> result.section.shape
     (1, 1, 4)
     """
-    initial = check_states(initial_states, 2, name="initial_states")
+    system = parameters.model.system
+    initial = check_states(initial_states, 2, system.n_states, "initial_states")
     frequency = np.asarray(frequency_hz, np.float64)
     if frequency.ndim == 0:
         frequency = np.full(len(initial), float(frequency))
@@ -270,7 +271,7 @@ def sections(
     packed = np.broadcast_to(parameters.pack(), (len(frequency), 1, len(parameters.names)))
     result = run_branches(
         packed, frequency, initial, n_transient=n_transient, n_keep=n_keep,
-        rtol=rtol, atol=atol, system=system_of(parameters), **options,
+        rtol=rtol, atol=atol, system=system, **options,
     )  # fmt: skip
     per_cell = ("section", "turns", "status", "orbit_period", "n_periods", "n_steps", "n_rejected")
     return replace(result, **{name: getattr(result, name)[:, 0] for name in per_cell})

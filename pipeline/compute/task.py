@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 
 from magpend_core import Status, kernel_version, lyapunov_exponents, run_branches
-from magpend_core.models.pendulum.systems import system_of
+from pipeline.compute.exponents import exponents
 from pipeline.compute.refinement import infer
 from pipeline.layout.cells import CellMap
 from pipeline.layout.identity import digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import VARIABLES
-from pipeline.products.lyapunov import exponents
 from pipeline.spec.parsing import Spec, parse_spec
 from pipeline.store.directory import RefusedError, RunInfo, read_run, write_task
 
@@ -43,7 +42,7 @@ def _prepare(directory: str, digest: str) -> tuple[RunInfo, Spec, Plan, CellMap]
 def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
     """Return all variables of a block of cells, in the block's shape."""
     inputs = cells.inputs(block)
-    system = system_of(spec.parameters.load())
+    system = spec.parameters.load().model.system
     integration = spec.integration.model_dump()
 
     def integrate(branches: Any) -> dict[str, np.ndarray]:
@@ -100,7 +99,7 @@ def warm_up(spec: Spec) -> float:
     """
     started = time.perf_counter()
     parameters = spec.parameters.load()
-    packed, system = parameters.pack().reshape(1, 1, -1), system_of(parameters)
+    packed, system = parameters.pack().reshape(1, 1, -1), parameters.model.system
     options = {**spec.integration.model_dump(), "n_transient": 0, "n_keep": 1}
     run_branches(packed, np.full((1, 1), 2.0), np.zeros((1, 4)), system=system, **options)
     if spec.products.lyapunov:

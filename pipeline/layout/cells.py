@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core.models.pendulum.parameters import describe
+from magpend_core.models.model import Model
 from pipeline.layout.schema import STATE_UNITS, STATES
 from pipeline.spec.parsing import FREQUENCY, GridStarts, ListStarts, RandomStarts, Range, Spec, Starts
 
@@ -140,22 +140,23 @@ def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
 
     ``direction`` is +1 (up) or -1 (down) here; `open_run` shows words.
     """
-    parameters = describe(spec.parameters.load())
+    model = spec.parameters.load().model
     found = [
-        Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, parameters))
+        Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, model))
         for a in parameter_axes(spec)
     ]
     if FREQUENCY not in spec.axes:
         value = np.array(spec.parameters.frequency_hz, dtype=np.float64)
-        found.append(Coordinate("frequency", (), value, _parameter_attrs(FREQUENCY, parameters)))
+        found.append(Coordinate("frequency", (), value, _parameter_attrs(FREQUENCY, model)))
     states = initial_states(spec.initial_conditions)
     return (*found, *(_branch_coords(spec, states) if spec.continuation else _start_coords(states)))
 
 
-def _parameter_attrs(name: str, parameters: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
+def _parameter_attrs(name: str, model: Model) -> dict[str, str]:
     if name == FREQUENCY:
         return {"units": "Hz", "long_name": "drive frequency"}
-    return {"units": parameters[name]["unit"], "long_name": parameters[name]["meaning"]}
+    parameter = model.parameter(name)
+    return {"units": parameter.unit, "long_name": parameter.meaning}
 
 
 def _start_attrs(state: str) -> dict[str, str]:

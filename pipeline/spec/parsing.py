@@ -27,12 +27,8 @@ from pydantic import (
     model_validator,
 )
 
-from magpend_core.models.pendulum.parameters import (
-    ParameterError,
-    Parameters,
-    load_preset,
-    unknown_name_problem,
-)
+from magpend_core.models import load_preset
+from magpend_core.models.parameters import ParameterError, Parameters, unknown_name_problem
 from pipeline.spec.problems import SpecError, problems_of, unknown_choice, unknown_key
 
 FREQUENCY = "frequency_hz"
