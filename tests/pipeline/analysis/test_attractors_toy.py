@@ -175,7 +175,7 @@ def sweep(seed=0, order=None):
     for i, f in enumerate(AXIS):
         shift = 0.05 * (i - 4)
         a = [[shift, 0.5, 0, 0]]
-        b = [[-shift, 0.0, 2.0, 0], [-shift, -0.2, -2.0, 0]]
+        b = [[-shift, 1.0, 2.0, 0], [-shift, 0.8, -2.0, 0]]
         cells = []
         if i != 4:
             cells += [("a", on(a, noise=1e-7, rng=rng)) for _ in range(6)]
