@@ -47,6 +47,7 @@ CELL_PRODUCTS: Registry[CellProduct] = Registry(
 ANALYSES: Registry[Analysis] = Registry(
     "analysis",
     {
+        "identified": "pipeline.products.attractors:IDENTIFIED",
         "attractors": "pipeline.products.attractors:ATTRACTORS",
         "basins": "pipeline.products.basins:BASINS",
         "hysteresis": "pipeline.products.attractors:HYSTERESIS",
@@ -57,6 +58,9 @@ ANALYSES: Registry[Analysis] = Registry(
         "curves": "pipeline.products.branches:CURVES",
     },
 )
+
+COMMANDS = tuple(name for name in ANALYSES if name != "identified")
+"""Analyses that have a table, and so a command."""
 
 FIGURES: Registry[Figure] = Registry(
     "figure",
