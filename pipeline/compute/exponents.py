@@ -4,32 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from magpend_core import LyapunovExponents, Sections, Status, lyapunov_exponents
+from magpend_core import LyapunovExponents, Status, lyapunov_exponents
 from magpend_core.engine.lyapunov import MOST_LOSS
-from magpend_core.engine.system import System
-from pipeline.layout.schema import LYAPUNOV_VARIABLES, LyapunovFlag
-from pipeline.spec.parsing import Spec
+from pipeline.compute.task import Job
+from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag, LyapunovOptions
 
 AUDIT = 0.01
 """Largest allowed difference between the sum of the exponents and the divergence, in units of the sum of
 their moduli."""
 
 
-def exponents(
-    parameters: np.ndarray, frequency_hz: np.ndarray, cells: Sections, spec: Spec, system: System
-) -> dict[str, np.ndarray]:
+def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
     """Return `LYAPUNOV_VARIABLES` for the cells of a task.
 
     Parameters
     ----------
-    parameters, frequency_hz
-        As `run_branches` took them, shapes (branch, point, parameter) and (branch, point).
-    cells
-        What it returned.
-    spec
-        Specification with the product.
-    system
-        What is integrated.
+    job
+        The cells as they were integrated.
+    options
+        What is asked for.
 
     Returns
     -------
@@ -37,14 +30,12 @@ def exponents(
         Arrays with leading dims (branch, point). A cell without an attractor (diverged, step limit,
         unreached) has NaN and the flag ``ABSENT``.
     """
-    options = spec.products.lyapunov
-    assert options is not None
-    integration = spec.integration
+    cells, inputs, integration = job.cells, job.inputs, job.spec.integration
     branch, point = np.nonzero(np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED)))
     found = lyapunov_exponents(
-        parameters[branch, point], frequency_hz[branch, point], cells.section[branch, point, -1],
-        rtol=integration.rtol, atol=integration.atol,
-        max_steps_per_period=integration.max_steps_per_period, system=system, **options.model_dump(),
+        inputs.parameters[branch, point], inputs.frequency_hz[branch, point],
+        cells.section[branch, point, -1], rtol=integration.rtol, atol=integration.atol,
+        max_steps_per_period=integration.max_steps_per_period, system=job.system, **options.model_dump(),
     )  # fmt: skip
     is_closed = cells.status[branch, point] == Status.PERIODIC
     values = {

@@ -61,6 +61,10 @@ class Options(BaseModel):
             if type(self).model_fields[name].is_required() or value != default_of(type(self), name)
         }
 
+    def part(self, model: type[Options]) -> dict[str, Any]:
+        """Options that another model has too, for the analysis that takes these."""
+        return {name: getattr(self, name) for name in model.model_fields}
+
 
 def default_of(model: type[Options], name: str) -> Any:
     """Default of an option as a JSON value, ``None`` if it is a required one."""
@@ -108,7 +112,17 @@ class CellProduct:
     cost : callable
         ``cost(options)``: what a cell takes, in drive periods of a plain integration.
     compute : str
-        ``"module:function"``, called by `pipeline.compute.task` with the options.
+        ``"module:function"``: ``compute(job, options)`` with a `pipeline.compute.task.Job`, the cells as they
+        were integrated; returns the variables, with leading dims (branch, point).
+    settle : callable
+        ``settle(options, model)``: the options with what follows from the model filled in; raises
+        ValueError with a sentence that begins with the option's name if they do not fit it.
+    coordinates : callable
+        ``coordinates(options, model)``: values of the product's own dims by name, where they have names.
+    integrate : callable
+        ``integrate(options)``: keywords of `magpend_core.run_branches` that the product needs.
+    shortest : callable
+        ``shortest(options)``: the options with the least work, for what is compiled ahead.
     """
 
     name: str
@@ -118,6 +132,10 @@ class CellProduct:
     sizes: Callable[[Any, Any], dict[str, int]]
     cost: Callable[[Any], float]
     compute: str
+    settle: Callable[[Any, Any], Any] = lambda options, model: options
+    coordinates: Callable[[Any, Any], dict[str, Sequence[Any]]] = lambda options, model: {}
+    integrate: Callable[[Any], dict[str, Any]] = lambda options: {}
+    shortest: Callable[[Any], Any] = lambda options: options
 
 
 @dataclass(frozen=True)
@@ -134,7 +152,8 @@ class Analysis:
         ``"module:function"``: ``compute(run, options)`` gives a Dataset. ``run.cube()`` is the cube,
         ``run.derive(name, **options)`` another analysis of the same cells.
     table : str
-        ``"module:function"``: ``table(ds)`` gives a `Table`.
+        ``"module:function"``: ``table(ds)`` gives a `Table`. Empty: a result that others build on, without
+        a command.
     needs : str
         ``"module:function"`` or empty: ``needs(run, options)`` raises ValueError with a sentence if the
         run does not have what the analysis takes; called before anything is computed.
@@ -154,7 +173,7 @@ class Analysis:
     help: str
     options: type[Options]
     compute: str
-    table: str
+    table: str = ""
     needs: str = ""
     settle: str = ""
     builds_on: tuple[str, ...] = ()

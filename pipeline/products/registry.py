@@ -40,12 +40,14 @@ CELL_PRODUCTS: Registry[CellProduct] = Registry(
     "product",
     {
         "lyapunov": "pipeline.products.lyapunov:LYAPUNOV",
+        "extremes": "pipeline.products.extremes:EXTREMES",
     },
 )
 
 ANALYSES: Registry[Analysis] = Registry(
     "analysis",
     {
+        "identified": "pipeline.products.attractors:IDENTIFIED",
         "attractors": "pipeline.products.attractors:ATTRACTORS",
         "basins": "pipeline.products.basins:BASINS",
         "hysteresis": "pipeline.products.attractors:HYSTERESIS",
@@ -56,6 +58,9 @@ ANALYSES: Registry[Analysis] = Registry(
         "curves": "pipeline.products.branches:CURVES",
     },
 )
+
+COMMANDS = tuple(name for name in ANALYSES if name != "identified")
+"""Analyses that have a table, and so a command."""
 
 FIGURES: Registry[Figure] = Registry(
     "figure",
