@@ -115,7 +115,7 @@ def branches_table(ds: xr.Dataset) -> Table:
 
 def curves_table(ds: xr.Dataset) -> Table:
     """Table of the curves: kind, period, points and range."""
-    from pipeline.analysis.branches.dataset import KINDS
+    from pipeline.analysis.branches.bifurcations import KINDS
 
     first, second = str(ds.attrs["first_parameter"]), str(ds.attrs["second_parameter"])
     rows: list[dict[str, Any]] = []
