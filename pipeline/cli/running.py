@@ -64,7 +64,7 @@ def _diagram(directory: Path) -> None:
     from pipeline.products.registry import FIGURES
 
     options = FIGURES["bifurcation"].options
-    draw(directory, "bifurcation", options())  # type: ignore[call-arg]
+    draw(directory, "bifurcation", options())
 
 
 def status(directory: Directory) -> None:

@@ -33,7 +33,7 @@ def test_help__is_light(environment):
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert found.stdout.splitlines()[-1] == "[]"
-    for command in ("run", "status", "verify", "analyse", "plot", "simulate", "presets"):
+    for command in ("run", "status", "verify", "analyse", "plot", "simulate", "models", "presets"):
         assert command in found.stdout
 
 
@@ -68,8 +68,10 @@ def test_run__bad_spec_creates_nothing(magpend, write_spec, tmp_path, option):
         ["run", "spec.toml", "--smoke"],
         ["status", "."],
         ["verify", "."],
+        ["analyse", "attractors", "."],
+        ["analyse", "basins", ".", "--box", "x"],
         ["analyse", ".", "attractors"],
-        ["analyse", ".", "basins", "--box", "x"],
+        ["branches", "."],
         ["analyse", ".", "nonsense"],
         ["plot", "bifurcation", "."],
         ["plot", "bifurcation", ".", "--state", "psi3"],
