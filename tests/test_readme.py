@@ -11,7 +11,7 @@ from typer.main import get_command
 
 from pipeline.cli.main import app
 from pipeline.layout.schema import VARIABLES
-from pipeline.runs.run import shipped_workflows
+from pipeline.runs.workflows import shipped_workflows
 from pipeline.spec.parsing import parse_spec
 
 README = (Path(__file__).parents[1] / "README.md").read_text("utf-8")

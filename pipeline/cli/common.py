@@ -20,7 +20,7 @@ Directory = Annotated[Path, typer.Argument(metavar="DIR", help="Run directory.")
 def refusals(directory: Path) -> Iterator[None]:
     """Say what is wrong with a cube or an option instead of failing with a trace."""
     from pipeline.spec.problems import SpecError
-    from pipeline.store.directory import DamagedError
+    from pipeline.store.errors import DamagedError
 
     try:
         yield

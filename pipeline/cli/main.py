@@ -78,28 +78,29 @@ def run(
 
     Stop it whenever you like: the same command goes on where it was, and the finished files are the same.
     """
+    from pipeline.runs import preview
     from pipeline.runs import run as runs
 
     if dry_run:
-        for line in runs.describe_plan(spec, out, workers=workers, smoke=smoke):
+        for line in preview.describe_plan(spec, out, workers=workers, smoke=smoke):
             typer.echo(line)
         return
     if plot:
-        runs.check_diagram(spec, smoke=smoke)
+        preview.check_diagram(spec, smoke=smoke)
     state = runs.run(spec, out, workers=workers, scheduler=scheduler, smoke=smoke, echo=typer.echo)
     typer.echo(f"cube: {state.directory / 'cube.zarr'}")
     if plot:
         typer.echo(f"figure: {draw_bifurcation(state.directory)}")
     else:
-        typer.echo(f"plot it with: magpend plot {runs.first_figure(state.plan)} {state.directory}")
+        typer.echo(f"plot it with: magpend plot {preview.first_figure(state.plan)} {state.directory}")
 
 
 @app.command(epilog=EXIT_HELP)
 def status(directory: Directory) -> None:
     """Say how much of a run is committed and what became of its cells."""
-    from pipeline.runs import run as runs
+    from pipeline.runs.status import describe_state, state
 
-    for line in runs.describe_state(runs.state(directory)):
+    for line in describe_state(state(directory)):
         typer.echo(line)
 
 
@@ -210,11 +211,18 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     from magpend_core.models.pendulum.parameters import ParameterError
     from pipeline.compute.execute import TaskFailedError
     from pipeline.spec.problems import SpecError
-    from pipeline.store.directory import DamagedError, LockedError, StoreError
+    from pipeline.store.errors import (
+        DamagedError,
+        IncompleteError,
+        LockedError,
+        StoreError,
+        UnreadableError,
+    )
 
     return [
         ((LockedError,), Exit.LOCKED),
         ((DamagedError,), Exit.DAMAGED),
+        ((IncompleteError, UnreadableError), Exit.FAILED),
         ((SpecError, ParameterError, StoreError), Exit.REFUSED),
         ((TaskFailedError, ArithmeticError, OSError), Exit.FAILED),
     ]

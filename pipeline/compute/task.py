@@ -22,7 +22,9 @@ from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import VARIABLES
 from pipeline.products.lyapunov import exponents
 from pipeline.spec.parsing import Spec, parse_spec
-from pipeline.store.directory import RefusedError, RunInfo, read_run, write_task
+from pipeline.store.commits import write_task
+from pipeline.store.errors import RefusedError
+from pipeline.store.runfile import RunInfo, read_run
 
 
 @lru_cache(maxsize=4)

@@ -17,7 +17,7 @@ import numpy as np
 
 from magpend_core.status import Status
 
-FORMAT = 1
+FORMAT = 2
 """Version of the run directory's layout."""
 
 REFINEMENT = 1
@@ -42,6 +42,7 @@ class Variable:
     fill : float or int
         What a pending cell reads as.
     units : str
+        Empty where the components have units of their own.
     long_name : str
     attrs : mapping
         Further attributes.
@@ -57,7 +58,8 @@ class Variable:
 
     def attributes(self) -> dict[str, Any]:
         """All attributes as written to the store."""
-        return {"units": self.units, "long_name": self.long_name, **self.attrs}
+        units = {"units": self.units} if self.units else {}
+        return {**units, "long_name": self.long_name, **self.attrs}
 
     def itemsize(self, sizes: Mapping[str, int]) -> int:
         """Bytes per cell, uncompressed."""
@@ -74,8 +76,8 @@ def _flag_attrs(codes: Any) -> dict[str, Any]:
 
 VARIABLES = (
     Variable(
-        "section", ("period_index", "state"), "float64", math.nan, "rad, rad, rad/s, rad/s",
-        "state at the drive's rising edge, angles wrapped to (-pi, pi]",
+        "section", ("period_index", "state"), "float64", math.nan, "",
+        "state at the drive's rising edge, angles wrapped to (-pi, pi]; units by component: state_units",
     ),
     Variable("turns", ("link",), "int32", 0, "1", "full turns of the link over the kept periods"),
     Variable("status", (), "int8", int(Status.PENDING), "1", "what became of the cell", _flag_attrs(Status)),

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from pipeline.products.derived import Echo, Snapshot, Source, attractors, derive
+from pipeline.products.derived import Echo, Source, attractors, derive
 from pipeline.spec.problems import SpecError
+from pipeline.store.run import Run
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -28,7 +29,7 @@ def branches(
     Parameters
     ----------
     directory
-        Run directory, or a `Snapshot`.
+        Run directory, or a `Run`.
     parameter
         ``frequency_hz`` or a parameter's name.
     low, high
@@ -54,7 +55,7 @@ def branches(
     ParameterError
         If an end of the interval is.
     """
-    snapshot = Snapshot.of(directory)
+    snapshot = Run.open(directory)
     interval = _interval(snapshot, parameter, low, high)
     problems = [
         f"{name} = {value}: must be {least} or more."
@@ -74,14 +75,12 @@ def branches(
     return derive(snapshot, "branches", options, lambda s: _branches(s, echo, **options), echo)
 
 
-def _interval(
-    snapshot: Snapshot, parameter: str, low: float | None, high: float | None
-) -> tuple[float, float]:
+def _interval(snapshot: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
     """Check the parameter and complete its interval from the run's axis."""
     from magpend_core.models.pendulum.parameters import unknown_name_problem
     from pipeline.analysis.attractors.attractors import parameters_of
 
-    ds = snapshot.open()
+    ds = snapshot.cube()
     names = (*parameters_of(ds).names, "frequency_hz")
     if parameter not in names:
         raise SpecError([unknown_name_problem(parameter, names)])
@@ -108,7 +107,7 @@ def _interval(
 
 
 def _branches(
-    snapshot: Snapshot,
+    snapshot: Run,
     echo: Echo | None,
     parameter: str,
     low: float,
@@ -120,7 +119,7 @@ def _branches(
     from pipeline.analysis.attractors.attractors import parameters_of
     from pipeline.analysis.branches import Scope, attracting, dataset_of, explore, recurrent
 
-    cube = snapshot.open()
+    cube = snapshot.cube()
     base, scale = parameters_of(cube), high - low
     found = attractors(snapshot, echo=echo)
     starts = attracting(found, base, parameter, scale, max_period)
@@ -147,7 +146,7 @@ def curves(
     Parameters
     ----------
     directory
-        Run directory, or a `Snapshot`.
+        Run directory, or a `Run`.
     second
         ``frequency_hz`` or a parameter's name.
     second_low, second_high
@@ -169,12 +168,12 @@ def curves(
     SpecError
         If an option is out of bounds, or the run sweeps the second parameter.
     """
-    snapshot = Snapshot.of(directory)
+    snapshot = Run.open(directory)
     located = branches(snapshot, echo=echo, **options)
     first = str(located.attrs["parameter"])
     if second == first:
         raise SpecError([f"{second} is the branches' own parameter; give another one."])
-    axis = snapshot.open().coords.get("frequency" if second == "frequency_hz" else second)
+    axis = snapshot.cube().coords.get("frequency" if second == "frequency_hz" else second)
     if axis is not None and axis.ndim > 0 and axis.size > 1:
         raise SpecError(
             [f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."]
@@ -190,11 +189,11 @@ def curves(
         "curve_period": curve_period,
     }
 
-    def compute(at: Snapshot) -> xr.Dataset:
+    def compute(at: Run) -> xr.Dataset:
         from pipeline.analysis.attractors.attractors import parameters_of
         from pipeline.analysis.branches import curves_dataset, curves_from
 
-        base = parameters_of(at.open())
+        base = parameters_of(at.cube())
         bounds = ((wanted["low"], wanted["high"]), interval)
         return curves_dataset(curves_from(located, base, second, bounds, curve_period), first, second)
 

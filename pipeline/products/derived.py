@@ -22,16 +22,23 @@ import inspect
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
-from functools import cached_property, lru_cache
+from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.layout.plan import Plan, make_plan
-from pipeline.spec.parsing import parse_spec
 from pipeline.spec.problems import SpecError, unknown_key
-from pipeline.store import directory as store
-from pipeline.store.reading import open_committed
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import DERIVED
+from pipeline.store.products import (
+    leftover_products,
+    open_product,
+    product_paths,
+    read_product_attrs,
+    remove_product,
+    write_product,
+)
+from pipeline.store.run import Run
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -42,48 +49,7 @@ _LEFTOVER_SECONDS = 3600.0
 _ANALYSIS = Path(__file__).parents[1] / "analysis"
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """A run directory with what was committed at one moment, so that all results speak of the same cells.
-
-    Attributes
-    ----------
-    info : store.RunInfo
-    plan : Plan
-    commits : dict
-        Valid markers by task.
-    """
-
-    info: store.RunInfo
-    plan: Plan
-    commits: Mapping[int, store.Commit]
-
-    @classmethod
-    def of(cls, directory: str | Path | Snapshot) -> Snapshot:
-        """Return what stands in a run directory now; a snapshot is returned as it is.
-
-        Raises
-        ------
-        store.RefusedError
-            If there is no run in `directory`.
-        """
-        if isinstance(directory, Snapshot):
-            return directory
-        info = store.read_run(Path(directory))
-        plan = make_plan(parse_spec(info.spec))
-        return cls(info, plan, store.read_commits(info, plan))
-
-    @cached_property
-    def digest(self) -> str:
-        """Digest of the committed cells."""
-        return store.cube_digest(self.info, self.commits)
-
-    def open(self, *, chunks: Any = None) -> xr.Dataset:
-        """Open the cube, as `pipeline.open_run` does."""
-        return open_committed(self.info, self.plan, self.commits, chunks=chunks)
-
-
-Source = str | Path | Snapshot
+Source = str | Path | Run
 
 
 @lru_cache
@@ -101,7 +67,7 @@ def derive(
     source: Source,
     product: str,
     options: Mapping[str, Any],
-    compute: Callable[[Snapshot], xr.Dataset],
+    compute: Callable[[Run], xr.Dataset],
     echo: Echo | None = None,
 ) -> xr.Dataset:
     """Return a product of a run, stored or computed.
@@ -109,13 +75,13 @@ def derive(
     Parameters
     ----------
     source
-        Run directory, or a snapshot of one.
+        Run directory, or one that has been opened.
     product
         Name of the product; begins the name of its folder.
     options
         All that `compute` depends on besides the cells and the code: JSON values, defaults filled in.
     compute
-        Called with the snapshot if the product is not stored; ``snapshot.open()`` gives the cube, and
+        Called with the snapshot if the product is not stored; ``snapshot.cube()`` gives the cube, and
         another product derived from the snapshot speaks of the same cells.
     echo
         Prints a line; says what is computed, and why.
@@ -127,33 +93,33 @@ def derive(
 
     Raises
     ------
-    store.RefusedError
+    RefusedError
         If there is no run.
-    store.DamagedError
+    DamagedError
         If a chunk of the cube is damaged.
     """
     say = echo or _silent
-    snapshot = Snapshot.of(source)
+    snapshot = Run.open(source)
     key = _key(snapshot, product, options)
-    path = snapshot.info.directory / store.DERIVED / f"{product}-{key['derived_key'][:8]}.zarr"
+    path = snapshot.info.directory / DERIVED / f"{product}-{key['derived_key'][:8]}.zarr"
     try:
-        ds = store.open_product(path)
+        ds = open_product(path)
         if all(ds.attrs.get(name) == value for name, value in key.items()):
             say(f"{product}: taken from {path}")
             return _placed(ds, path)
     except FileNotFoundError:
         pass
-    except store.DamagedError as error:
+    except DamagedError as error:
         say(f"{product}: damaged ({error}); computing it again")
     started = time.perf_counter()
     result = _compute(snapshot, compute).assign_attrs(key)
     say(f"{product}: computed in {time.perf_counter() - started:.1f} s")
     try:
-        store.write_product(path, result)
+        write_product(path, result)
     except PermissionError as error:
         say(f"{product}: not kept ({error})")
         return result
-    return _placed(store.open_product(path), path)
+    return _placed(open_product(path), path)
 
 
 def _silent(_: str) -> None:
@@ -165,7 +131,7 @@ def _placed(ds: xr.Dataset, path: Path) -> xr.Dataset:
     return ds
 
 
-def _key(snapshot: Snapshot, product: str, options: Mapping[str, Any]) -> dict[str, str]:
+def _key(snapshot: Run, product: str, options: Mapping[str, Any]) -> dict[str, str]:
     """Attributes that name a product."""
     parts = {
         "derived_product": product,
@@ -176,14 +142,14 @@ def _key(snapshot: Snapshot, product: str, options: Mapping[str, Any]) -> dict[s
     return {**parts, "derived_key": hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()}
 
 
-def _compute(snapshot: Snapshot, compute: Callable[[Snapshot], xr.Dataset]) -> xr.Dataset:
+def _compute(snapshot: Run, compute: Callable[[Run], xr.Dataset]) -> xr.Dataset:
     try:
         return compute(snapshot)
     except ValueError as error:
         if "checksum" not in str(error).lower():
             raise
         directory = snapshot.info.directory
-        raise store.DamagedError(
+        raise DamagedError(
             f"{directory}: a chunk is damaged; look with: magpend verify {directory}"
         ) from None
 
@@ -197,7 +163,7 @@ def attractors(directory: Source, *, echo: Echo | None = None, **options: Any) -
     Parameters
     ----------
     directory
-        Run directory, or a `Snapshot`.
+        Run directory, or an opened `Run`.
     echo
         Prints a line.
     options
@@ -220,7 +186,7 @@ def attractors(directory: Source, *, echo: Echo | None = None, **options: Any) -
     wanted = _with_defaults("attractors", options, attractor_defaults())
     matching = {name: wanted.pop(name) for name in _defaults_of(match)}
 
-    def compute(snapshot: Snapshot) -> xr.Dataset:
+    def compute(snapshot: Run) -> xr.Dataset:
         return match(derive(snapshot, "identified", wanted, lambda s: _identify(s, wanted), echo), **matching)
 
     return derive(directory, "attractors", {**wanted, **matching}, compute, echo)
@@ -258,18 +224,18 @@ def basins(directory: Source, *, echo: Echo | None = None, **options: Any) -> xr
     from pipeline.analysis.basins.basins import basins as compute
     from pipeline.analysis.basins.basins import check_basin_options, check_starts
 
-    snapshot = Snapshot.of(directory)
+    snapshot = Run.open(directory)
     wanted = _with_defaults("basins", options, basin_defaults())
     own = {name: wanted[name] for name in _defaults_of(compute)}
     shared = {name: value for name, value in wanted.items() if name not in own}
     with _refused(snapshot):
         check_basin_options(**own)
-        check_starts(snapshot.open())
+        check_starts(snapshot.cube())
     return derive(
         snapshot,
         "basins",
         wanted,
-        lambda s: compute(s.open(), attractors(s, echo=echo, **shared), **own),
+        lambda s: compute(s.cube(), attractors(s, echo=echo, **shared), **own),
         echo,
     )
 
@@ -302,12 +268,12 @@ def hysteresis(directory: Source, *, echo: Echo | None = None, **options: Any) -
     from pipeline.analysis.attractors.hysteresis import check_directions
     from pipeline.analysis.attractors.hysteresis import hysteresis as compute
 
-    snapshot = Snapshot.of(directory)
+    snapshot = Run.open(directory)
     wanted = _with_defaults("hysteresis", options, attractor_defaults())
     with _refused(snapshot):
-        check_directions(snapshot.open())
+        check_directions(snapshot.cube())
     return derive(
-        snapshot, "hysteresis", wanted, lambda s: compute(s.open(), attractors(s, echo=echo, **wanted)), echo
+        snapshot, "hysteresis", wanted, lambda s: compute(s.cube(), attractors(s, echo=echo, **wanted)), echo
     )
 
 
@@ -338,7 +304,7 @@ def settling(directory: Source, *, echo: Echo | None = None, **options: Any) -> 
     own = {name: wanted[name] for name in _defaults_of(lifetimes)}
     return derive(
         directory, "settling", wanted,
-        lambda s: lifetimes(s.open(), attractors(s, echo=echo, **shared), **own), echo,
+        lambda s: lifetimes(s.cube(), attractors(s, echo=echo, **shared), **own), echo,
     )  # fmt: skip
 
 
@@ -372,11 +338,11 @@ def chaos(directory: Source, *, echo: Echo | None = None, **options: Any) -> xr.
     from pipeline.analysis.chaos.chaos import chaos as compute
     from pipeline.analysis.chaos.chaos import check_chaos
 
-    snapshot = Snapshot.of(directory)
+    snapshot = Run.open(directory)
     wanted = _with_defaults("chaos", options, chaos_defaults())
     with _refused(snapshot):
-        check_chaos(snapshot.open(), **wanted)
-    return derive(snapshot, "chaos", wanted, lambda s: compute(s.open(), **wanted), echo)
+        check_chaos(snapshot.cube(), **wanted)
+    return derive(snapshot, "chaos", wanted, lambda s: compute(s.cube(), **wanted), echo)
 
 
 def chaos_defaults() -> dict[str, Any]:
@@ -413,16 +379,16 @@ def dimension(
     from pipeline.analysis.chaos.chaos import check_dimension, section_dimension
     from pipeline.analysis.selection import select_points
 
-    snapshot = Snapshot.of(directory)
+    snapshot = Run.open(directory)
     wanted = _with_defaults("dimension", options, dimension_defaults())
     with _refused(snapshot):
-        check_dimension(snapshot.open(), at=at, **wanted)
-        part = select_points(snapshot.open(), at)
+        check_dimension(snapshot.cube(), at=at, **wanted)
+        part = select_points(snapshot.cube(), at)
     # the values that the axes have: another spelling of a point is the same product
     chosen = {name: float(part[name].values[0]) for name in at or {}}
     return derive(
         snapshot, "dimension", {"at": chosen, **wanted},
-        lambda s: section_dimension(s.open(), at=chosen, **wanted), echo,
+        lambda s: section_dimension(s.cube(), at=chosen, **wanted), echo,
     )  # fmt: skip
 
 
@@ -434,7 +400,7 @@ def dimension_defaults() -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _refused(snapshot: Snapshot) -> Iterator[None]:
+def _refused(snapshot: Run) -> Iterator[None]:
     """Turn what an analysis refuses into a sentence with the directory's name."""
     try:
         yield
@@ -442,14 +408,14 @@ def _refused(snapshot: Snapshot) -> Iterator[None]:
         raise SpecError([f"{snapshot.info.directory}: {error}"]) from None
 
 
-def _identify(snapshot: Snapshot, options: Mapping[str, Any]) -> xr.Dataset:
+def _identify(snapshot: Run, options: Mapping[str, Any]) -> xr.Dataset:
     from pipeline.analysis.attractors.attractors import Rule, identify
 
     own = {name: value for name, value in options.items() if not name.startswith("rule_")}
     rule = {name.removeprefix("rule_"): value for name, value in options.items() if name not in own}
     if not own["tolerance"]:
         del own["tolerance"]
-    return identify(snapshot.open(), rule=Rule(**rule), **own)
+    return identify(snapshot.cube(), rule=Rule(**rule), **own)
 
 
 _NO_OPTIONS = frozenset({"block_bytes"})
@@ -517,24 +483,24 @@ def stale(source: Source) -> list[Path]:
     A leftover is what a process that was killed had begun to write; one younger than an hour may
     belong to a process at work and is not listed.
     """
-    snapshot = Snapshot.of(source)
-    folder = snapshot.info.directory / store.DERIVED
+    snapshot = Run.open(source)
+    folder = snapshot.info.directory / DERIVED
     now = {"cube_digest": snapshot.digest, "analysis_version": analysis_version()}
 
     def is_stale(path: Path) -> bool:
         try:
-            attrs = store.read_product_attrs(path)
-        except store.DamagedError:
+            attrs = read_product_attrs(path)
+        except DamagedError:
             return True
         return any(attrs.get(name) != value for name, value in now.items())
 
-    products = [path for path in sorted(folder.glob("*.zarr")) if is_stale(path)]
-    return products + store.leftover_products(folder, older_than=_LEFTOVER_SECONDS)
+    products = [path for path in product_paths(folder) if is_stale(path)]
+    return products + leftover_products(folder, older_than=_LEFTOVER_SECONDS)
 
 
 def prune(source: Source) -> list[Path]:
     """Remove what `stale` lists; returns it."""
     found = stale(source)
     for path in found:
-        store.remove_product(path)
+        remove_product(path)
     return found

@@ -121,4 +121,4 @@ def test_differences__key_by_key():
     new = {"a": {"b": 1.0, "c": [1, 3]}, "e": 5}
     lines = differences(old, new)
     assert [line.split(":")[0] for line in lines] == ["a.c", "d", "e"]
-    assert lines[0] == "a.c: [1.0, 2.0] in the directory, [1.0, 3.0] now"
+    assert lines[0] == "a.c: [1, 2] in the directory, [1, 3] now"

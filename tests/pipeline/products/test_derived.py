@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.products.derived import Snapshot, attractors, derive
+from pipeline.products.derived import attractors, derive
 from pipeline.spec.problems import SpecError
 from pipeline.store import directory as store
+from pipeline.store.run import Run
 
 QUICK = {"polish": False, "rule_n_anchors": 16}
 
@@ -33,7 +34,7 @@ class Counted:
 
     def __call__(self, snapshot):
         self.calls += 1
-        ds = snapshot.open()
+        ds = snapshot.cube()
         words = ("row", ["left", "right", "left"], {"long_name": "words"})
         return xr.Dataset(
             {
@@ -64,7 +65,7 @@ def test_derive__the_second_call_computes_nothing(whole):
 
 def test_derive__returns_what_was_computed(whole):
     compute = Counted()
-    expected = compute(Snapshot.of(whole.info.directory))
+    expected = compute(Run.open(whole.info.directory))
     found = derive(whole.info.directory, "mean", {}, compute)
     assert set(found.coords) == set(expected.coords)
     for name in expected.variables:
@@ -99,7 +100,7 @@ def test_derive__other_options_and_further_cells_compute_again(made):
     assert compute.calls == 3
     assert not after["mean"].equals(before["mean"])
     assert len(products(made)) == 3
-    store.withdraw(made.info, [1])
+    store.withdraw(made.info, ["000001.json"])
     xr.testing.assert_identical(derive(directory, "mean", {"a": 1}, compute), before)
     assert compute.calls == 3
 
@@ -116,10 +117,10 @@ def test_derive__other_code_computes_again(whole, monkeypatch):
 
 def test_snapshot__does_not_see_later_commits(made):
     made.commit(0)
-    snapshot = Snapshot.of(made.info.directory)
+    snapshot = Run.open(made.info.directory)
     made.commit(1)
-    assert int((snapshot.open()["status"] > 0).sum()) == made.plan.cells_in(0)
-    assert int((Snapshot.of(made.info.directory).open()["status"] > 0).sum()) > made.plan.cells_in(0)
+    assert int((snapshot.cube()["status"] > 0).sum()) == made.plan.cells_in(0)
+    assert int((Run.open(made.info.directory).cube()["status"] > 0).sum()) > made.plan.cells_in(0)
 
 
 def flip(path: Path):
