@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.layout import identity
 from pipeline.layout import plan as planning
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
@@ -50,6 +53,18 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
                 assert s.stop % c == 0 or s.stop == n
         size = np.dtype(variable.dtype).itemsize * np.prod(chunks)
         assert size <= planning.CHUNK_BYTES or chunks[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("n_points", "n_branches", "n_keep"), [(266, 16, 290), (400, 70, 300), (7, 3, 60_000)]
+)
+def test_chunks__ceil_of_a_ceil_stays_within_the_bound(n_points, n_branches, n_keep):
+    shape = (n_points, n_branches)
+    block = planning._block(shape, 0, 16)
+    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, n_keep, 1.0)
+    for variable in VARIABLES:
+        chunks = plan.chunks(variable)
+        assert np.dtype(variable.dtype).itemsize * np.prod(chunks) <= planning.CHUNK_BYTES or chunks[0] == 1
 
 
 def test_make_plan__multiples_of_lanes_and_sizes():
@@ -114,6 +129,63 @@ def test_identity__what_counts(sweep_text):
         ("rtol = 1e-6", "rtol = 1e-7"),
     ]:
         assert digest(sweep_text.replace(old, new)) != same
+
+
+def test_digest_of__numbers_without_loss():
+    assert digest_of({"seed": 2**53 + 1}) != digest_of({"seed": 2**53})
+    assert digest_of({"seed": 2**200 + 1}) != digest_of({"seed": 2**200})
+    assert digest_of({"a": 2, "b": [1.0]}) == digest_of({"a": 2.0, "b": [1]})
+    assert digest_of({"a": 0.0}) == digest_of({"a": 0}) != digest_of({"a": -0.0})
+    assert digest_of({"a": 1}) != digest_of({"a": True})
+    assert differences({"seed": 2**53 + 1}, {"seed": 2**53})
+    assert not differences({"a": 2.0}, {"a": 2})
+
+
+def test_identity__seeds_beyond_the_floats(walk_text):
+    def digest(seed):
+        spec = parse_spec(tomllib.loads(walk_text.replace("seed = 3", f"seed = {seed}")))
+        return digest_of(identity_of(spec, make_plan(spec), "k"))
+
+    assert digest(2**53) != digest(2**53 + 1)
+
+
+def test_identity__other_starts_under_the_same_specification(sweep_text, monkeypatch):
+    """Another version of what makes numbers of a specification is another run."""
+    spec = parse_spec(tomllib.loads(sweep_text))
+    before = identity_of(spec, make_plan(spec), "k")
+    original = identity.coordinates
+
+    def moved(spec):
+        found = list(original(spec))
+        i = next(i for i, c in enumerate(found) if c.name == "psi1_0")
+        found[i] = replace(found[i], values=found[i].values + 1e-15)
+        return tuple(found)
+
+    monkeypatch.setattr(identity, "coordinates", moved)
+    lines = differences(before, identity_of(spec, make_plan(spec), "k"))
+    assert [line.split(":")[0] for line in lines] == ["coordinates"]
+
+
+def test_identity__meaning_of_the_code(sweep_text, monkeypatch, tmp_path):
+    folder = tmp_path / "pipeline"
+    for name in identity.CODE:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / "pipeline" / name, folder / name)
+    monkeypatch.setattr(identity, "_PIPELINE", folder)
+
+    def version():
+        identity.code_version.cache_clear()
+        return identity.code_version()
+
+    before = version()
+    cells = folder / "layout/cells.py"
+    text = cells.read_text()
+    cells.write_text('"""Another first sentence."""\n# a comment\n' + text)
+    assert version() == before
+    assert "math.pi / 180" in text
+    cells.write_text(text.replace("math.pi / 180", "math.pi / 181"))
+    assert version() != before
+    identity.code_version.cache_clear()
 
 
 def test_differences__key_by_key():
