@@ -16,11 +16,13 @@ from magpend_core.meaning import meaning_digest
 from pipeline.layout.cells import coordinates
 from pipeline.layout.plan import Plan
 from pipeline.layout.schema import FORMAT, REFINEMENT
+from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec
 
 _PIPELINE = Path(__file__).parents[1]
-CODE = ("layout/cells.py", "compute/task.py", "compute/refinement.py", "products/lyapunov.py")
-"""Modules of the pipeline that decide a task's numbers; the numerical core has a version of its own."""
+CODE = ("layout.cells", "compute.task")
+"""Modules of the pipeline that decide the numbers of every task; those of refined grids and of products are
+added where they are used. The numerical core and the model have versions of their own."""
 
 
 def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
@@ -34,9 +36,10 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
         **({} if spec.refine is None else {"refinement": REFINEMENT}),
         "format": FORMAT,
         "kernel_version": kernel_version,
-        "code": code_version(),
+        "code": {name: code_version(name) for name in code_of(spec)},
         "spec": tables,
-        "parameter_values": spec.parameters.load().as_dict(),
+        "model_digest": spec.model.digest,
+        "parameter_values": spec.values.as_dict(),
         "coordinates": _coordinates_digest(spec),
         "chunks": {v.name: list(plan.chunks(v)) for v in plan.variables},
     }
@@ -53,10 +56,17 @@ def _coordinates_digest(spec: Spec) -> str:
     return digest.hexdigest()[:16]
 
 
+def code_of(spec: Spec) -> list[str]:
+    """Modules of the pipeline that decide the numbers of a run's tasks."""
+    products = [CELL_PRODUCTS[name].compute.partition(":")[0] for name in spec.products]
+    refined = ["compute.refinement"] if spec.refine is not None else []
+    return [*CODE, *refined, *(module.removeprefix("pipeline.") for module in products)]
+
+
 @lru_cache
-def code_version() -> str:
-    """Digest of the meaning of `CODE`."""
-    return meaning_digest(_PIPELINE / name for name in CODE)
+def code_version(module: str) -> str:
+    """Digest of the meaning of a module of the pipeline; see `magpend_core.meaning`."""
+    return meaning_digest([_PIPELINE / f"{module.replace('.', '/')}.py"])
 
 
 def canonical(data: Any) -> str:

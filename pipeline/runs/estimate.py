@@ -11,13 +11,12 @@ import itertools
 import math
 import time
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell, seconds_per_period
-from pipeline.spec.parsing import GridStarts, Spec
+from pipeline.spec.parsing import Spec
 
 BRANCHES, POINTS = 32, 4
 """Size of the sample: two groups of lanes, and of a continuation some points of each branch."""
@@ -50,19 +49,6 @@ class Estimate:
     compiled_s: float
 
 
-class _Sample:
-    """Stands for a `CellMap` whose only block is the sample."""
-
-    def __init__(self, inputs: Inputs) -> None:
-        self._inputs = inputs
-
-    def inputs(self, block: Any) -> Inputs:
-        return self._inputs
-
-    def outputs(self, block: Any, values: np.ndarray) -> np.ndarray:
-        return values
-
-
 def estimate(spec: Spec, plan: Plan) -> Estimate:
     """Measure what a run takes on one core of this machine; a second or two, and compiling before.
 
@@ -72,8 +58,8 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
     from pipeline.compute.task import warm_up
 
     compiled_s = warm_up(spec)
-    spec = _plain(spec)
     most, products = periods_per_cell(spec)
+    spec = replace(spec, products={})
     inputs = _sample(spec, plan, np.random.default_rng(0), pairs=False)
     ratio, measured, seconds = _speed(spec, inputs, most)
     how = f"measured: {inputs.frequency_hz.size} of its cells over {measured} periods, {seconds:.1f} s"
@@ -83,14 +69,6 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
         how += f"; a cell takes {periods:.0f} of at most {most:.0f} periods until it has closed"
     per_cell = ratio * mean_seconds_per_period(spec) * (periods + products)
     return Estimate(per_cell * plan.n_cells, how, compiled_s)
-
-
-def _plain(spec: Spec) -> Spec:
-    """The specification without what works on whole tiles: a sample is none."""
-    starts = spec.initial_conditions
-    if isinstance(starts, GridStarts):
-        starts = starts.model_copy(update={"refine": None})
-    return replace(spec, initial_conditions=starts, products=type(spec.products)())
 
 
 def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, *, pairs: bool) -> Inputs:
@@ -151,19 +129,19 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
 
 def _integrate(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[dict[str, np.ndarray], float]:
     """Integrate the sample for some periods without stopping; the variables, and the processor's time [s]."""
-    from pipeline.compute.task import compute
+    from pipeline.compute.task import integrate
 
     integration = spec.integration.model_copy(
         update={"n_transient": n_periods - 1, "n_keep": 1, "stop_when_closed": False}
     )
     started = time.process_time()
-    values = compute(replace(spec, integration=integration), _Sample(inputs), ())  # type: ignore[arg-type]
+    values = integrate(replace(spec, integration=integration), inputs)
     return values, time.process_time() - started
 
 
 def _periods_until_closed(spec: Spec, plan: Plan, most: float) -> float:
     """Mean periods of a cell in a run that stops when orbits have closed."""
-    from pipeline.compute.task import compute
+    from pipeline.compute.task import integrate
 
     rng, counts = np.random.default_rng(1), []
     left = CLOSING_S
@@ -173,7 +151,7 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float) -> float:
         cap = int(min(most, max(CLOSING_S / by_rule, LEAST_PERIODS + spec.integration.n_keep)))
         integration = spec.integration.model_copy(update={"n_transient": cap - spec.integration.n_keep})
         started = time.process_time()
-        values = compute(replace(spec, integration=integration), _Sample(inputs), ())  # type: ignore[arg-type]
+        values = integrate(replace(spec, integration=integration), inputs)
         left -= time.process_time() - started
         periods = values["n_periods"]
         counts.append(periods[:, 1::2] if periods.shape[1] > 1 else periods)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from pipeline.analysis.vocabulary import GRID_DIMS, START_DIMS
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate
 from pipeline.runs.progress import duration, size
 from pipeline.runs.run import identity_here
@@ -20,9 +20,9 @@ from pipeline.store.setup import check
 
 def first_figure(plan: Plan) -> str:
     """Name of the figure of ``magpend plot`` that shows a run as a whole."""
-    swept = [d for d in plan.dims if d not in START_DIMS]
+    swept = [d for d in plan.dims if not is_start_dim(d)]
     long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
-    n_swept, n_grid = (sum(d in names for d in long) for names in (swept, GRID_DIMS))
+    n_swept, n_grid = sum(d in swept for d in long), sum(is_grid_dim(d) for d in long)
     if n_swept >= 2:
         return "regimes"
     if n_swept == 0 and n_grid >= 2:

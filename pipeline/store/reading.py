@@ -33,9 +33,9 @@ def open_run(path: str | Path | Run, *, chunks: Any = None) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        With the specification's TOML text, the settings of the integration by name, those of the
-        exponents as ``lyapunov_<name>``, and what made it (``source``, ``created``, ``host``,
-        ``git_commit``) in the attributes. It can be written as NetCDF.
+        With the model's name, the specification's TOML text, the settings of the integration by name,
+        those of products as ``<product>_<name>`` (such as ``lyapunov_n_periods``), and what made it
+        (``source``, ``created``, ``host``, ``git_commit``) in the attributes. It can be written as NetCDF.
 
     Raises
     ------
@@ -68,18 +68,19 @@ def cube_of(run: Run, *, chunks: Any = None) -> xr.Dataset:
 
 def _attributes(run: Run) -> dict[str, Any]:
     """What an opened cube says of itself."""
-    info, lyapunov = run.info, run.spec.products.lyapunov
+    info = run.info
     attrs: dict[str, Any] = {
         "title": info.title,
         "source": f"magpend {info.versions.get('magpend', '(not installed)')}, "
         f"kernel {info.identity['kernel_version']}",
         **info.provenance,
         "kind": run.plan.kind,
+        "model": run.spec.model_name,
         "spec": info.spec_text,
         "digest": info.digest,
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
         **run.spec.integration.model_dump(),
-        **{f"lyapunov_{k}": v for k, v in (lyapunov.model_dump() if lyapunov else {}).items()},
+        **{f"{name}_{k}": v for name, o in run.spec.products.items() for k, v in o.plain().items()},
     }
     if run.plan.path is not None:
         attrs["path"] = run.plan.dims[run.plan.path]

@@ -17,6 +17,9 @@ from pipeline.store.skeleton import check_skeleton
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magpend_core.models.model import Model
+    from magpend_core.models.parameters import Parameters
+
 
 @dataclass(frozen=True)
 class Run:
@@ -69,6 +72,16 @@ class Run:
     def directory(self) -> Path:
         """Where it is."""
         return self.info.directory
+
+    @property
+    def model(self) -> Model:
+        """What was integrated."""
+        return self.spec.model
+
+    @property
+    def parameters(self) -> Parameters:
+        """The model's parameters, but for those that are swept."""
+        return self.spec.values
 
     @property
     def complete(self) -> bool:

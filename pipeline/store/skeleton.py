@@ -18,7 +18,7 @@ from zarr.storage import MemoryStore
 from pipeline.layout.cells import Coordinate, coordinates
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import Plan
-from pipeline.layout.schema import LINKS, STATE_UNITS, STATES
+from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec
 from pipeline.store.arrays import create_array, write_whole
 from pipeline.store.errors import DamagedError
@@ -34,12 +34,13 @@ def skeleton_files(
     """Content by key of all files of an empty cube; the group's own metadata come first."""
     attrs = {
         "kind": plan.kind,
+        "model": spec.model_name,
         "Conventions": "CF-1.11",
         "title": title,
         "spec": spec_text,
         "digest": digest_of(identity),
     }
-    found = [*coordinates(spec), *_labels(plan)]
+    found = [*coordinates(spec), *_labels(spec)]
     data: dict[str, Any] = {}
     store = MemoryStore(data)
     names = " ".join(sorted(c.name for c in found if c.dims != (c.name,)))
@@ -60,21 +61,28 @@ def skeleton_files(
     return {key: data[key].to_bytes() for key in keys}
 
 
-def _labels(plan: Plan) -> list[Coordinate]:
-    """Names of states and links, numbers of exponents."""
+def _labels(spec: Spec) -> list[Coordinate]:
+    """Names along the dims that are not cell dims."""
+    model = spec.model
     found = [
-        Coordinate("state", ("state",), _texts(STATES), {"long_name": "component of the state"}),
-        Coordinate("state_units", ("state",), _texts(STATE_UNITS), {"long_name": "unit of the component"}),
-        Coordinate("link", ("link",), _texts(LINKS), {"long_name": "link, by its angle"}),
+        Coordinate("state", ("state",), _values(model.state_names), {"long_name": "component of the state"}),
+        Coordinate(
+            "state_units", ("state",), _values(model.state_units), {"long_name": "unit of the component"}
+        ),
     ]
-    if plan.lyapunov is not None:
-        numbers = np.arange(1, plan.sizes["exponent"] + 1, dtype=np.int32)
-        found.append(Coordinate("exponent", ("exponent",), numbers, {"long_name": "number of the exponent"}))
+    if model.angles:
+        dim = model.angle_dim
+        found.append(Coordinate(dim, (dim,), _values(model.angles), {"long_name": "by its angle"}))
+    for name, options in spec.products.items():
+        for dim, values in CELL_PRODUCTS[name].coordinates(options, model).items():
+            found.append(Coordinate(dim, (dim,), _values(values)))
     return found
 
 
-def _texts(words: Iterable[str]) -> np.ndarray:
-    return np.array(list(words), dtype=object)
+def _values(labels: Iterable[Any]) -> np.ndarray:
+    """Words, or whole numbers."""
+    values = list(labels)
+    return np.array(values, dtype=object if isinstance(values[0], str) else np.int32)
 
 
 def entries_of(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:

@@ -115,7 +115,7 @@ def lanes(case: Case, n_keep: int = 1) -> Outcome:
 @contextmanager
 def no_limiter() -> Iterator[None]:
     """Let the engine's step limiter allow any step; what it computes for that stays."""
-    module = importlib.import_module("magpend_core.sections")
+    module = importlib.import_module("magpend_core.engine.entry")
     slack = module.SLACK
     module.SLACK = 1e30
     try:
@@ -284,7 +284,7 @@ def title_of(case: Case) -> str:
     return (
         f"{target()} ({numba.config.CPU_NAME or llvmlite.binding.get_host_cpu_name()}): "
         f"{len(case.initial)} trajectories, {case.n_periods} periods at {case.frequency_hz:g} Hz, "
-        f"tolerance {case.tolerance:.0e}, eps_drive {case.parameters.drive.eps_drive:g}"
+        f"tolerance {case.tolerance:.0e}, eps_drive {case.parameters['eps_drive']:g}"
     )
 
 

@@ -16,8 +16,8 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.pendulum.parameters import Parameters, load_preset
-from magpend_core.models.pendulum.systems import PENDULUM_FITTED, system_of
+from magpend_core.models.parameters import Parameters
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors.bounded import Clouds, Rule, assign, find_sets
 from pipeline.analysis.attractors.features import Cells, Features
@@ -43,7 +43,7 @@ from pipeline.analysis.attractors.orbits import (
     run_on,
 )
 from pipeline.analysis.sets import Geometry, hashes, order_by_points
-from pipeline.analysis.vocabulary import BOUNDED_SET, CLOSED_ORBIT, START_DIMS
+from pipeline.layout.vocabulary import BOUNDED_SET, CLOSED_ORBIT, is_start_dim, parameters_of
 
 ROUNDS, ROUNDS_LOOSE = 3, 6
 """Most rounds of guessing and polishing, with a strict and a loose tolerance."""
@@ -124,30 +124,13 @@ class Found:
     counts: list[int]
 
 
-def parameters_of(ds: xr.Dataset) -> Parameters:
-    """Parameters that a run's attribute ``parameters`` tells, a line ``name = value`` for each.
-
-    Raises
-    ------
-    ValueError
-        If it is not there.
-    """
-    lines = str(ds.attrs.get("parameters", "")).splitlines()
-    values = {name.strip(): float(value) for name, _, value in (line.partition("=") for line in lines)}
-    if not values:
-        raise ValueError(
-            "The dataset has no attribute 'parameters'; give parameters, or set polish to False."
-        )
-    return load_preset().replace(**values)
-
-
 def engine_inputs(
     ds: xr.Dataset, parameters: Parameters | np.ndarray | None, system: System | None, *, needed: bool
 ) -> tuple[Parameters | np.ndarray | None, System]:
     """Parameters and system: those given, else those of the run."""
     base = parameters_of(ds) if parameters is None and needed else parameters
     if system is None:
-        system = system_of(base) if isinstance(base, Parameters) else PENDULUM_FITTED
+        system = base.model.system if isinstance(base, Parameters) else PENDULUM_FITTED
     return base, system
 
 
@@ -164,7 +147,7 @@ def slabs(
     """Parameter points, some at a time: what fits is loaded at once, since chunks span many points."""
     names = [n for n in ("section", "status", "orbit_period", "turns") if n in ds]
     cube = ds[names].reset_coords(drop=True) if "frequency" in ds.dims else ds[names]
-    dims = [str(d) for d in ds["status"].dims if d not in START_DIMS]
+    dims = [str(d) for d in ds["status"].dims if not is_start_dim(str(d))]
     shape = [ds.sizes[d] for d in dims]
     per_point = ds["section"].size * 8 // max(math.prod(shape), 1)
     cell = 8 * math.prod(ds.sizes[d] for d in ("period_index", "state"))

@@ -60,7 +60,7 @@ import xarray as xr
 from scipy.stats import chi2
 
 from magpend_core.engine.system import System
-from magpend_core.models.pendulum.parameters import Parameters
+from magpend_core.models.parameters import Parameters
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.attractors.identify import BUDGET, Point, engine_inputs, slabs
@@ -78,7 +78,7 @@ from pipeline.analysis.attractors.orbits import (
     polish,
 )
 from pipeline.analysis.sets import Geometry
-from pipeline.analysis.vocabulary import BOUNDED_SET, split_dims
+from pipeline.layout.vocabulary import BOUNDED_SET, split_dims
 
 LEG = 64
 """Drive periods between two looks at where the cells are."""

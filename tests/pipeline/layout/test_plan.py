@@ -14,12 +14,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from magpend_core.models import load_model
 from pipeline.layout import identity
 from pipeline.layout import plan as planning
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.schema import VARIABLES
+from pipeline.layout.schema import base_variables, sizes_of
 from pipeline.spec.parsing import parse_spec
+
+VARIABLES = base_variables(load_model())
+
+
+def sizes(n_keep):
+    return sizes_of(load_model(), {}, n_keep)
+
 
 ROOT = Path(__file__).parents[3]
 
@@ -30,7 +38,7 @@ SHAPES = st.lists(st.integers(1, 9), min_size=0, max_size=4)
 def test_tasks__every_cell_in_one_task(shape, wanted, data):
     path = data.draw(st.sampled_from([None, *range(len(shape))]))
     block = planning._block(tuple(shape), path, wanted)
-    plan = Plan("sweep", tuple("abcd"[: len(shape)]), tuple(shape), path, block, 3, 1.0)
+    plan = Plan("sweep", tuple("abcd"[: len(shape)]), tuple(shape), path, block, VARIABLES, sizes(3), 1.0)
     seen = np.zeros(shape, dtype=int)
     for task in plan.tasks():
         seen[task] += 1
@@ -44,7 +52,7 @@ def test_tasks__every_cell_in_one_task(shape, wanted, data):
 def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
     shape = (n_points, n_branches)
     block = planning._block(shape, 0, 16)
-    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, n_keep, 1.0)
+    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, VARIABLES, sizes(n_keep), 1.0)
     for variable in VARIABLES:
         chunks = plan.chunks(variable)
         for task in plan.tasks():
@@ -61,7 +69,7 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
 def test_chunks__ceil_of_a_ceil_stays_within_the_bound(n_points, n_branches, n_keep):
     shape = (n_points, n_branches)
     block = planning._block(shape, 0, 16)
-    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, n_keep, 1.0)
+    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, VARIABLES, sizes(n_keep), 1.0)
     for variable in VARIABLES:
         chunks = plan.chunks(variable)
         assert np.dtype(variable.dtype).itemsize * np.prod(chunks) <= planning.CHUNK_BYTES or chunks[0] == 1
@@ -166,16 +174,15 @@ def test_identity__other_starts_under_the_same_specification(sweep_text, monkeyp
     assert [line.split(":")[0] for line in lines] == ["coordinates"]
 
 
-def test_identity__meaning_of_the_code(sweep_text, monkeypatch, tmp_path):
+def test_code_version__changes_with_its_meaning(monkeypatch, tmp_path):
     folder = tmp_path / "pipeline"
-    for name in identity.CODE:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / "pipeline" / name, folder / name)
+    (folder / "layout").mkdir(parents=True)
+    shutil.copy(ROOT / "pipeline/layout/cells.py", folder / "layout")
     monkeypatch.setattr(identity, "_PIPELINE", folder)
 
     def version():
         identity.code_version.cache_clear()
-        return identity.code_version()
+        return identity.code_version("layout.cells")
 
     before = version()
     cells = folder / "layout/cells.py"
@@ -186,6 +193,16 @@ def test_identity__meaning_of_the_code(sweep_text, monkeypatch, tmp_path):
     cells.write_text(text.replace("math.pi / 180", "math.pi / 181"))
     assert version() != before
     identity.code_version.cache_clear()
+
+
+def test_identity__code_of_what_is_computed(sweep_text):
+    """A product that a run does not ask for bars nobody from completing it."""
+    plain = parse_spec(tomllib.loads(sweep_text))
+    spectra = parse_spec(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
+    assert identity.code_of(plain) == ["layout.cells", "compute.task"]
+    assert identity.code_of(spectra) == ["layout.cells", "compute.task", "compute.exponents"]
+    lines = differences(*(identity_of(s, make_plan(s), "k") for s in (plain, spectra)))
+    assert any(line.startswith("code.compute.exponents: (absent)") for line in lines)
 
 
 def test_differences__key_by_key():
