@@ -13,7 +13,7 @@ import pytest
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
 from pipeline.runs import run as runs
-from pipeline.runs.run import first_figure
+from pipeline.runs.preview import first_figure
 from pipeline.spec.parsing import parse_spec
 
 BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
