@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from pipeline.products.derived import prune
 
 from pipeline import open_run
 from pipeline.compute import execute, task
+from pipeline.runs.derive import prune
 from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import run
 from pipeline.runs.status import state
