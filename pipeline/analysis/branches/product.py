@@ -1,0 +1,109 @@
+"""Branches and curves as analyses of a run (`pipeline.products.branches`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, parameters_of
+from pipeline.products.branches import BranchOptions, CurveOptions
+
+if TYPE_CHECKING:
+    from pipeline.store.run import Run
+
+LEAST_PERIOD = 4
+"""Branches of twice the period are followed up to this one, however short the orbits of the run are."""
+
+
+def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
+    """Complete the interval from the run's axis; refuse an empty one."""
+    low, high = _interval(run, options.parameter, options.low, options.high)
+    return options.model_copy(update={"low": low, "high": high})
+
+
+def branches(run: Any, options: BranchOptions) -> xr.Dataset:
+    """Branches of periodic orbits along a parameter, from the orbits that attract a run's cells."""
+    from pipeline.analysis.branches import Scope, attracting, dataset_of, explore, recurrent
+
+    cube, parameter = run.cube(), axis_name(options.parameter)
+    interval = low, high = _ends(options)
+    base = parameters_of(cube)
+    starts, left_out = attracting(run.derive("attractors"), base, parameter, interval, options.max_period)
+    longest = options.max_period or max([LEAST_PERIOD, *(s.family.period for s in starts)])
+    if options.recurrences:
+        found = recurrent(cube, base, parameter, high - low, min(options.recurrences, longest))
+        starts += [s for s in found if low <= s.value <= high]
+    run.echo(f"branches: {len(starts)} starting orbits, periods up to {longest}")
+    scope = Scope(low, high, longest, options.generations)
+    return dataset_of(explore(starts, scope), parameter, base, left_out)
+
+
+def _ends(options: BranchOptions) -> tuple[float, float]:
+    assert options.low is not None
+    assert options.high is not None
+    return options.low, options.high
+
+
+def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
+    """Complete the branches' interval; refuse a plane that is none."""
+    from pipeline.spec.problems import SpecError
+
+    settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
+    second = options.second
+    if axis_name(second) == axis_name(options.parameter):
+        raise SpecError([f"{second} is the branches' own parameter; give another one."])
+    if _axis(run, second) is not None:
+        raise SpecError(
+            [f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."]
+        )
+    _interval(run, second, options.second_low, options.second_high)
+    return settled
+
+
+def curves(run: Any, options: CurveOptions) -> xr.Dataset:
+    """Curves of the bifurcations located by `branches`, in the plane of its parameter and a second one."""
+    from pipeline.analysis.branches import curves_dataset, curves_from
+
+    located = run.derive("branches", **options.part(BranchOptions))
+    bounds = (_ends(options), (options.second_low, options.second_high))
+    second = axis_name(options.second)
+    base = parameters_of(run.cube())
+    found = curves_from(located, base, second, bounds, options.curve_period)
+    return curves_dataset(found, axis_name(options.parameter), second, base.model)
+
+
+def _axis(run: Run, parameter: str) -> xr.DataArray | None:
+    """The axis of a parameter that the run sweeps."""
+    axis = run.cube().coords.get(axis_name(parameter))
+    return axis if axis is not None and axis.ndim > 0 and axis.size > 1 else None
+
+
+def _interval(run: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
+    """Check the parameter and complete its interval from the run's axis."""
+    from pipeline.spec.problems import SpecError, unknown_name
+
+    base = parameters_of(run.cube())
+    is_frequency = axis_name(parameter) == FREQUENCY_DIM
+    if not is_frequency and parameter not in base.names:
+        raise SpecError([unknown_name("parameter", parameter, (*base.names, FREQUENCY_DIM))])
+    axis = _axis(run, parameter)
+    if axis is not None:
+        ends = float(axis.min()), float(axis.max())
+    elif low is None or high is None:
+        raise SpecError([f"the run does not sweep {parameter}; give the interval with --from and --to."])
+    else:
+        ends = low, high
+    chosen = (ends[0] if low is None else float(low), ends[1] if high is None else float(high))
+    if not chosen[0] < chosen[1]:
+        raise SpecError(
+            [
+                f"the interval {chosen[0]} to {chosen[1]} of {parameter} is empty; "
+                "--from must be less than --to."
+            ]
+        )
+    if is_frequency and chosen[0] <= 0.0:
+        raise SpecError([f"--from {chosen[0]}: a drive frequency must be greater than 0."])
+    for value in () if is_frequency else chosen:
+        base.replace(**{parameter: value})
+    return chosen

@@ -1,0 +1,100 @@
+"""What stands in a run directory, opened once: specification, plan, commits and cube."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.layout.plan import Plan, make_plan
+from pipeline.spec.parsing import Spec, parse_spec
+from pipeline.store.commits import Commit, cube_digest, read_commits
+from pipeline.store.runfile import RunInfo, read_run
+from pipeline.store.skeleton import check_skeleton
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magpend_core.models.model import Model
+    from magpend_core.models.parameters import Parameters
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run directory with what was committed at one moment, so that all results speak of the same cells.
+
+    Attributes
+    ----------
+    info : RunInfo
+        What ``run.json`` holds.
+    spec : Spec
+    plan : Plan
+    commits : dict
+        Valid commit records by task.
+    """
+
+    info: RunInfo
+    spec: Spec
+    plan: Plan
+    commits: Mapping[int, Commit]
+
+    @classmethod
+    def open(cls, source: str | Path | Run) -> Run:
+        """Return what stands in a run directory now; an opened run is returned as it is.
+
+        Metadata and coordinates are compared with the digests in ``run.json``; no cell is read.
+
+        Raises
+        ------
+        RefusedError
+            If there is no run in `source`.
+        DamagedError
+            If ``run.json``, metadata or coordinates are not what was written.
+        UnreadableError
+            If something is there and cannot be read.
+
+        Examples
+        --------
+        >>> run = Run.open("runs/quickstart")                                # doctest: +SKIP
+        >>> run.cube().section.sel(frequency=2.2, method="nearest")          # doctest: +SKIP
+        """
+        if isinstance(source, Run):
+            return source
+        info = read_run(source)
+        check_skeleton(info)
+        spec = parse_spec(info.spec)
+        plan = make_plan(spec)
+        return cls(info, spec, plan, read_commits(info, plan))
+
+    @property
+    def directory(self) -> Path:
+        """Where it is."""
+        return self.info.directory
+
+    @property
+    def model(self) -> Model:
+        """What was integrated."""
+        return self.spec.model
+
+    @property
+    def parameters(self) -> Parameters:
+        """The model's parameters, but for those that are swept."""
+        return self.spec.values
+
+    @property
+    def complete(self) -> bool:
+        """Whether every task is committed."""
+        return len(self.commits) == self.plan.n_tasks
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of the committed cells."""
+        return cube_digest(self.info, self.commits)
+
+    def cube(self, chunks: Any = None) -> xr.Dataset:
+        """Open the cube, as `pipeline.open_run` does."""
+        from pipeline.store.reading import cube_of
+
+        return cube_of(self, chunks=chunks)
