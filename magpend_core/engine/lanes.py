@@ -40,24 +40,18 @@ from magpend_core.engine.simd import (
     where_less,
 )
 from magpend_core.engine.system import System
+from magpend_core.engine.tableau import ERROR, N_STAGES, NODES, STAGES
 from magpend_core.engine.vecmath import TWO_PI, exp2_rough, hypot_rough, log2_rough
+from magpend_core.engine.watching import (
+    begin_watch,
+    evaluate_watched,
+    keep_extremes,
+    set_watching,
+    update_extremes,
+    watched_function,
+)
 from magpend_core.status import Status
 
-# Dormand and Prince, J. Comput. Appl. Math. 6 (1980) 19-26, RK5(4)7M
-NODES = np.array([0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0])
-STAGES = np.array(
-    [
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0],
-        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0],
-        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0],
-        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0],
-        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
-    ]
-)
-ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
-N_STAGES = 7
 ZERO: Any = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
 
 UNROLLED_STATES = 3
@@ -101,13 +95,21 @@ class Rows(NamedTuple):
     rejected: int  # rejected attempts in this cell
     attempts: int  # in this period
     event: int
+    halfway: int  # state in the middle of a step, if something is watched
+    begin: int  # watched quantities at the begin of the step, a row each; so below
+    middle: int
+    end: int
+    lowest: int  # in this period
+    highest: int
+    integral: int
     size: int
 
 
-def rows_of(system: System) -> Rows:
-    """Lay out a group for a system."""
+def rows_of(system: System, n_watched: int = 0) -> Rows:
+    """Lay out a group for a system of which `n_watched` quantities are watched."""
     counts = [
         system.n_states, N_STAGES * system.n_states, system.n_states, system.n_constants, *[1] * 18,
+        system.n_states if n_watched else 0, *[n_watched] * 6,
     ]  # fmt: skip
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
     return Rows(*(int(x) for x in offsets))
@@ -283,14 +285,23 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
 
 
 def attempt(
-    w: Any, events: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float
-) -> None:
-    """Advance all groups by one attempted step; `events` says which have a lane with an event."""
+    w: Any, events: Any, n_watching: Any, n_groups: int, slack: float, rtol: float, atol: float,
+    max_attempts: float,
+) -> None:  # fmt: skip
+    """Advance all groups by one attempted step.
+
+    `events` says afterwards which have a lane with an event; `n_watching` holds the number of lanes
+    of each that are in a period whose extremes are wanted.
+    """
     for group in range(n_groups):
         base = group * ROWS.size
         choose_step(w, base, slack)
         run_stages(w, base)
+        if WATCHES and n_watching[group] > 0:
+            evaluate_watched(w, base)
         events[group] = finish_step(w, base, rtol, atol, max_attempts)
+        if WATCHES and n_watching[group] > 0:
+            update_extremes(w, base)
 
 
 def load_cell(
@@ -402,6 +413,8 @@ class Work(NamedTuple):
     turns: Any  # int64 (lanes, n_states), since the branch's start
     edge_table: Any  # float64 (lanes, 3, n_edges): time [s], half-width [s], step_ratio
     memory: Any  # float64 (lanes, n_memory), the observer's own
+    watching: Any  # int64, 1 in a period whose extremes are wanted
+    n_watching: Any  # int64 per group: sum of the above
 
 
 class Cells(NamedTuple):
@@ -419,9 +432,10 @@ class Cells(NamedTuple):
     n_periods: Any  # int64
     n_steps: Any  # int64, accepted
     n_rejected: Any  # int64
+    watched: Any  # (..., n_keep, n_watched, 3), see `watching`; no numbers where nothing is watched
 
 
-def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any) -> None:
+def start_branch(cells: Cells, work: Work, lane: int, branch: int, settings: Any, scratch: Any) -> None:
     """Put a branch's initial state and first cell into a lane."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     for i in range(N):
@@ -429,7 +443,7 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any)
         work.lanes[w_at] = cells.state[branch, i]
         work.turns[lane, i] = 0
     work.branch[lane] = branch
-    start_point(cells, work, lane, ZERO, scratch)
+    start_point(cells, work, lane, ZERO, settings, scratch)
     # angles come in as given; from here on they are in (-pi, pi] at every section
     take_section(work.lanes, base, column, scratch, work.turns[lane])
     given = cells.step_size[branch]
@@ -437,7 +451,7 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any)
     work.lanes[base + ROWS.wish + column] = given if given > 0.0 else cautious
 
 
-def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -> None:
+def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, scratch: Any) -> None:
     """Begin the cell `point` of a lane's branch from the lane's state."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     branch = work.branch[lane]
@@ -452,6 +466,8 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -
     work.lanes[base + ROWS.fresh + column] = 1.0
     work.lanes[base + ROWS.after_rejection + column] = 0.0
     work.lanes[base + ROWS.event + column] = NOTHING
+    if WATCHES:
+        begin_watch(work, lane, keeps_next(0, work.memory[lane], settings))
 
 
 def has_failed(status: int) -> bool:
@@ -464,6 +480,8 @@ def forget(cells: Cells, branch: int, point: int) -> None:
     for i in range(cells.section.shape[2]):
         for k in range(N):
             cells.section[branch, point, i, k] = np.nan
+        if WATCHES:
+            cells.watched[branch, point, i] = np.nan
 
 
 def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
@@ -508,6 +526,8 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
         work.i_period[lane] += 1
         if take_section(w, base, column, section, work.turns[lane]):
             at = (work.branch[lane], work.point[lane])
+            if WATCHES and work.watching[lane] == 1:
+                keep_extremes(w, base, column, cells.watched[at][n_kept(work.memory[lane])])
             status = observe(
                 section, work.turns[lane], work.i_period[lane], work.memory[lane],
                 cells.section[at], cells.measures[at], settings,
@@ -516,6 +536,8 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
             status = DIVERGED
         if status == PENDING:
             work.edge[lane] = begin_period(w, base, column, work.edge_table[lane])
+            if WATCHES:
+                begin_watch(work, lane, keeps_next(work.i_period[lane], work.memory[lane], settings))
             return False
     elif not in_bounds(w, base, column):
         # a blow-up within a period shrinks the step before a section could show it
@@ -528,7 +550,7 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     if has_failed(status) or work.point[lane] + 1 == cells.frequency.shape[1]:
         end_branch(cells, work, lane, status)
         return True
-    start_point(cells, work, lane, work.point[lane] + 1, scratch)
+    start_point(cells, work, lane, work.point[lane] + 1, settings, scratch)
     return False
 
 
@@ -542,18 +564,19 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: 
         np.zeros(n_groups * ROWS.size), np.zeros(size, np.int64), np.zeros(size, np.int64),
         np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros((size, N), np.int64),
         np.zeros((size, 3, max(NE, 1))), np.zeros((size, memory_size(settings, N))),
+        np.zeros(size, np.int64), np.zeros(n_groups, np.int64),
     )  # fmt: skip
     scratch = np.zeros(max(NC, N))
     section = np.zeros(N)
     for lane in range(size):
         # lanes beyond the last branch repeat it, so that they hold ordinary numbers; no one looks
-        start_branch(cells, work, lane, min(lane, n_branches - 1), scratch)
+        start_branch(cells, work, lane, min(lane, n_branches - 1), settings, scratch)
     next_branch = active
     # a field of a tuple is counted by an atomic operation at every use: too slow per lane
     rows, events = work.lanes, np.zeros(n_groups, np.bool_)
     while active > 0:
         in_use = (active + WIDTH - 1) // WIDTH
-        attempt(rows, events, in_use, cells.slack, rtol, atol, max_attempts)
+        attempt(rows, events, work.n_watching, in_use, cells.slack, rtol, atol, max_attempts)
         for group in range(in_use):
             if not events[group]:
                 continue
@@ -563,7 +586,7 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: 
                 if event == NOTHING or not serve(cells, work, lane, settings, section, scratch):
                     lane += 1
                 elif next_branch < n_branches:
-                    start_branch(cells, work, lane, next_branch, scratch)
+                    start_branch(cells, work, lane, next_branch, settings, scratch)
                     next_branch += 1
                     lane += 1
                 else:
@@ -587,11 +610,15 @@ def copy_lane(work: Work, source: int, target: int) -> None:
             work.edge_table[target, k, i] = work.edge_table[source, k, i]
     for i in range(work.memory.shape[1]):
         work.memory[target, i] = work.memory[source, i]
+    if WATCHES:
+        set_watching(work, target, work.watching[source])
+        set_watching(work, source, 0)
 
 
 _INLINE = (
     "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period",
     "in_bounds", "take_section", "renew_state", "move_lane", "has_failed",
+    "evaluate_watched", "update_extremes", "keep_extremes", "set_watching", "begin_watch",
 )  # fmt: skip
 _CALLED = (
     "choose_step", "run_stage", "run_stages", "finish_step", "attempt",
@@ -599,11 +626,20 @@ _CALLED = (
 )  # fmt: skip
 
 
-def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
+def _name(system: System, observer: Observer, watched: tuple[int, ...]) -> str:
+    return "_".join([system.label, observer.name, *(["watch"] if watched else []), *map(str, watched)])
+
+
+def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> dict[str, Any]:
     """Names that the templates of this module use, bound to a system and an observer."""
-    name = f"{system.label}_{observer.name}"
+    name = _name(system, observer, watched)
     bindings: dict[str, Any] = {
-        "ROWS": rows_of(system),
+        "ROWS": rows_of(system, len(watched)),
+        "WATCHES": len(watched) > 0,
+        "N_WATCHED": len(watched),
+        "watched_values": watched_function(system, watched),
+        "n_kept": observer.n_kept,
+        "keeps_next": observer.keeps_next,
         "N": system.n_states,
         "N_CONTROLLED": system.controlled,
         "NC": system.n_constants,
@@ -636,8 +672,11 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
 
 
 @cache
-def engine_of(system: System, observer: Observer) -> Callable[..., None]:
-    """Compile `advance` for a system and an observer."""
-    bindings = engine_bindings(system, observer)
+def engine_of(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> Callable[..., None]:
+    """Compile `advance` for a system and an observer, and for the quantities to be watched.
+
+    Those are given by their numbers in ``system.state_names + system.quantity_names``.
+    """
+    bindings = engine_bindings(system, observer, watched)
     cached = is_covered(*system.functions, observer.observe, observer.memory_size, observer.renew)
-    return kernel(specialise(advance, f"{system.label}_{observer.name}", **bindings), cached)
+    return kernel(specialise(advance, _name(system, observer, watched), **bindings), cached)
