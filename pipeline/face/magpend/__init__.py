@@ -57,7 +57,9 @@ def _analysis(name: str) -> Callable[..., Any]:
 
     analysis = ANALYSES[name]
     fields = analysis.options.model_fields
-    lines = [f"    {key} = {default_of(analysis.options, key)!r}: {fields[key].description}" for key in fields]
+    lines = [
+        f"    {key} = {default_of(analysis.options, key)!r}: {fields[key].description}" for key in fields
+    ]
     found.__name__ = found.__qualname__ = name
     found.__doc__ = "\n".join([analysis.help, "", "Options:", *lines])
     return found

@@ -147,6 +147,15 @@ def test_system__fills_in_what_is_left_out():
     assert hash(dataclasses.replace(RELAXATION)) == hash(RELAXATION)
 
 
+def test_system__takes_lists_and_whole_numbers(duffing):
+    listed = dataclasses.replace(
+        duffing, state_names=["x", "v"], is_angle=[0, np.False_], scales=np.array([1, 1]), escape=[1000, 1000]
+    )
+    assert listed == duffing
+    assert hash(listed) == hash(duffing)
+    assert listed.label == duffing.label
+
+
 def test_one_state__section_multiplier_and_exponent_are_the_closed_forms():
     rate, omega = 0.5, 1.0
     packed, frequency = np.array([[rate]] * 2), np.full(2, UNIT_FREQUENCY)
