@@ -28,9 +28,7 @@ def check_array(name: str, values: Any, ndim: int | tuple[int, ...]) -> np.ndarr
     return array
 
 
-def check_states(
-    values: Any, ndim: int | tuple[int, ...], n_states: int = 4, name: str = "state"
-) -> np.ndarray:
+def check_states(values: Any, ndim: int | tuple[int, ...], n_states: int, name: str = "state") -> np.ndarray:
     """Return states as an array whose last dimension has `n_states` entries.
 
     Raises
