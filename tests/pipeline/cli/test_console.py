@@ -60,8 +60,10 @@ def test_configure__quiet_verbose_and_log(capsys, tmp_path):
 def test_work__says_how_far_and_how_long():
     work = Work("polishing orbits", started=0.0)
     assert work.line(3.0) == "polishing orbits: 3.0 s so far"
-    work.done, work.total = 5.0, 20.0
+    work.done, work.total, work.heard = 5.0, 20.0, 10.0
     assert work.line(10.0) == "polishing orbits: 5 of 20 (25 %), 30 s left"
+    assert work.line(25.0) == "polishing orbits: 5 of 20 (25 %), 15 s left"
+    assert work.line(50.0) == "polishing orbits: 5 of 20 (25 %), 50 s so far"
     work.done = 20.0
     assert work.line(40.0) == "polishing orbits: 20 of 20 (100 %)"
 
