@@ -13,7 +13,7 @@ from typer.main import get_command
 from pipeline.cli import reference
 from pipeline.cli.main import app
 from pipeline.layout.vocabulary import FREQUENCY_DIM
-from pipeline.runs.run import shipped_workflows
+from pipeline.runs.workflows import shipped_workflows
 from pipeline.spec.parsing import parse_spec
 
 ROOT = Path(__file__).parents[1]

@@ -129,7 +129,7 @@ def _text(text: str) -> str:
 
 def workflows() -> str:
     """Specifications that ship."""
-    from pipeline.runs.run import shipped_workflows
+    from pipeline.runs.workflows import shipped_workflows
 
     def title(path: Path) -> str:
         return str(tomllib.loads(path.read_text("utf-8")).get("title", ""))

@@ -12,8 +12,8 @@ import pytest
 
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
-from pipeline.runs import run as runs
-from pipeline.runs.run import first_figure
+from pipeline.runs import preview, workflows
+from pipeline.runs.preview import first_figure
 from pipeline.spec.parsing import parse_spec
 
 BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
@@ -215,12 +215,12 @@ def test_presets__values_units_and_source(main):
 
 
 def test_find_spec__shipped_workflows():
-    shipped = runs.shipped_workflows()
+    shipped = workflows.shipped_workflows()
     assert "quickstart" in shipped
-    assert runs.find_spec("quickstart") == shipped["quickstart"]
+    assert workflows.find_spec("quickstart") == shipped["quickstart"]
     for path in shipped.values():
-        assert runs.describe_plan(path, os.devnull + "-absent")
-        assert runs.describe_plan(path, os.devnull + "-absent", smoke=True)
+        assert preview.describe_plan(path, os.devnull + "-absent")
+        assert preview.describe_plan(path, os.devnull + "-absent", smoke=True)
 
 
 def test_modules__each_library_has_one_room():
