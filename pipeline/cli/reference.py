@@ -57,7 +57,7 @@ def options() -> str:
     found, parts = dict(_commands()), []
     listed = {name: dict(_options(found[name])) for name in SHARED}
     for name, command in found.items():
-        own, also = dict(_options(command)), []
+        own, also = dict(_options(command)), list[str]()
         for other in SHARED:
             if other != name and listed[other].items() <= own.items() and not _covered(other, also):
                 also.append(f"`magpend {other}`")
