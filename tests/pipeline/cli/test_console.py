@@ -147,6 +147,40 @@ def test_completion__is_offered(main):
     assert "--install-completion" in main("--help")[1]
 
 
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("magpend analyse hy", "hysteresis"),
+        ("magpend plot ga", "gallery"),
+        ("magpend analyse basins --metric ch", "chessboard"),
+        ("magpend run quick", "quickstart"),
+        ("magpend models duff", "duffing"),
+    ],
+)
+def test_completion__completes_names(environment, line, word):
+    code = "import sys; sys.argv[0] = 'magpend'; from pipeline.cli.main import main; main()"
+    asked = {
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split()) - 1),
+        "_MAGPEND_COMPLETE": "complete_bash",
+    }
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**environment, **asked},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.stdout.split() == [word]
+
+
+def test_default_model__is_that_of_the_models():
+    from magpend_core.models import DEFAULT
+    from pipeline.cli import models
+
+    assert models.DEFAULT == DEFAULT
+
+
 def test_models__lists_states_parameters_and_presets(main):
     code, out, _ = main("models")
     assert code == 0
