@@ -48,6 +48,9 @@ class Sections:
     step_size : ndarray, (branch,)
         Step size that the error control would try next [s]: with `final_state` it continues a
         branch bit for bit.
+    extremes : ndarray, (..., n_keep, n_quantities, 3), or None
+        Least and largest value and mean of each watched quantity over the drive period that ends at the
+        section; NaN for cells that failed, None if nothing was watched.
     """
 
     section: np.ndarray
@@ -59,6 +62,7 @@ class Sections:
     n_rejected: np.ndarray
     final_state: np.ndarray
     step_size: np.ndarray
+    extremes: np.ndarray | None = None
 
 
 SLACK = 1e4

@@ -4,32 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from magpend_core import LyapunovExponents, Sections, Status, lyapunov_exponents
+from magpend_core import LyapunovExponents, Status, lyapunov_exponents
 from magpend_core.engine.lyapunov import MOST_LOSS
-from magpend_core.engine.system import System
-from pipeline.layout.schema import LYAPUNOV_VARIABLES, LyapunovFlag
-from pipeline.spec.parsing import STATES, Spec
+from pipeline.compute.task import Job
+from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag, LyapunovOptions
 
 AUDIT = 0.01
 """Largest allowed difference between the sum of the exponents and the divergence, in units of the sum of
 their moduli."""
 
 
-def exponents(
-    parameters: np.ndarray, frequency_hz: np.ndarray, cells: Sections, spec: Spec, system: System
-) -> dict[str, np.ndarray]:
+def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
     """Return `LYAPUNOV_VARIABLES` for the cells of a task.
 
     Parameters
     ----------
-    parameters, frequency_hz
-        As `run_branches` took them, shapes (branch, point, parameter) and (branch, point).
-    cells
-        What it returned.
-    spec
-        Specification with the product.
-    system
-        What is integrated.
+    job
+        The cells as they were integrated.
+    options
+        What is asked for.
 
     Returns
     -------
@@ -37,14 +30,12 @@ def exponents(
         Arrays with leading dims (branch, point). A cell without an attractor (diverged, step limit,
         unreached) has NaN and the flag ``ABSENT``.
     """
-    options = spec.products.lyapunov
-    assert options is not None
-    integration = spec.integration
+    cells, inputs, integration = job.cells, job.inputs, job.spec.integration
     branch, point = np.nonzero(np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED)))
     found = lyapunov_exponents(
-        parameters[branch, point], frequency_hz[branch, point], cells.section[branch, point, -1],
-        rtol=integration.rtol, atol=integration.atol,
-        max_steps_per_period=integration.max_steps_per_period, system=system, **options.model_dump(),
+        inputs.parameters[branch, point], inputs.frequency_hz[branch, point],
+        cells.section[branch, point, -1], rtol=integration.rtol, atol=integration.atol,
+        max_steps_per_period=integration.max_steps_per_period, system=job.system, **options.model_dump(),
     )  # fmt: skip
     is_closed = cells.status[branch, point] == Status.PERIODIC
     values = {
@@ -52,7 +43,7 @@ def exponents(
         "lyapunov_stderr": found.stderr,
         "lyapunov_blocks": found.blocks,
         "divergence": found.divergence,
-        "lyapunov_flag": flags(found),
+        "lyapunov_flag": flags(found, len(job.spec.model.states)),
     }
     filled = {}
     for variable in LYAPUNOV_VARIABLES:
@@ -66,10 +57,10 @@ def _falling(rates: np.ndarray) -> np.ndarray:
     return np.sort(rates, axis=1)[:, ::-1]
 
 
-def flags(found: LyapunovExponents) -> np.ndarray:
+def flags(found: LyapunovExponents, n_states: int) -> np.ndarray:
     """Codes of `LyapunovFlag`; only a whole spectrum can be held against the divergence."""
     flag = np.full(len(found.status), LyapunovFlag.GOOD, np.int8)
-    if found.exponents.shape[1] == len(STATES):
+    if found.exponents.shape[1] == n_states:
         missing = np.abs(found.exponents.sum(axis=1) - found.divergence)
         flag[missing > AUDIT * np.abs(found.exponents).sum(axis=1)] = LyapunovFlag.AUDIT_FAILED
     flag[found.loss > MOST_LOSS] = LyapunovFlag.UNRESOLVED

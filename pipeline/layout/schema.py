@@ -1,5 +1,4 @@
-"""The variables that every cube has. A new one is a new line in `VARIABLES`; those that a specification
-has to ask for stand with their product, in `pipeline.products`.
+"""The variables that every cube has, and those of its products, which stand in `pipeline.products`.
 
 Every variable has the cell dims of the run (swept parameters, initial conditions or branches) first,
 then its own.
@@ -8,10 +7,12 @@ then its own.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
+from magpend_core.models.model import Model
 from magpend_core.status import Status
-from pipeline.products.lyapunov import LYAPUNOV_VARIABLES as LYAPUNOV_VARIABLES
-from pipeline.products.lyapunov import LyapunovFlag as LyapunovFlag
+from pipeline.products.product import Options
+from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable, flag_attrs
 
 FORMAT = 1
@@ -20,17 +21,19 @@ FORMAT = 1
 REFINEMENT = 1
 """Version of what is inferred in refined grids (`pipeline.compute.refinement`); part of their identity."""
 
-STATES = ("psi1", "psi2", "psi1_dot", "psi2_dot")
-STATE_UNITS = ("rad", "rad", "rad/s", "rad/s")
-LINKS = ("psi1", "psi2")
+
+def base_variables(model: Model) -> tuple[Variable, ...]:
+    """Return the variables that every cube of a model has, in order."""
+    wrapped = ", angles wrapped to (-pi, pi]" if model.angles else ""
+    section = Variable(
+        "section", ("period_index", "state"), "float64", math.nan, "", f"state at {model.section}{wrapped}",
+        {"comment": "units of the components: see state_units"},
+    )  # fmt: skip
+    turns = Variable("turns", (model.angle_dim,), "int32", 0, "1", "full turns over the kept periods")
+    return (section, *([turns] if model.angles else []), *COUNTS)
 
 
-VARIABLES = (
-    Variable(
-        "section", ("period_index", "state"), "float64", math.nan, "rad, rad, rad/s, rad/s",
-        "state at the drive's rising edge, angles wrapped to (-pi, pi]",
-    ),
-    Variable("turns", ("link",), "int32", 0, "1", "full turns of the link over the kept periods"),
+COUNTS = (
     Variable("status", (), "int8", int(Status.PENDING), "1", "what became of the cell", flag_attrs(Status)),
     Variable("orbit_period", (), "int16", 0, "1", "period of the closed orbit [drive periods]; 0: none"),
     Variable("n_periods", (), "int32", 0, "1", "drive periods integrated in all"),
@@ -39,12 +42,15 @@ VARIABLES = (
 )  # fmt: skip
 
 
-def own_sizes(n_keep: int, n_exponents: int = 0, n_blocks: int = 0) -> dict[str, int]:
-    """Sizes of the dims that are not cell dims."""
-    return {
-        "period_index": n_keep,
-        "state": len(STATES),
-        "link": len(LINKS),
-        "exponent": n_exponents,
-        "block": n_blocks,
-    }
+def variables_of(model: Model, products: Mapping[str, Options]) -> tuple[Variable, ...]:
+    """Return the variables of a cube with these products."""
+    own = (CELL_PRODUCTS[name].variables(options, model) for name, options in products.items())
+    return (*base_variables(model), *(variable for variables in own for variable in variables))
+
+
+def sizes_of(model: Model, products: Mapping[str, Options], n_keep: int) -> dict[str, int]:
+    """Return the sizes of the dims that are not cell dims."""
+    sizes = {"period_index": n_keep, "state": len(model.states), model.angle_dim: len(model.angles)}
+    for name, options in products.items():
+        sizes |= CELL_PRODUCTS[name].sizes(options, model)
+    return sizes

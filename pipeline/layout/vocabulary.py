@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
+from pipeline.spec.tables import FREQUENCY
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from magpend_core.engine.system import System
-
-FREQUENCY = "frequency_hz"
-"""The drive's frequency among the parameters of a specification."""
 
 FREQUENCY_DIM = "frequency"
 """Its dim in a cube [Hz]."""

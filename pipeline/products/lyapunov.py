@@ -90,14 +90,32 @@ def _variables(options: LyapunovOptions, model: Any) -> tuple[Variable, ...]:
 
 
 def _sizes(options: LyapunovOptions, model: Any) -> dict[str, int]:
-    return {"exponent": options.n_exponents or len(model.states), "block": options.n_blocks}
+    return {"exponent": _settled(options, model).n_exponents or 0, "block": options.n_blocks}
+
+
+def _settled(options: LyapunovOptions, model: Any) -> LyapunovOptions:
+    n = len(model.states)
+    if options.n_exponents is not None and options.n_exponents > n:
+        raise ValueError(
+            f"n_exponents = {options.n_exponents}: must be at most {n}, the number of states of {model.name}."
+        )
+    return options.model_copy(update={"n_exponents": options.n_exponents or n})
+
+
+def _numbers(options: LyapunovOptions, model: Any) -> dict[str, Any]:
+    return {"exponent": range(1, (_settled(options, model).n_exponents or 0) + 1)}
 
 
 def _cost(options: LyapunovOptions) -> float:
     return TANGENT_COST * (options.n_transient + options.n_periods)
 
 
+def _shortest(options: LyapunovOptions) -> LyapunovOptions:
+    return options.model_copy(update={"n_transient": 0, "n_periods": 2, "n_blocks": 2})
+
+
 LYAPUNOV = CellProduct(
     "lyapunov", "Lyapunov exponents along each cell's attractor, with errors, convergence and an audit.",
     LyapunovOptions, _variables, _sizes, _cost, "pipeline.compute.exponents:exponents",
+    settle=_settled, coordinates=_numbers, shortest=_shortest,
 )  # fmt: skip

@@ -108,7 +108,17 @@ class CellProduct:
     cost : callable
         ``cost(options)``: what a cell takes, in drive periods of a plain integration.
     compute : str
-        ``"module:function"``, called by `pipeline.compute.task` with the options.
+        ``"module:function"``: ``compute(job, options)`` with a `pipeline.compute.task.Job`, the cells as they
+        were integrated; returns the variables, with leading dims (branch, point).
+    settle : callable
+        ``settle(options, model)``: the options with what follows from the model filled in; raises
+        ValueError with a sentence if they do not fit it.
+    coordinates : callable
+        ``coordinates(options, model)``: values of the product's own dims by name, where they have names.
+    integrate : callable
+        ``integrate(options)``: keywords of `magpend_core.run_branches` that the product needs.
+    shortest : callable
+        ``shortest(options)``: the options with the least work, for what is compiled ahead.
     """
 
     name: str
@@ -118,6 +128,10 @@ class CellProduct:
     sizes: Callable[[Any, Any], dict[str, int]]
     cost: Callable[[Any], float]
     compute: str
+    settle: Callable[[Any, Any], Any] = lambda options, model: options
+    coordinates: Callable[[Any, Any], dict[str, Sequence[Any]]] = lambda options, model: {}
+    integrate: Callable[[Any], dict[str, Any]] = lambda options: {}
+    shortest: Callable[[Any], Any] = lambda options: options
 
 
 @dataclass(frozen=True)

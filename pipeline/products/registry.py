@@ -40,6 +40,7 @@ CELL_PRODUCTS: Registry[CellProduct] = Registry(
     "product",
     {
         "lyapunov": "pipeline.products.lyapunov:LYAPUNOV",
+        "extremes": "pipeline.products.extremes:EXTREMES",
     },
 )
 

@@ -94,8 +94,8 @@ from pipeline.analysis.attractors.lifetimes import lifetimes
 from pipeline.analysis.attractors.matching import match
 from pipeline.analysis.attractors.orbits import DECISIONS
 from pipeline.analysis.sides import Side
-from pipeline.layout.schema import LyapunovFlag
 from pipeline.layout.vocabulary import BOUNDED_SET, parameters_of, split_dims
+from pipeline.products.lyapunov import LyapunovFlag
 
 __all__ = ["Rule", "hysteresis", "identify", "lifetimes", "match", "parameters_of"]
 
