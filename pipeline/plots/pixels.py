@@ -132,7 +132,7 @@ def _table(x: np.ndarray, y: np.ndarray, motion: np.ndarray, layer: np.ndarray, 
     ds = xr.Dataset(variables)
     if view.motions.told:
         words = view.motions.words
-        attrs = {"flag_values": np.arange(len(words), dtype=np.int8), "flag_meanings": " ".join(words)}
+        attrs = {"flag_values": np.arange(len(words), dtype=np.int8), "flag_meanings": " ".join(w.replace(" ", "_") for w in words)}
         ds["motion"] = ("point", motion.astype(np.int8), attrs)
     if view.layers != ("",):
         attrs = {

@@ -91,7 +91,7 @@ class View:
         there = block["status"].isin(DRAWN).values[..., None] & np.isfinite(y) & np.isfinite(x)
         spread = [
             np.broadcast_to(cells.transpose(*block["status"].dims).values[..., None], shape)[there]
-            for cells in (motion_codes(block), self.layer_index(block))
+            for cells in (self.kinds(block), self.layer_index(block))
         ]
         return Points(x[there], y[there], *spread)
 
@@ -99,6 +99,12 @@ class View:
         """Yield the points of the cube, block by block."""
         for block in self.blocks():
             yield self.points(block)
+
+    def kinds(self, block: xr.Dataset) -> xr.DataArray:
+        """Code of each cell's colour: of its attractor if that is marked, else of its motion."""
+        if "_kind" in block.coords:
+            return block["_kind"] + xr.zeros_like(block["status"], dtype=np.int32)
+        return motion_codes(block)
 
     def layer_index(self, block: xr.Dataset) -> xr.DataArray:
         """Index of the layer of each cell."""
