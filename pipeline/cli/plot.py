@@ -45,7 +45,6 @@ plot_app = typer.Typer(
 def draw(directory: Path, name: str, options: FigureOptions) -> None:
     """Draw a figure of a run, write it and the data drawn, and say where."""
     from pipeline.cli import console
-    from pipeline.products.product import function_of
     from pipeline.products.registry import FIGURES
     from pipeline.runs.derive import AnalysedRun, prepared, refused
 
@@ -55,14 +54,14 @@ def draw(directory: Path, name: str, options: FigureOptions) -> None:
     run = AnalysedRun.of(directory, console.note)
     wanted: Any = prepared(run, figure, options)
     target = _target_of(wanted) if wanted.out else _in_run(directory, name, wanted)
+    from pipeline.plots import draw_figure, save_data, save_figure
+
     with refused(directory):
-        drawn = function_of(figure.draw)(run, wanted)
-    from pipeline.plots import save_data, save_figure
+        drawn = draw_figure(run, name, wanted)
 
     target.parent.mkdir(exist_ok=True)
     console.result(f"figure: {save_figure(drawn, target)}")
-    if hasattr(drawn, "data"):
-        console.result(f"data: {save_data(drawn, target)}")
+    console.result(f"data: {save_data(drawn, target)}")
 
 
 def _target_of(options: FigureOptions) -> Path:

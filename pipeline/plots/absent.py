@@ -70,7 +70,7 @@ def say_empty(ax: Axes, survey: Survey, shown: str = "") -> None:
     elif sum(absent.values()) < n_cells:
         text = f"nothing to draw: no point lies {shown or 'here'}"
     size = style.look_of(ax).label
-    width = 0.8 * float(ax.figure.get_size_inches()[0])
+    width = 0.8 * style.figure_of(ax).frame.width_in
     ax.text(
         0.5, 0.5, style.folded(text, width, size), transform=ax.transAxes, ha="center", va="center",
         fontsize=size, zorder=3, bbox={"facecolor": "white", "edgecolor": "none", "pad": 5.0},

@@ -14,6 +14,8 @@ from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.vocabulary import CLOSED_ORBIT, INFERRED, model_of
 from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.products.figures import BasinFigureOptions
 
 _DARKEST = 0.62
 _OTHERS = -1
@@ -69,7 +71,8 @@ def plot_basins(
     fig, ax = palette.new_panel(_stored(data, part, cast), _entries(cast, counts, codes.size), frame, 4.7)
     scale = _scale(data, part)
     image = ax.imshow(
-        _painted(codes, data, part, cast, scale), origin="lower", extent=_extent(data, attractors, axes, degrees),
+        _painted(codes, data, part, cast, scale), origin="lower",
+        extent=_extent(data, attractors, axes, degrees),
         aspect="equal" if _is_square(data, attractors, axes) and not (frame.xlim or frame.ylim) else "auto",
         interpolation="nearest",
     )  # fmt: skip
@@ -230,3 +233,12 @@ def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Datase
     stored = stored.assign_coords(scalars)
     stored.attrs = {"title": "basins of attraction"}
     return stored
+
+
+def draw(run: Run, options: BasinFigureOptions) -> style.DataFigure:
+    """Draw the figure ``basins`` of a run."""
+    found = attractors_of(run, options)
+    at, notes = values_of(run, options, found)
+    times = run.cube()["n_periods"] if options.shade else None
+    figure = plot_basins(found, at=at, degrees=options.degrees, n_periods=times, frame=frame_of(options))
+    return noted(figure, notes)

@@ -17,9 +17,11 @@ from matplotlib.axes import Axes
 from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.absent import absent_handles, draw_absent, say_empty
+from pipeline.plots.door import Run, frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.plots.points import Survey, View, make_view, survey
 from pipeline.plots.selection import at_points
+from pipeline.products.figures import BifurcationOptions
 
 LAYOUTS = ("overlay", "side")
 EXTREMES = ("min", "max", "mean")
@@ -187,9 +189,8 @@ class Diagram:
     def draw(self, panels: Sequence[pixels.Panel]) -> xr.Dataset:
         """Draw the points into axes whose places are final, and return what was drawn."""
         width = 72.0 * self.frame.width_in * 0.88 / len(panels)
-        shown = np.count_nonzero(
-            (self.x >= min(panels[0].ax.get_xlim())) & (self.x <= max(panels[0].ax.get_xlim()))
-        )
+        left, right = panels[0].ax.get_xlim()
+        shown = np.count_nonzero((self.x >= min(left, right)) & (self.x <= max(left, right)))
         drawn = pixels.draw_points(panels, self.view, min(1.7, max(0.75, 0.8 * width / max(shown, 1))))
         axis = self.view.ds[self.parameter]
         drawn["x"].attrs = {"units": str(axis.attrs.get("units", "1")), "long_name": self.parameter}
@@ -216,9 +217,10 @@ def _section(ds: xr.Dataset, state: str, degrees: bool) -> tuple[Measure, Any]:
 def _extreme(ds: xr.Dataset, quantity: str, degrees: bool) -> tuple[Measure, Any]:
     """Measure of an extreme, and what takes it from a block."""
     if "extremes" not in ds:
+        wanted = quantity.rpartition(".")[0] or quantity
         raise ValueError(
             "the cube has no extremes of quantities; run it with "
-            f'[products] extremes = {{ quantities = ["{quantity.rpartition(".")[0] or quantity}"] }} in its specification'
+            f'[products] extremes = {{ quantities = ["{wanted}"] }} in its specification'
         )
     name, _, kind = quantity.rpartition(".")
     if kind not in EXTREMES or not name:
@@ -276,3 +278,14 @@ def _panels(fig: style.DataFigure, diagram: Diagram, layers: Sequence[tuple[int,
                     fontsize=fig.look.label)  # fmt: skip
         panels.append(pixels.Panel(ax, shown))
     return panels
+
+
+def draw(run: Run, options: BifurcationOptions) -> style.DataFigure:
+    """Draw the figure ``bifurcation`` of a run."""
+    cube = run.cube()
+    at, notes = values_of(run, options, cube)
+    figure = plot_bifurcation(
+        cube, state="" if options.quantity else options.state, quantity=options.quantity,
+        degrees=options.degrees, layout=options.layout, at=at, frame=frame_of(options),
+    )  # fmt: skip
+    return noted(figure, notes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +11,13 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import Diagram
+from pipeline.plots.door import Run, frame_of, noted, values_of
 from pipeline.plots.labels import Measure
+from pipeline.products.branches import BranchOptions
+from pipeline.products.figures import BranchFigureOptions
 
 KINDS = ("fold", "period_doubling", "neimark_sacker", "branch_point")
 MARKERS = {"fold": "^", "period_doubling": "s", "neimark_sacker": "o", "branch_point": "D"}
@@ -25,6 +29,7 @@ NAMES = {
 _STABLE: dict[str, Any] = {"color": "black", "linewidth": 1.3, "linestyle": "-", "zorder": 6.0}
 _UNSTABLE: dict[str, Any] = {"color": "0.3", "linewidth": 0.7, "linestyle": (0, (4, 2)), "zorder": 5.0}
 _NAME_PT = 7.0
+_LEADER = {"arrowstyle": "-", "linewidth": 0.4, "color": "0.4", "shrinkA": 4.0, "shrinkB": 2.5}
 
 
 def plot_branches(
@@ -34,6 +39,7 @@ def plot_branches(
     state: str = "",
     max_period: int | None = None,
     degrees: bool = False,
+    at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
     """Draw section points of periodic orbits over the parameter: solid stable, dashed unstable.
@@ -53,6 +59,8 @@ def plot_branches(
         Longest period drawn; by default all.
     degrees
         Degrees instead of radians.
+    at
+        Values of further parameters that the cube sweeps.
     frame
         Width of the figure and ranges of its axes.
 
@@ -69,7 +77,7 @@ def plot_branches(
     measure = labels.state_measure(ds, state, degrees)
     below = None
     if cube is not None:
-        below = Diagram.of(cube, state=measure.name, degrees=degrees, frame=frame)
+        below = Diagram.of(cube, state=measure.name, degrees=degrees, at=at, frame=frame)
     fig = style.new_figure(4.5, _stored(ds), frame)
     ax = fig.add_subplot()
     style.style_axes(ax)
@@ -191,7 +199,7 @@ def _name(ax: Axes, names: list[_Name]) -> None:
             ax.annotate(
                 name.text, (name.x, y), tuple(spot - anchor), textcoords="offset points", ha="center",
                 va="center", fontsize=_NAME_PT, fontfamily=style.FONT, zorder=9.0, gid=f"name:{name.text}",
-                arrowprops={"arrowstyle": "-", "linewidth": 0.4, "color": "0.4", "shrinkA": 4.0, "shrinkB": 2.5},
+                arrowprops=_LEADER,
             )  # fmt: skip
             break
 
@@ -203,13 +211,21 @@ def _dense(line: np.ndarray) -> np.ndarray:
         return line
     steps = np.hypot(*np.diff(line, axis=0).T)
     parts = np.minimum(np.ceil(steps / 3.0), 60).astype(int)
-    pieces = [a + (b - a) * np.linspace(0.0, 1.0, n + 1)[:, None] for a, b, n in zip(line, line[1:], parts, strict=False)]
+    pieces = [
+        a + (b - a) * np.linspace(0.0, 1.0, n + 1)[:, None]
+        for a, b, n in zip(line, line[1:], parts, strict=False)
+    ]
     return np.concatenate(pieces)
 
 
 def _free(
-    anchor: np.ndarray, up: float, size: tuple[float, float], ink: np.ndarray, taken: list[np.ndarray], bounds: np.ndarray
-) -> np.ndarray | None:
+    anchor: np.ndarray,
+    up: float,
+    size: tuple[float, float],
+    ink: np.ndarray,
+    taken: list[np.ndarray],
+    bounds: np.ndarray,
+) -> np.ndarray | None:  # fmt: skip
     """Return the nearest place for a text of a size about an anchor [pt] that covers nothing, or None."""
     half = 0.5 * np.asarray(size)
     for distance in (9.0, 14.0, 20.0, 28.0, 38.0):
@@ -238,3 +254,18 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
             if kind in present
         ),
     ]  # fmt: skip
+
+
+def draw(run: Run, options: BranchFigureOptions) -> style.DataFigure:
+    """Draw the figure ``branches`` of a run, over its own diagram or that of another one."""
+    found = run.derive("branches", **options.part(BranchOptions))
+    cube = run.cube()
+    if options.over:
+        cube = run.of(options.over).cube()
+    below = cube if axis_name(options.parameter) in cube.dims else None
+    at, notes = values_of(run, options, cube)
+    figure = plot_branches(
+        found, below, state=options.state, max_period=options.shown, degrees=options.degrees, at=at,
+        frame=frame_of(options),
+    )  # fmt: skip
+    return noted(figure, notes)

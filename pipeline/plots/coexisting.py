@@ -13,7 +13,10 @@ from matplotlib.patches import Patch
 from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.letters import letter
 from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
 from pipeline.plots.fractions import swept_parameter
+from pipeline.products.attractors import AttractorOptions
+from pipeline.products.figures import CoexistingOptions
 
 _LEAST_PT, _GROWTH_PT = 1.1, 5.0
 _UP_PT, _DOWN_PT, _TINT = 1.5, 4.2, 0.55
@@ -160,7 +163,7 @@ def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Ca
         up = word == "up"
         ax.plot(
             x, y, linestyle="none", marker="o", markersize=_UP_PT if up else _DOWN_PT, markeredgewidth=0.0,
-            color=cast.colours[number] if up else style.tinted(cast.colours[number], _TINT), zorder=2.2 if up else 2.0,
+            color=style.tinted(cast.colours[number], 0.0 if up else _TINT), zorder=2.2 if up else 2.0,
             rasterized=True, gid=f"points:{word}:{letter(number)}",
         )  # fmt: skip
 
@@ -180,3 +183,17 @@ def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> l
     if loops:
         entries.append(Patch(label="up and down differ", **_SPAN))
     return entries
+
+
+def draw(run: Run, options: CoexistingOptions) -> style.DataFigure:
+    """Draw the figure ``attractors`` of a run, with its hysteresis if it was walked up and down."""
+    found = attractors_of(run, options)
+    at, notes = values_of(run, options, found)
+    both = "direction" in found.coords and {"up", "down"} == set(
+        found["direction"].values.astype(str).tolist()
+    )
+    loops = run.derive("hysteresis", **options.part(AttractorOptions)) if both else None
+    figure = plot_coexisting(
+        found, state=options.state, at=at, degrees=options.degrees, hysteresis=loops, frame=frame_of(options)
+    )
+    return noted(figure, notes)

@@ -14,7 +14,9 @@ from pipeline.analysis.chaos.lyapunov import GOOD, Motion, pooled_mean, summaris
 from pipeline.analysis.selection import select_points
 from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import labels, style
+from pipeline.plots.door import Run, frame_of, noted, values_of
 from pipeline.plots.lyapunov import UNITS
+from pipeline.products.figures import ConvergenceOptions
 
 MOST_LINES = 24
 """Most cells of one kind of motion that are drawn as lines: more would hide one another."""
@@ -198,3 +200,13 @@ def _draw_cells(ax: Axes, data: xr.Dataset, variable: str, kind: Motion, colour:
     for bottom, top, alpha in ((low, high, 0.18), (lower, upper, 0.3)):
         ax.fill_between(x, bottom, top, color=colour, alpha=alpha, linewidth=0.0, gid=f"quantiles:{gid}")
     ax.plot(x, middle, color=colour, linestyle=_DASHES[kind], linewidth=1.2, gid=gid)
+
+
+def draw(run: Run, options: ConvergenceOptions) -> style.DataFigure:
+    """Draw the figure ``convergence`` of a run."""
+    cube = run.cube()
+    at, notes = values_of(run, options, cube)
+    figure = plot_convergence(
+        cube, exponent=options.exponent, per=options.per, at=at, frame=frame_of(options)
+    )
+    return noted(figure, notes)

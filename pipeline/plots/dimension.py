@@ -6,8 +6,12 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from pipeline.analysis.selection import select_points
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
+from pipeline.plots.door import Run, frame_of, noted, values_of
+from pipeline.products.chaos import DimensionOptions
+from pipeline.products.figures import DimensionFigureOptions
 
 
 def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
@@ -47,7 +51,13 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
         gid="correlation_sum",
     )  # fmt: skip
     bottom.semilogx(
-        radius, data["local_slope"].values, "o-", markersize=3, linewidth=0.7, color="black", gid="local_slope"
+        radius,
+        data["local_slope"].values,
+        "o-",
+        markersize=3,
+        linewidth=0.7,
+        color="black",
+        gid="local_slope",
     )
     _draw_fit(top, bottom, data)
     value, error = (float(data[f"correlation_dimension{end}"]) for end in ("", "_stderr"))
@@ -70,7 +80,9 @@ def _scales(ds: xr.Dataset) -> str:
     """What counts as 1, such as ``1 for 1 rad, 10 rad/s``."""
     model = model_of(ds)
     units = {s.unit: s.scale for s in model.states}
-    return "1 for " + ", ".join(f"{scale:g}" + (f" {unit}" if unit != "1" else "") for unit, scale in units.items())
+    return "1 for " + ", ".join(
+        f"{scale:g}" + (f" {unit}" if unit != "1" else "") for unit, scale in units.items()
+    )
 
 
 def _draw_fit(top: Axes, bottom: Axes, data: xr.Dataset) -> None:
@@ -111,3 +123,12 @@ def _correlation(ds: xr.Dataset) -> xr.Dataset:
         coords={"radius": ("radius", np.exp(x), {"units": "1", "long_name": "scaled radius"})},
         attrs={"title": "correlation sum", "place": labels.caption(ds, with_start=False)},
     )
+
+
+def draw(run: Run, options: DimensionFigureOptions) -> style.DataFigure:
+    """Draw the figure ``dimension`` of a run."""
+    cube = run.cube()
+    at, notes = values_of(run, options, cube)
+    select_points(cube, at, purpose="a correlation sum is drawn of one parameter point")
+    found = run.derive("dimension", **{**options.part(DimensionOptions), "at": at})
+    return noted(plot_dimension(found, frame=frame_of(options)), notes)

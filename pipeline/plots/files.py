@@ -19,7 +19,7 @@ SUFFIXES = (".png", ".pdf", ".svg")
 VECTOR_DPI = 400
 """Resolution of the images inside PDF and SVG files, which get magnified."""
 
-_SETTINGS = {"svg.hashsalt": "magpend", "svg.fonttype": "none", "pdf.fonttype": 42}
+_SETTINGS: dict[str, Any] = {"svg.hashsalt": "magpend", "svg.fonttype": "none", "pdf.fonttype": 42}
 _settings_lock = threading.Lock()
 
 
@@ -106,9 +106,10 @@ def _save_vectors(fig: Figure, buffer: io.BytesIO, options: dict[str, Any]) -> N
     and all others are left as they are.
     """
     with _settings_lock:
-        before = {key: matplotlib.rcParams[key] for key in _SETTINGS}
-        matplotlib.rcParams.update(_SETTINGS)
+        settings: Any = matplotlib.rcParams
+        before = {key: settings[key] for key in _SETTINGS}
+        settings.update(_SETTINGS)
         try:
             fig.savefig(buffer, **options)
         finally:
-            matplotlib.rcParams.update(before)
+            settings.update(before)

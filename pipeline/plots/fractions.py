@@ -15,6 +15,8 @@ from pipeline.analysis.basins.numbers import binomial_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.letters import letter
 from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.products.figures import AttractorFigureOptions
 
 MOST_BARS = 60
 """Most bars that are drawn: more would hide the bands."""
@@ -222,3 +224,10 @@ def _raster(
     raster[:, (x < edges[0]) | (x > edges[-1])] = -1
     raster[(y < 0.0) | (y > 1.0)] = -1
     return raster
+
+
+def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
+    """Draw the figure ``fractions`` of a run."""
+    found = attractors_of(run, options)
+    at, notes = values_of(run, options, found)
+    return noted(plot_fractions(found, at=at, frame=frame_of(options)), notes)

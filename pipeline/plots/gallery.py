@@ -1,4 +1,4 @@
-"""Gallery of attractors: phase portraits of each, and the path of the point that the model's drawing traces."""
+"""Gallery of attractors: phase portraits of each, and the path of a point of the model's drawing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from matplotlib.ticker import MaxNLocator
 from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
 from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
+from pipeline.products.figures import AttractorFigureOptions
 
 MAX_ROWS = 8
 _PANEL_IN, _TITLE_IN, _LABEL_IN, _HEAD_IN = 0.9, 0.2, 0.44, 0.3
@@ -163,9 +165,7 @@ def _head(fig: style.DataFigure, data: xr.Dataset, portraits: xr.Dataset, n: int
         text += f"; {rest} more attractors, {share} of the cells, are not shown"
     size = fig.look.legend
     room = width - 0.2 if fig.frame.compact else 0.62 * width
-    fig.text(
-        0.08 / width, 1.0 - 0.06 / height, style.folded(text, room, size), fontsize=size, va="top"
-    )
+    fig.text(0.08 / width, 1.0 - 0.06 / height, style.folded(text, room, size), fontsize=size, va="top")
     handles: list[Any] = [style.dot("once per drive period", "black", 3.0), *_fixed_handles(data, shown)]
     fig.legend(
         handles=handles, loc="upper right" if not fig.frame.compact else "upper left", frameon=False,
@@ -179,3 +179,13 @@ def _head(fig: style.DataFigure, data: xr.Dataset, portraits: xr.Dataset, n: int
 def _fixed_handles(data: xr.Dataset, shown: set[str]) -> list[Any]:
     drawing = model_of(data).drawing
     return [] if drawing is None else fixed_handles(drawing, _parameters(data), shown)
+
+
+def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
+    """Draw the figure ``gallery`` of a run; integrates the portraits."""
+    from pipeline.analysis.attractors.portraits import portraits
+
+    found = attractors_of(run, options)
+    at, notes = values_of(run, options, found)
+    figure = plot_gallery(found, portraits(found, at=at), degrees=options.degrees, frame=frame_of(options))
+    return noted(figure, notes)

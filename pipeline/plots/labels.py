@@ -204,7 +204,8 @@ def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True
         Whether to name initial states.
     """
     axes, states = set(drop), set(model_of(ds).state_names)
-    parameters, starts = [], []
+    parameters: list[str] = []
+    starts: list[str] = []
     for key in sorted(map(str, ds.coords)):
         coordinate = ds.coords[key]
         is_start = key.removesuffix("_0") in states and key.endswith("_0")

@@ -13,7 +13,9 @@ from matplotlib.collections import PolyCollection
 from pipeline.analysis.chaos.lyapunov import GOOD
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import Diagram
+from pipeline.plots.door import Run, frame_of, noted, values_of
 from pipeline.plots.motions import motion_codes, motions_of
+from pipeline.products.figures import LyapunovFigureOptions
 
 UNITS = ("s", "period")
 EXPONENT_COLOURS = ("#332288", style.ORANGE, style.SKY, "#882255", "#5B3A1E", "#999933", "#44AA99", "#AA4499")
@@ -190,3 +192,18 @@ def _union(value: np.ndarray, error: np.ndarray) -> list[tuple[float, float]]:
         else:
             joined.append((low, high))
     return joined
+
+
+def draw(run: Run, options: LyapunovFigureOptions) -> style.DataFigure:
+    """Draw the figure ``lyapunov`` of a run, over one parameter or as a map."""
+    from pipeline.plots.exponent_map import plot_lyapunov_map
+
+    cube = run.cube()
+    at, notes = values_of(run, options, cube)
+    if options.as_map:
+        return noted(plot_lyapunov_map(cube, per=options.per, at=at, frame=frame_of(options)), notes)
+    figure = plot_lyapunov(
+        cube, spectrum=options.spectrum, per=options.per, state=options.state, degrees=options.degrees, at=at,
+        frame=frame_of(options),
+    )  # fmt: skip
+    return noted(figure, notes)

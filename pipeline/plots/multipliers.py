@@ -12,6 +12,9 @@ from matplotlib.patches import Circle
 
 from pipeline.plots import labels, style
 from pipeline.plots.branches import KINDS, MARKERS, NAMES, SHORT
+from pipeline.plots.door import Run, frame_of
+from pipeline.products.branches import BranchOptions, CurveOptions
+from pipeline.products.figures import CurveFigureOptions, MultiplierOptions
 
 MOST = 2.0
 """Multipliers beyond this modulus are left out."""
@@ -20,12 +23,16 @@ _COLOURS = {
     "fold": style.BLUE, "period_doubling": style.VERMILLION, "neimark_sacker": style.GREEN,
     "branch_point": style.PURPLE,
 }  # fmt: skip
-_DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)), (0, (8, 1.5, 1, 1.5, 1, 1.5)))
+_DASHES: tuple[Any, ...] = (
+    "-",
+    (0, (6, 2)),
+    (0, (1, 1.2)),
+    (0, (5, 1.5, 1, 1.5)),
+    (0, (8, 1.5, 1, 1.5, 1, 1.5)),
+)
 
 
-def plot_multipliers(
-    ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = style.WIDE
-) -> style.DataFigure:
+def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the Floquet multipliers along a branch in the complex plane, with the unit circle.
 
     Parameters
@@ -160,3 +167,14 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     style.legend_above(fig, [seen[key] for key in sorted(seen)], size=fig.look.tick)
     style.finish(fig)
     return fig
+
+
+def draw_multipliers(run: Run, options: MultiplierOptions) -> style.DataFigure:
+    """Draw the figure ``multipliers`` of a run."""
+    found = run.derive("branches", **options.part(BranchOptions))
+    return plot_multipliers(found, options.branch, frame=frame_of(options))
+
+
+def draw_curves(run: Run, options: CurveFigureOptions) -> style.DataFigure:
+    """Draw the figure ``curves`` of a run."""
+    return plot_curves(run.derive("curves", **options.part(CurveOptions)), frame=frame_of(options))

@@ -86,7 +86,7 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
 
 
 def describe(one: xr.Dataset) -> str:
-    """Describe an attractor: its periods and kinds of motion where it is present, and its turns if it rotates."""
+    """Describe an attractor: its periods and motions where it is present, and its turns if it rotates."""
     present = one["kind"].values.ravel() > 0
     if not present.any():
         return "absent"

@@ -108,8 +108,8 @@ def _draw_markers(panel: Panel, points: Points, view: View, diameter: float, x: 
             where, height = distinct(points.x[chosen], points.y[chosen], x, y)
             (line,) = panel.ax.plot(
                 where, height, linestyle="none", marker="o", markersize=look.diameter, markeredgewidth=0.0,
-                color=style.tinted(view.motions.colours[code], look.tint), rasterized=True, zorder=2.0 - 0.1 * i,
-                scalex=False, scaley=False,
+                color=style.tinted(view.motions.colours[code], look.tint), rasterized=True,
+                zorder=2.0 - 0.1 * i, scalex=False, scaley=False,
             )  # fmt: skip
             line.set_gid("points:" + ":".join(n for n in (view.layers[i], view.motions.words[code]) if n))
 
@@ -132,7 +132,10 @@ def _table(x: np.ndarray, y: np.ndarray, motion: np.ndarray, layer: np.ndarray, 
     ds = xr.Dataset(variables)
     if view.motions.told:
         words = view.motions.words
-        attrs = {"flag_values": np.arange(len(words), dtype=np.int8), "flag_meanings": " ".join(w.replace(" ", "_") for w in words)}
+        attrs = {
+            "flag_values": np.arange(len(words), dtype=np.int8),
+            "flag_meanings": " ".join(w.replace(" ", "_") for w in words),
+        }
         ds["motion"] = ("point", motion.astype(np.int8), attrs)
     if view.layers != ("",):
         attrs = {
@@ -269,14 +272,14 @@ def _dilate(grid: np.ndarray, dot: Sequence[tuple[int, int]]) -> np.ndarray:
 def _pixel_table(counts: Counts, x: Range, y: Range, view: View) -> xr.Dataset:
     """Centres of the pixels that hold points, and how many these hold."""
     parts = []
-    for (layer, code), grid in counts.items():
-        row, column = np.nonzero(grid)
-        n = np.full(row.size, 1)
-        parts.append((column, row, code * n, layer * n, grid[row, column]))
+    for (own_layer, code), grid in counts.items():
+        rows, columns = np.nonzero(grid)
+        ones = np.ones(rows.size, np.int64)
+        parts.append((columns, rows, code * ones, own_layer * ones, grid[rows, columns]))
     if not parts:
-        return _table(*(np.zeros(0) for _ in range(4)), view)
+        parts.append((np.zeros(0, np.int64),) * 5)
     column, row, motion, layer, count = (np.concatenate(p) for p in zip(*parts, strict=True))
-    height, width = next(iter(counts.values())).shape
+    height, width = next(iter(counts.values())).shape if counts else (1, 1)
     ds = _table(
         x[0] + (column + 0.5) * (x[1] - x[0]) / width, y[0] + (row + 0.5) * (y[1] - y[0]) / height,
         motion, layer, view,

@@ -187,8 +187,8 @@ def survey(view: View, *, along: str = "", xlim: Range | None = None, ylim: Rang
     if along:
         position = xr.DataArray(np.arange(size), dims=along)
         marked = View(
-            view.ds.assign_coords(_position=position), view.names, view.coordinates, view.n_points, view.layers,
-            view.motions,
+            view.ds.assign_coords(_position=position), view.names, view.coordinates, view.n_points,
+            view.layers, view.motions,
         )  # fmt: skip
     for block in marked.blocks():
         found.add(marked.points(block).inside(xlim, ylim), len(view.motions.words))

@@ -39,7 +39,9 @@ class Motion:
     gid: str = ""
 
 
-def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motion, *, degrees: bool = False) -> None:
+def draw_portrait(
+    ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motion, *, degrees: bool = False
+) -> None:
     """Draw a phase portrait: the motion as a line, its section as dots; on the circle where an angle turns.
 
     Parameters
@@ -61,7 +63,7 @@ def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motio
     dots = [np.asarray(motion.section[name], dtype=np.float64) for name in pair]
     there = np.isfinite(lines[0]) & np.isfinite(lines[1])
     lines = [values[there] for values in lines]
-    turning = [m.on_circle and bool(lines[i].size) and np.ptp(lines[i]) >= 2.0 * np.pi for i, m in enumerate(measures)]
+    turning = [m.on_circle and _turns(values) for m, values in zip(measures, lines, strict=True)]
     for i, measure in enumerate(measures):
         if turning[i]:
             folded = labels.on_circle(lines[i], *lines)
@@ -74,11 +76,15 @@ def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motio
     ax.plot(x, y, color=motion.colour, linewidth=0.7, gid=f"orbit:{gid}")
     if dots[0].size:
         ax.plot(
-            *(m.shown(values) for m, values in zip(measures, dots, strict=True)), linestyle="none", marker="o",
-            markersize=2.8, color="black", markeredgecolor="white", markeredgewidth=0.4, zorder=3,
+            *(m.shown(values) for m, values in zip(measures, dots, strict=True)), linestyle="none",
+            marker="o", markersize=2.8, color="black", markeredgecolor="white", markeredgewidth=0.4, zorder=3,
             gid=f"section:{gid}",
         )  # fmt: skip
     _dress(ax, measures, turning)
+
+
+def _turns(angle: np.ndarray) -> bool:
+    return bool(angle.size) and bool(np.ptp(angle) >= 2.0 * np.pi)
 
 
 def _dress(ax: Axes, measures: list[Measure], turning: list[bool]) -> None:
@@ -93,9 +99,7 @@ def _dress(ax: Axes, measures: list[Measure], turning: list[bool]) -> None:
     style.label_axes(ax, measures[0].label, measures[1].label)
 
 
-def draw_path(
-    ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: Motion
-) -> list[str]:
+def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: Motion) -> list[str]:
     """Draw the path of the point that a model's drawing traces, with what does not move.
 
     Parameters

@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex, to_rgb
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.basins import outcomes
@@ -19,6 +19,8 @@ from pipeline.analysis.basins.numbers import basin_fractions, binomial_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.letters import letter
 from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.products.figures import RegimeOptions
 
 KINDS = ("periods", "attractors", "number")
 SHARE_LIMIT = 0.05
@@ -123,7 +125,7 @@ def _draw_multiples(
             continue
         member = str(data["member"].values[chosen[k]])
         colour = _member_colour(member, show, cast)
-        ramp = LinearSegmentedColormap.from_list("share", [style.tinted(colour, 0.75), colour])
+        ramp = LinearSegmentedColormap.from_list("share", [style.tinted(colour, 0.75), to_rgb(colour)])
         share = np.ma.masked_equal(data["share_of"].values[..., chosen[k]], 0.0)
         mesh = ax.pcolormesh(*edges, share, cmap=ramp, vmin=0.0, vmax=1.0, rasterized=True)
         mesh.set_gid(f"member:{member}")
@@ -132,11 +134,8 @@ def _draw_multiples(
     fig.supxlabel(labels.parameter_label(data[x]), fontsize=fig.look.label)
     fig.supylabel(labels.parameter_label(data[y]), fontsize=fig.look.label)
     rest = data.sizes["member"] - len(chosen)
-    more = (
-        f"{rest} more, met by {palette.percent(float(1 - total[chosen].sum() / total.sum()))} of the cells, are not shown"
-        if rest
-        else ""
-    )
+    met = palette.percent(float(1.0 - total[chosen].sum() / total.sum())) if rest else ""
+    more = f"{rest} more, met by {met} of the cells, are not shown" if rest else ""
     note = style.join([text, "depth of colour: share of the cells", more])
     fig.suptitle(
         style.folded(note, frame.width_in - 0.3, fig.look.legend), fontsize=fig.look.legend, x=0.01, ha="left"
@@ -280,3 +279,10 @@ def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]
     return [colours[name] for name in names], [
         (name, colours[name]) for name in [*own, *(["none"] if "none" in names else [])]
     ]
+
+
+def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
+    """Draw the figure ``regimes`` of a run."""
+    found = attractors_of(run, options)
+    at, notes = values_of(run, options, found)
+    return noted(plot_regimes(found, show=options.show, at=at, frame=frame_of(options)), notes)

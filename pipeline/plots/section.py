@@ -11,9 +11,11 @@ import xarray as xr
 from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.absent import absent_handles, say_empty
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
 from pipeline.plots.motions import Motions
 from pipeline.plots.points import View, make_view, survey
 from pipeline.plots.selection import at_points
+from pipeline.products.figures import SectionOptions
 
 COLOURS_BY = ("motion", "attractor")
 _MOST_PT, _LEAST_PT = 1.7, 0.45
@@ -124,7 +126,9 @@ def _range(found: tuple[float, float], measure: labels.Measure) -> tuple[float, 
 
 def _handles(view: View, found: set[int]) -> list[Any]:
     motions = view.motions
-    return [style.dot(motions.words[c], motions.colours[c]) for c in motions.drawn if c in found and motions.told]
+    return [
+        style.dot(motions.words[c], motions.colours[c]) for c in motions.drawn if c in found and motions.told
+    ]
 
 
 def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
@@ -141,3 +145,17 @@ def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
     codes = (chosen["attractor_id"].clip(-1) + 1).astype(np.int32)
     marked = part.assign_coords(_kind=(codes.dims, codes.values))
     return View(marked, view.names, view.coordinates, view.n_points, view.layers, motions)
+
+
+def draw(run: Run, options: SectionOptions) -> style.DataFigure:
+    """Draw the figure ``section`` of a run."""
+    cube = run.cube()
+    at, notes = values_of(run, options, cube)
+    found = attractors_of(run, options) if options.colour == "attractor" else None
+    model = model_of(cube)
+    pair = next((p for p in model.portraits if p[0] == options.state), (options.state, ""))
+    first, second = options.state, options.against or pair[1] or model.portraits[0][1]
+    figure = plot_section(
+        cube, found, states=(first, second), at=at, degrees=options.degrees, frame=frame_of(options)
+    )
+    return noted(figure, notes)

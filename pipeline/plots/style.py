@@ -135,10 +135,16 @@ def look_at(frame: Frame) -> Look:
     return _LOOKS[frame.compact]
 
 
+def figure_of(ax: Axes) -> DataFigure:
+    """Return the figure that axes are in."""
+    figure = ax.figure
+    assert isinstance(figure, DataFigure)
+    return figure
+
+
 def look_of(ax: Axes) -> Look:
     """Sizes of letters of the figure that the axes are in."""
-    figure = ax.figure
-    return figure.look if isinstance(figure, DataFigure) else _LOOKS[False]
+    return figure_of(ax).look
 
 
 def finish(figure: DataFigure) -> None:
@@ -198,7 +204,7 @@ def caption(ax: Axes, text: str) -> None:
     """Write a line above the axes, folded where the figure ends."""
     if text:
         look = look_of(ax)
-        width = float(ax.figure.get_size_inches()[0]) - 0.6
+        width = figure_of(ax).frame.width_in - 0.6
         ax.set_title(folded(text, width, look.legend), fontsize=look.legend, loc="left", pad=4.0)
 
 

@@ -17,6 +17,9 @@ from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.plots import labels, style
 from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
 
+MOST_PANELS, MOST_LINES = 3, 2
+"""Most panels of variables that are no states, and most lines in each."""
+
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY)
 """Of the pairs of states that portraits show; a seventh begins again."""
 
@@ -59,8 +62,9 @@ def plot_trajectory(
     strobe = _section_times(ds, time)
     section = {name: np.interp(strobe, time, values) for name, values in series.items()}
     drawing = model.drawing if "parameters" in ds.attrs else None
-    fig = style.new_figure(4.9 if drawing is None else 5.9, _data(ds, series, drawing), frame)
     rows = [*_units(model), *_others(ds, model)]
+    height = max(4.0, 1.25 * len(rows) + 0.8, 1.6 * (len(model.portraits) + (drawing is not None)) + 0.8)
+    fig = style.new_figure(height, _data(ds, series, drawing), frame)
     left, right = _grids(fig, len(rows), len(model.portraits) + (drawing is not None))
     axes = [fig.add_subplot(spec) for spec in left]
     _draw_series(axes, ds, time, series, rows, degrees)
@@ -92,9 +96,7 @@ def _place(ds: xr.Dataset) -> str:
     return f"$f$ = {float(frequency):.6g}\u00a0Hz" if frequency is not None else ""
 
 
-def _grids(
-    fig: style.DataFigure, n_rows: int, n_panels: int
-) -> tuple[list[SubplotSpec], list[SubplotSpec]]:
+def _grids(fig: style.DataFigure, n_rows: int, n_panels: int) -> tuple[list[SubplotSpec], list[SubplotSpec]]:
     """Places of the series, and of the portraits: beside one another, or below in a narrow figure."""
     if not fig.frame.compact:
         outer = fig.add_gridspec(1, 2, width_ratios=[1.35, 1.0])
@@ -160,11 +162,13 @@ def _units(model: Model) -> list[tuple[str, ...]]:
 
 
 def _others(ds: xr.Dataset, model: Model) -> list[tuple[str, ...]]:
-    return [
-        (str(name),)
-        for name, values in ds.data_vars.items()
-        if values.dims == ("time",) and str(name) not in (*model.state_names, "section_times")
-    ]
+    """Further variables, a panel for each unit: the first few of each of the first few units."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name, values in ds.data_vars.items():
+        if values.dims == ("time",) and str(name) not in (*model.state_names, "section_times"):
+            unit = str(values.attrs.get("units", ""))
+            found[unit] = (*found.get(unit, ()), str(name))[:MOST_LINES]
+    return list(found.values())[:MOST_PANELS]
 
 
 def _colour(pair: int) -> str:
@@ -194,10 +198,7 @@ def _draw_series(
         ax.set_xlim(float(time[0]), float(time[-1]))
         ax.margins(y=0.08)
         if names[0] not in model.state_names:
-            values = np.asarray(ds[names[0]].values, dtype=np.float64)
-            ax.plot(time, values, color="0.2", linewidth=0.8, gid=f"series:{names[0]}")
-            unit = str(ds[names[0]].attrs.get("units", ""))
-            style.label_axes(ax, y=labels.with_unit(names[0].replace("_", " "), unit))
+            _draw_others(ax, ds, time, names)
             continue
         turn = degrees and model.state(names[0]).unit.startswith("rad")
         measures = [labels.state_measure(ds, name, turn) for name in names]
@@ -207,6 +208,21 @@ def _draw_series(
         style.label_axes(ax, y=labels.with_unit(", ".join(m.symbol for m in measures), measures[0].unit))
         labels.angle_ticks(ax, measures[0], most=5.0)
     style.label_axes(axes[-1], x="time [s]")
+
+
+def _draw_others(ax: Axes, ds: xr.Dataset, time: np.ndarray, names: Sequence[str]) -> None:
+    """Draw variables that are no states, with a legend of their own if there are several."""
+    quantities = {q.name: q.symbol for q in model_of(ds).quantities}
+    symbols = [f"${quantities[n]}$" if quantities.get(n) else n.replace("_", " ") for n in names]
+    for name, symbol, look in zip(names, symbols, ("0.15", style.ORANGE), strict=False):
+        values = np.asarray(ds[name].values, dtype=np.float64)
+        ax.plot(time, values, color=look, linewidth=0.8, gid=f"series:{name}", label=symbol)
+    unit = str(ds[names[0]].attrs.get("units", ""))
+    style.label_axes(ax, y=labels.with_unit(", ".join(symbols), unit))
+    if len(names) > 1:
+        ax.legend(loc="upper right", ncols=len(names), fontsize=style.look_of(ax).tick - 1.0, borderpad=0.2,
+                  handlelength=1.0, framealpha=0.8, edgecolor="none", columnspacing=0.8,
+                  handletextpad=0.3)  # fmt: skip
 
 
 def _handles(ds: xr.Dataset, model: Model, with_section: bool) -> list[Any]:
