@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from magpend_core.engine.entry import check_tolerances, slack_of
 from magpend_core.engine.jit import OPTIONS, kernel, specialise
 from magpend_core.engine.lanes import (
     DIVERGED,
@@ -27,7 +28,6 @@ from magpend_core.engine.simd import WIDTH
 from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models.parameters import Parameters
-from magpend_core.sections import check_tolerances, slack_of
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_frequency, check_states
 
