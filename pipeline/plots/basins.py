@@ -237,8 +237,8 @@ def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Datase
 
 def draw(run: Run, options: BasinFigureOptions) -> style.DataFigure:
     """Draw the figure ``basins`` of a run."""
+    at, notes = values_of(run, options)
     found = attractors_of(run, options)
-    at, notes = values_of(run, options, found)
     times = run.cube()["n_periods"] if options.shade else None
     figure = plot_basins(found, at=at, degrees=options.degrees, n_periods=times, frame=frame_of(options))
     return noted(figure, notes)

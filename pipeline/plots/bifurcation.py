@@ -283,7 +283,7 @@ def _panels(fig: style.DataFigure, diagram: Diagram, layers: Sequence[tuple[int,
 def draw(run: Run, options: BifurcationOptions) -> style.DataFigure:
     """Draw the figure ``bifurcation`` of a run."""
     cube = run.cube()
-    at, notes = values_of(run, options, cube)
+    at, notes = values_of(run, options)
     figure = plot_bifurcation(
         cube, state="" if options.quantity else options.state, quantity=options.quantity,
         degrees=options.degrees, layout=options.layout, at=at, frame=frame_of(options),

@@ -258,12 +258,11 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
 
 def draw(run: Run, options: BranchFigureOptions) -> style.DataFigure:
     """Draw the figure ``branches`` of a run, over its own diagram or that of another one."""
+    other = run.of(options.over) if options.over else run
+    at, notes = values_of(other, options)
     found = run.derive("branches", **options.part(BranchOptions))
-    cube = run.cube()
-    if options.over:
-        cube = run.of(options.over).cube()
+    cube = other.cube()
     below = cube if axis_name(options.parameter) in cube.dims else None
-    at, notes = values_of(run, options, cube)
     figure = plot_branches(
         found, below, state=options.state, max_period=options.shown, degrees=options.degrees, at=at,
         frame=frame_of(options),

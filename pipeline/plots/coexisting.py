@@ -187,8 +187,8 @@ def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> l
 
 def draw(run: Run, options: CoexistingOptions) -> style.DataFigure:
     """Draw the figure ``attractors`` of a run, with its hysteresis if it was walked up and down."""
+    at, notes = values_of(run, options)
     found = attractors_of(run, options)
-    at, notes = values_of(run, options, found)
     both = "direction" in found.coords and {"up", "down"} == set(
         found["direction"].values.astype(str).tolist()
     )

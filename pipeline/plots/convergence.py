@@ -85,7 +85,7 @@ def plot_convergence(
     handles = _draw_running(top, final, data)
     for kind, colour in _COLOURS.items():
         _draw_cells(bottom, data, "in_block", kind, colour)
-    unit = "s" if per == "s" else "drive period"
+    unit = "s" if per == "s" else "period"
     style.label_axes(top, y=f"$\\lambda_{exponent}$, mean so far [1/{unit}]")
     style.label_axes(bottom, str(data["period"].attrs["long_name"]), f"in the block [1/{unit}]")
     top.set_xlim(0.0, 1.01 * float(data["period"][-1]))
@@ -160,7 +160,10 @@ def _draw_running(ax: Axes, final: Axes, data: xr.Dataset) -> list[Any]:
         handles.append(Line2D([], [], color=colour, linestyle=_DASHES[kind], linewidth=1.2, label=label))
     final.set_xlim(-1.0, value.size)
     final.set_xticks([])
-    style.label_axes(final, "cells")
+    final.text(
+        0.5, 0.02, "cells", transform=final.transAxes, ha="center", va="bottom",
+        fontsize=style.look_of(final).legend, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
+    )  # fmt: skip
     final.tick_params(labelleft=False)
     ax.tick_params(labelbottom=False)
     return handles
@@ -205,7 +208,7 @@ def _draw_cells(ax: Axes, data: xr.Dataset, variable: str, kind: Motion, colour:
 def draw(run: Run, options: ConvergenceOptions) -> style.DataFigure:
     """Draw the figure ``convergence`` of a run."""
     cube = run.cube()
-    at, notes = values_of(run, options, cube)
+    at, notes = values_of(run, options)
     figure = plot_convergence(
         cube, exponent=options.exponent, per=options.per, at=at, frame=frame_of(options)
     )

@@ -128,7 +128,7 @@ def _correlation(ds: xr.Dataset) -> xr.Dataset:
 def draw(run: Run, options: DimensionFigureOptions) -> style.DataFigure:
     """Draw the figure ``dimension`` of a run."""
     cube = run.cube()
-    at, notes = values_of(run, options, cube)
+    at, notes = values_of(run, options)
     select_points(cube, at, purpose="a correlation sum is drawn of one parameter point")
     found = run.derive("dimension", **{**options.part(DimensionOptions), "at": at})
     return noted(plot_dimension(found, frame=frame_of(options)), notes)

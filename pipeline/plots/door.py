@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import xarray as xr
 
-from pipeline.analysis.selection import snap
+from pipeline.analysis.selection import place, snap
 from pipeline.plots.files import with_provenance
 from pipeline.plots.style import DataFigure, Frame
 from pipeline.products.product import FigureOptions, Options, function_of
@@ -96,15 +96,26 @@ def frame_of(options: FigureOptions) -> Frame:
     return Frame(options.width, options.xlim, options.ylim)
 
 
-def values_of(run: Run, options: FigureOptions, ds: xr.Dataset) -> tuple[dict[str, float], list[str]]:
+def values_of(run: Run, options: FigureOptions) -> tuple[dict[str, float], list[str]]:
     """Return the values of axes that are drawn, and what to say where they are not those asked for.
 
-    Without ``nearest`` they are as given, and a value that its axis does not have is refused later.
+    Raises
+    ------
+    ValueError
+        If an axis is unknown, or does not have a value and ``nearest`` is not asked for: before anything
+        is computed.
     """
     given: Mapping[str, float] = options.at
+    cube = run.cube()
+    axes = [str(d) for d in cube["status"].dims if d in cube.coords]
+    for name in given:
+        if name not in axes:
+            raise ValueError(f"unknown axis {name!r}; values can be chosen of: {', '.join(axes) or 'none'}")
     if not options.nearest:
+        for name, value in given.items():
+            place(cube[name], value)
         return dict(given), []
-    found = snap(ds, given)
+    found = snap(cube, given)
     notes = [
         f"{name} = {given[name]:.10g} is not on its axis; drawn at the nearest, {value:.10g}"
         for name, value in found.items()

@@ -228,6 +228,6 @@ def _raster(
 
 def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
     """Draw the figure ``fractions`` of a run."""
+    at, notes = values_of(run, options)
     found = attractors_of(run, options)
-    at, notes = values_of(run, options, found)
     return noted(plot_fractions(found, at=at, frame=frame_of(options)), notes)

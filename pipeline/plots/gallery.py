@@ -185,7 +185,7 @@ def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
     """Draw the figure ``gallery`` of a run; integrates the portraits."""
     from pipeline.analysis.attractors.portraits import portraits
 
+    at, notes = values_of(run, options)
     found = attractors_of(run, options)
-    at, notes = values_of(run, options, found)
     figure = plot_gallery(found, portraits(found, at=at), degrees=options.degrees, frame=frame_of(options))
     return noted(figure, notes)

@@ -124,7 +124,7 @@ def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
 
 def rate_unit(data: xr.Dataset) -> str:
     """Unit of the exponents for an axis."""
-    return "1/drive period" if data["exponent_value"].attrs["per"] == "drive period" else "1/s"
+    return "1/period" if data["exponent_value"].attrs["per"] == "drive period" else "1/s"
 
 
 def _draw_exponents(
@@ -199,7 +199,7 @@ def draw(run: Run, options: LyapunovFigureOptions) -> style.DataFigure:
     from pipeline.plots.exponent_map import plot_lyapunov_map
 
     cube = run.cube()
-    at, notes = values_of(run, options, cube)
+    at, notes = values_of(run, options)
     if options.as_map:
         return noted(plot_lyapunov_map(cube, per=options.per, at=at, frame=frame_of(options)), notes)
     figure = plot_lyapunov(

@@ -283,6 +283,6 @@ def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]
 
 def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
     """Draw the figure ``regimes`` of a run."""
+    at, notes = values_of(run, options)
     found = attractors_of(run, options)
-    at, notes = values_of(run, options, found)
     return noted(plot_regimes(found, show=options.show, at=at, frame=frame_of(options)), notes)

@@ -150,7 +150,7 @@ def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
 def draw(run: Run, options: SectionOptions) -> style.DataFigure:
     """Draw the figure ``section`` of a run."""
     cube = run.cube()
-    at, notes = values_of(run, options, cube)
+    at, notes = values_of(run, options)
     found = attractors_of(run, options) if options.colour == "attractor" else None
     model = model_of(cube)
     pair = next((p for p in model.portraits if p[0] == options.state), (options.state, ""))
