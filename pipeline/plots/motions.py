@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import style
 
@@ -62,8 +63,5 @@ def motions_of(ds: xr.Dataset) -> Motions:
 
 def motion_codes(cells: xr.Dataset) -> xr.DataArray:
     """Code of the motion of each cell of a cube's part, on the dims of ``status``."""
-    if model_of(cells).classifier is None:
-        return xr.zeros_like(cells["status"], dtype=np.int8)
-    from pipeline.analysis.sides import side
-
-    return side(cells)
+    found = classify(cells)
+    return xr.zeros_like(cells["status"], dtype=np.int8) if found is None else found
