@@ -80,20 +80,13 @@ import xarray as xr
 from magpend_core.engine.system import System
 from magpend_core.models.pendulum.parameters import Parameters
 from pipeline.analysis.attractors.bounded import Rule
+from pipeline.analysis.attractors.deciding import DECISIONS
 from pipeline.analysis.attractors.features import Features
 from pipeline.analysis.attractors.hysteresis import hysteresis
-from pipeline.analysis.attractors.identify import (
-    BUDGET,
-    Found,
-    Options,
-    engine_inputs,
-    parameters_of,
-    search_all,
-    slabs,
-)
+from pipeline.analysis.attractors.identify import Found, Options, search_all
 from pipeline.analysis.attractors.lifetimes import lifetimes
 from pipeline.analysis.attractors.matching import match
-from pipeline.analysis.attractors.orbits import DECISIONS
+from pipeline.analysis.attractors.points import BUDGET, engine_inputs, parameters_of, slabs
 from pipeline.analysis.sides import Side
 from pipeline.analysis.vocabulary import BOUNDED_SET, split_dims
 from pipeline.layout.schema import LyapunovFlag

@@ -148,7 +148,7 @@ def _shares(part: csr_array, whole: csr_array) -> np.ndarray:
 
 
 def _agree(a: np.ndarray, b: np.ndarray, tolerance: float) -> np.ndarray:
-    return np.asarray(np.abs(a[:, None] - b[None]).max(axis=-1) <= tolerance)
+    return np.asarray((np.abs(a[:, None] - b[None]) <= tolerance).all(axis=-1))
 
 
 def find_sets(anchors: Clouds, geometry: Geometry, rule: Rule) -> Sets:

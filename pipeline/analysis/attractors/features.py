@@ -23,7 +23,7 @@ from magpend_core.models.pendulum.parameters import Parameters
 from magpend_core.status import Status
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.bounded import mean_rotation
-from pipeline.analysis.attractors.orbits import Block
+from pipeline.analysis.attractors.cells import Block
 from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points
 from pipeline.analysis.sides import Side, side
 

@@ -8,48 +8,53 @@ guesses of all are polished in one call of the engine.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.pendulum.parameters import Parameters, load_preset
-from magpend_core.models.pendulum.systems import PENDULUM_FITTED, system_of
 from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors.bounded import Clouds, Rule, assign, find_sets
-from pipeline.analysis.attractors.features import Cells, Features
-from pipeline.analysis.attractors.orbits import (
+from pipeline.analysis.attractors.cells import Block, ClosedCells, Guesses, marks_of
+from pipeline.analysis.attractors.deciding import (
     CLOSED,
     LOOSE_SHARE,
-    MAX_GUESSES,
     RUN_ON,
     SAME_SET,
     STRICT,
     UNDECIDED,
-    Block,
-    ClosedCells,
-    Guesses,
-    Orbit,
     decide,
+)
+from pipeline.analysis.attractors.features import Cells, Features
+from pipeline.analysis.attractors.following import Engine, follow
+from pipeline.analysis.attractors.orbits import (
+    RUN_ON_RTOL,
+    Orbit,
     distinct,
-    marks_of,
-    near_closed,
     number_of,
     polish,
     raw_orbit,
     run_on,
 )
+from pipeline.analysis.attractors.points import Point
+from pipeline.analysis.attractors.spirals import (
+    MAX_GUESSES,
+    RUN_ON_LEGS,
+    Recurrence,
+    keys_of,
+    near_closed,
+    spirals_of,
+)
 from pipeline.analysis.sets import Geometry, hashes, order_by_points
-from pipeline.analysis.vocabulary import BOUNDED_SET, CLOSED_ORBIT, START_DIMS
+from pipeline.analysis.vocabulary import BOUNDED_SET, CLOSED_ORBIT
 
 ROUNDS, ROUNDS_LOOSE = 3, 6
 """Most rounds of guessing and polishing, with a strict and a loose tolerance."""
 
-BUDGET = 256 * 2**20
-"""Bytes of sections held at once."""
+UNSETTLED = -2
+"""Label of spirals that were not run on, until the sets are told."""
 
 
 @dataclass(frozen=True)
@@ -76,45 +81,6 @@ class Options:
 
 
 @dataclass
-class Point:
-    """One parameter point: where its cells are, and what is integrated there."""
-
-    cube: xr.Dataset
-    start_dims: tuple[str, ...]
-    frequency: float
-    packed: np.ndarray
-    parameters: Parameters | None
-    state_names: tuple[str, ...]
-    block_cells: int
-
-    @property
-    def n_cells(self) -> int:
-        """Number of cells."""
-        return math.prod(self.cube.sizes[d] for d in self.start_dims)
-
-    def blocks(self) -> Iterator[Block]:
-        """All cells in blocks, in the order of the start dims."""
-        first = self.start_dims[0] if self.start_dims else None
-        length = self.cube.sizes[first] if first else 1
-        inner = self.n_cells // max(length, 1)
-        step = max(1, self.block_cells // max(inner, 1))
-        for begin in range(0, length, step):
-            part = self.cube.isel({first: slice(begin, begin + step)}) if first else self.cube
-            n = min(step, length - begin) * inner
-            yield self._block(part, slice(begin * inner, begin * inner + n), n)
-
-    def _block(self, part: xr.Dataset, cells: slice, n: int) -> Block:
-        def values(name: str, own: tuple[str, ...]) -> np.ndarray:
-            array = part[name].transpose(*self.start_dims, *own)
-            return np.asarray(array.values).reshape(n, *array.shape[len(self.start_dims) :])
-
-        section = values("section", ("period_index", "state")).astype(np.float64)
-        links = sum(name in ("psi1", "psi2") for name in self.state_names)
-        turns = values("turns", ("link",)) if "turns" in part else np.zeros((n, links), np.int64)
-        return Block(cells, section, values("status", ()), values("orbit_period", ()), turns)
-
-
-@dataclass
 class Found:
     """Attractors of one parameter point."""
 
@@ -124,105 +90,92 @@ class Found:
     counts: list[int]
 
 
-def parameters_of(ds: xr.Dataset) -> Parameters:
-    """Parameters that a run's attribute ``parameters`` tells, a line ``name = value`` for each.
-
-    Raises
-    ------
-    ValueError
-        If it is not there.
-    """
-    lines = str(ds.attrs.get("parameters", "")).splitlines()
-    values = {name.strip(): float(value) for name, _, value in (line.partition("=") for line in lines)}
-    if not values:
-        raise ValueError(
-            "The dataset has no attribute 'parameters'; give parameters, or set polish to False."
-        )
-    return load_preset().replace(**values)
-
-
-def engine_inputs(
-    ds: xr.Dataset, parameters: Parameters | np.ndarray | None, system: System | None, *, needed: bool
-) -> tuple[Parameters | np.ndarray | None, System]:
-    """Parameters and system: those given, else those of the run."""
-    base = parameters_of(ds) if parameters is None and needed else parameters
-    if system is None:
-        system = system_of(base) if isinstance(base, Parameters) else PENDULUM_FITTED
-    return base, system
-
-
-# ---- reading -----------------------------------------------------------------------------------
-
-
-def slabs(
-    ds: xr.Dataset,
-    start_dims: tuple[str, ...],
-    base: Parameters | np.ndarray | None,
-    system: System,
-    budget: int,
-) -> Iterator[dict[tuple[int, ...], Point]]:
-    """Parameter points, some at a time: what fits is loaded at once, since chunks span many points."""
-    names = [n for n in ("section", "status", "orbit_period", "turns") if n in ds]
-    cube = ds[names].reset_coords(drop=True) if "frequency" in ds.dims else ds[names]
-    dims = [str(d) for d in ds["status"].dims if d not in START_DIMS]
-    shape = [ds.sizes[d] for d in dims]
-    per_point = ds["section"].size * 8 // max(math.prod(shape), 1)
-    cell = 8 * math.prod(ds.sizes[d] for d in ("period_index", "state"))
-    rows = max(1, budget // max(per_point * math.prod(shape[1:]), 1))
-    for begin in range(0, shape[0] if dims else 1, rows):
-        slab = cube.isel({dims[0]: slice(begin, begin + rows)}) if dims else cube
-        if slab["section"].size * 8 <= budget:
-            slab = slab.load()
-        sizes = [slab.sizes[d] for d in dims]
-        points = {}
-        for local in np.ndindex(*sizes):
-            index = (local[0] + begin, *local[1:]) if dims else ()
-            one = slab.isel(dict(zip(dims, local, strict=True)))
-            values = {d: float(ds[d].values[i]) for d, i in zip(dims, index, strict=True)}
-            points[index] = _point(one, ds, start_dims, values, base, system, max(1, budget // (4 * cell)))
-        yield points
-
-
-def _point(
-    one: xr.Dataset, ds: xr.Dataset, start_dims: tuple[str, ...], values: Mapping[str, float],
-    base: Parameters | np.ndarray | None, system: System, block_cells: int,
-) -> Point:  # fmt: skip
-    own = dict(values)
-    fixed = float(ds["frequency"]) if "frequency" in ds.coords and not ds["frequency"].ndim else math.nan
-    frequency = own.pop("frequency", fixed)
-    parameters = base.replace(**own) if isinstance(base, Parameters) else None
-    if parameters is not None:
-        packed = parameters.pack()
-    else:
-        packed = np.zeros(len(system.parameter_names)) if base is None else np.array(base, np.float64)
-        for name, value in own.items():
-            if name in system.parameter_names:
-                packed[system.parameter_names.index(name)] = value
-    return Point(one, start_dims, frequency, packed, parameters, system.state_names, block_cells)
-
-
 # ---- search ------------------------------------------------------------------------------------
 
-_Search = Generator[Guesses, list[Orbit | None], Found]
+_Search = Generator[Guesses, list[Orbit | None], "State"]
+
+
+@dataclass
+class State:
+    """What the search knows of one point before its cells are labelled.
+
+    Attributes
+    ----------
+    orbits : list of Orbit
+        In the order in which they were found.
+    keys, group : ndarray
+        Boxes of the closed cells, and the group of each.
+    closed : ClosedCells
+    ends : dict
+        Orbit by the mark of a closed cell that was run on.
+    spirals : dict
+        Orbit by the box of a spiral that was run on, -1 where it stayed.
+    """
+
+    orbits: list[Orbit]
+    keys: np.ndarray
+    group: np.ndarray
+    closed: ClosedCells
+    ends: dict[int, int]
+    spirals: dict[int, int] = field(default_factory=dict)
 
 
 def search_all(
     points: Mapping[tuple[int, ...], Point], options: Options, system: System
 ) -> dict[tuple[int, ...], Found]:
-    """Search all points in step, so that their orbits are polished together."""
+    """Search all points in step, so that their orbits are polished and their spirals run on together."""
     geometry = Geometry.of(system)
     searches = {index: _search(point, options, geometry) for index, point in points.items()}
     answers: dict[tuple[int, ...], Any] = dict.fromkeys(searches)
-    done: dict[tuple[int, ...], Found] = {}
+    states: dict[tuple[int, ...], State] = {}
     while answers:
         asked: dict[tuple[int, ...], Guesses] = {}
         for index, answer in answers.items():
             try:
                 asked[index] = searches[index].send(answer)
             except StopIteration as stop:
-                done[index] = stop.value
+                states[index] = stop.value
         answers = _polish_together(asked, points, options, geometry, system)
-    return done
+    if options.polish:
+        _run_spirals(states, points, options, geometry, system)
+    return {index: _conclude(points[index], states[index], options, geometry) for index in points}
+
+
+def _run_spirals(
+    states: Mapping[tuple[int, ...], State], points: Mapping[tuple[int, ...], Point], options: Options,
+    geometry: Geometry, system: System,
+) -> None:  # fmt: skip
+    """Run on what comes back near and no orbit accounts for, in place: before a bounded set is named."""
+    asked = {i: _spirals(points[i], state.orbits, options, geometry) for i, state in states.items()}
+    asked = {i: guesses for i, guesses in asked.items() if len(guesses.key)}
+    if not asked:
+        return
+    owner = np.repeat(np.arange(len(asked)), [len(g.key) for g in asked.values()])
+    start = np.concatenate([g.point for g in asked.values()])
+    engine = Engine(
+        np.stack([points[i].packed for i in asked]), np.array([points[i].frequency for i in asked]),
+        owner, start, tolerances=(RUN_ON_RTOL, RUN_ON_RTOL), max_orbit_period=options.max_orbit_period,
+        residual=options.residual, geometry=geometry, system=system,
+    )  # fmt: skip
+    known = [states[i].orbits for i in asked]
+    ends = follow(
+        start, owner, known, engine.advance, engine.polish, RUN_ON_LEGS, options.max_orbit_period, geometry,
+        spirals_only=True,
+    )  # fmt: skip
+    for number, (index, guesses) in enumerate(asked.items()):
+        states[index].orbits = ends.orbits[number]
+        reached = np.maximum(ends.orbit[owner == number], -1)
+        states[index].spirals = dict(zip(guesses.key.tolist(), reached.tolist(), strict=True))
+
+
+def _spirals(point: Point, orbits: Sequence[Orbit], options: Options, geometry: Geometry) -> Guesses:
+    """Bounded cells that come back near and that none of the orbits accounts for."""
+    found = Guesses.none(len(geometry.scales))
+    for block in point.blocks():
+        label, _ = decide(block, orbits, options.tolerance, geometry)
+        rest = block.section[block.is_bounded & (label < 0)]
+        found = found.joined(spirals_of(rest, options.max_orbit_period, options.tolerance, geometry))
+    return found.least(MAX_GUESSES)
 
 
 def _polish_together(
@@ -306,7 +259,7 @@ def _search(point: Point, options: Options, geometry: Geometry) -> _Search:
                     number = number_of(orbit, orbits, geometry)
                     orbits = orbits if number < len(orbits) else [*orbits, orbit]
                     ends[int(mark)] = number
-    return _conclude(point, orbits, keys, group, closed, ends, options, geometry)
+    return State(orbits, keys, group, closed, ends)
 
 
 def _closed_undecided(point: Point, orbits: Sequence[Orbit], options: Options, geometry: Geometry) -> Guesses:
@@ -342,31 +295,52 @@ def _undecided(point: Point, orbits: Sequence[Orbit], options: Options, geometry
     return own.followed_by(near.least(MAX_GUESSES))
 
 
-def _conclude(
-    point: Point, orbits: list[Orbit], keys: np.ndarray, group: np.ndarray, closed: ClosedCells,
-    ends: Mapping[int, int], options: Options, geometry: Geometry,
-) -> Found:  # fmt: skip
+def _conclude(point: Point, state: State, options: Options, geometry: Geometry) -> Found:
     """Label all cells, and describe what they are labelled with."""
     label = np.full(point.n_cells, -1, np.int64)
     decision = np.zeros(point.n_cells, np.int8)
     raw: dict[int, tuple[float, int, np.ndarray]] = {}
     left = np.full(point.n_cells, -1, np.int64)
     for block in point.blocks():
-        label[block.cells], decision[block.cells] = decide(block, orbits, options.tolerance, geometry)
+        label[block.cells], decision[block.cells] = decide(block, state.orbits, options.tolerance, geometry)
+        _label_spirals(block, state.spirals, label, decision, options, geometry)
         if options.is_loose:
-            _label_ends(block, ends, label, decision)
+            _label_ends(block, state.ends, label, decision)
             continue
-        own = closed.group_of(block, keys, group)
+        own = state.closed.group_of(block, state.keys, state.group)
         own[label[block.cells] >= 0] = -1
         left[block.cells] = own
         _representatives(block, own, raw, geometry)
-    numbers = {g: len(orbits) + i for i, g in enumerate(sorted(raw))}
+    numbers = {g: len(state.orbits) + i for i, g in enumerate(sorted(raw))}
     for g, number in numbers.items():
         label[left == g] = number
     decision[left >= 0] = CLOSED
-    orbits = [*orbits, *(raw_orbit(raw[g][2], geometry) for g in sorted(raw))]
+    orbits = [*state.orbits, *(raw_orbit(raw[g][2], geometry) for g in sorted(raw))]
     _label_sets(point, len(orbits), label, decision, options.rule, geometry)
+    label[label == UNSETTLED] = -1
     return _describe(point, orbits, label, decision, options, geometry)
+
+
+def _label_spirals(
+    block: Block, spirals: Mapping[int, int], label: np.ndarray, decision: np.ndarray, options: Options,
+    geometry: Geometry,
+) -> None:  # fmt: skip
+    """Label the bounded cells that come back near by where those of their box went, in place.
+
+    There are more boxes than are run on where very many cells spiral at once. If all that were run on
+    ended on orbits, the others make no set either: they stay undecided.
+    """
+    rest = np.flatnonzero(block.is_bounded & (label[block.cells] < 0)) if spirals else np.zeros(0, np.int64)
+    if not len(rest):
+        return
+    section = block.section[rest]
+    none_stayed = all(number >= 0 for number in spirals.values())
+    is_near = Recurrence.of(section, options.max_orbit_period, geometry).is_near
+    keys = keys_of(section, options.tolerance, geometry)
+    for row, key, near in zip(rest + block.cells.start, keys.tolist(), is_near, strict=True):
+        number = spirals.get(key, UNSETTLED if none_stayed else -1) if near else -1
+        label[row] = number
+        decision[row] = RUN_ON if number >= 0 else UNDECIDED
 
 
 def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
@@ -402,7 +376,7 @@ def _label_sets(
     for _ in range(rule.n_rounds):
         anchors: Clouds | None = None
         for block in point.blocks():
-            loose = np.flatnonzero(block.is_bounded & (label[block.cells] < 0))
+            loose = np.flatnonzero(block.is_bounded & (label[block.cells] == -1))
             if len(loose):
                 clouds = Clouds.of(block.section[loose], block.turns[loose], geometry, rule)
                 anchors = (clouds if anchors is None else anchors.joined(clouds)).first(rule.n_anchors)
@@ -410,7 +384,7 @@ def _label_sets(
             return
         sets = find_sets(anchors, geometry, rule)
         for block in point.blocks():
-            loose = np.flatnonzero(block.is_bounded & (label[block.cells] < 0))
+            loose = np.flatnonzero(block.is_bounded & (label[block.cells] == -1))
             if len(loose):
                 clouds = Clouds.of(block.section[loose], block.turns[loose], geometry, rule)
                 own = assign(clouds, sets, rule)

@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.bounded import Clouds, Rule
-from pipeline.analysis.attractors.orbits import (
-    APPROACHING,
-    CERTAIN,
-    CLOSED,
-    UNDECIDED,
-    Block,
-    Orbit,
-    decide,
-    near_closed,
-    raw_orbit,
-)
+from pipeline.analysis.attractors.cells import Block
+from pipeline.analysis.attractors.deciding import APPROACHING, CERTAIN, CLOSED, UNDECIDED, decide
+from pipeline.analysis.attractors.orbits import Orbit, raw_orbit
+from pipeline.analysis.attractors.spirals import near_closed
 from pipeline.analysis.sets import Geometry, groups, hashes, mean_distance, nearest_distances
 
 GEOMETRY = Geometry((True, True, False, False), (1.0, 1.0, 10.0, 10.0))
