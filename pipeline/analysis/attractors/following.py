@@ -14,7 +14,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.cells import Block, ClosedCells, Guesses
 from pipeline.analysis.attractors.deciding import REACH, decide
 from pipeline.analysis.attractors.orbits import Orbit, distinct, number_of, polish
-from pipeline.analysis.attractors.spirals import Recurrence, near_closed
+from pipeline.analysis.attractors.spirals import PER_PHASE, Recurrence, near_closed
 from pipeline.analysis.sets import Geometry
 
 LEG = 64
@@ -31,6 +31,13 @@ Advance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 Polish = Callable[[np.ndarray, np.ndarray, np.ndarray], list[Orbit | None]]
 """From parameter points (n,), guesses (n, state) and periods (n,) to orbits."""
+
+Jump = Callable[[np.ndarray, np.ndarray], None]
+"""Puts rows at states (n, state)."""
+
+LEAP, LINEAR = 2.0, 0.1
+"""How far a cell that leaves an unstable orbit leaps, in its distance, and the error of the linear map that
+this allows, in units of the growth."""
 
 
 class Engine:
@@ -74,6 +81,10 @@ class Engine:
         )  # fmt: skip
         self._state[rows], self._step[rows] = result.final_state, result.step_size
         return result.section[:, 0], result.status[:, 0], result.orbit_period[:, 0]
+
+    def jump(self, rows: np.ndarray, states: np.ndarray) -> None:
+        """See `Jump`."""
+        self._state[rows], self._step[rows] = states, 0.0
 
     def polish(self, owner: np.ndarray, point: np.ndarray, period: np.ndarray) -> list[Orbit | None]:
         """See `Polish`."""
@@ -125,7 +136,8 @@ class Ends:
 
 def follow(
     start: np.ndarray, owner: np.ndarray, orbits: Sequence[Sequence[Orbit]], advance: Advance,
-    polish_new: Polish, n_legs: int, max_orbit_period: int, geometry: Geometry, *, spirals_only: bool = False,
+    polish_new: Polish, n_legs: int, max_orbit_period: int, geometry: Geometry, *,
+    jump: Jump | None = None,
 ) -> Ends:  # fmt: skip
     """Run cells on, leg by leg, until each is seen on its way to an orbit.
 
@@ -145,8 +157,9 @@ def follow(
         Longest period guessed.
     geometry
         Of the states.
-    spirals_only
-        Give cells up that do not come back near any more within a leg; they count as having stayed.
+    jump
+        If given, cells are spirals: those that do not come back near any more within a leg are given up
+        (they count as having stayed), and those that leave an unstable orbit slowly leap, see `leap`.
     """
     ends = Ends(
         np.full(len(start), ON_SET), np.full(len(start), float(n_legs * LEG)),
@@ -174,9 +187,60 @@ def follow(
                 if number >= 0 and ends.orbits[point][number].is_stable:
                     _leave(ends, row, number, ends.orbits[point][number], paths[row], geometry)
                     paths[row] = []
-        if spirals_only:
+        if jump is not None:
             going[rows] = Recurrence.of(section, max_orbit_period, geometry).is_near
+            for point in np.unique(owner[rows]):
+                own = np.flatnonzero((owner[rows] == point) & (ends.orbit[rows] == ON_SET))
+                states = leap(section[own], ends.orbits[point], geometry)
+                there = np.isfinite(states).all(axis=1)
+                jump(rows[own[there]], states[there])
     return ends
+
+
+def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np.ndarray:
+    """Where cells that leave an unstable orbit slowly will be when they are `LEAP` times as far from it.
+
+    Beside a bifurcation that takes thousands of periods, along which the orbit's monodromy matrix tells the
+    motion. Let u be the parts of a cell's distance along the unstable eigenvectors, at the sections that
+    share the phase of the orbit's first point, and lambda the multipliers. A cell leaps as long as
+    ``|u'' - lambda**2 u| <= 0.1 (|lambda|**2 - 1) |u|`` over the younger half of them, two returns apart, since
+    near a doubling what is quadratic cancels over two.
+
+    Parameters
+    ----------
+    section
+        A leg, shape (n, LEG, state).
+    orbits
+        Known orbits.
+    geometry
+        Of the states.
+
+    Returns
+    -------
+    ndarray, (n, state)
+        NaN for cells that do not leap.
+    """
+    states = np.full((len(section), section.shape[2]), np.nan)
+    scales = np.asarray(geometry.scales)
+    for orbit in orbits:
+        growth = float(np.abs(orbit.multipliers).max())
+        # where it is fast, nothing is gained
+        if not 1.0 < growth < LEAP ** (orbit.period / LEG):
+            continue
+        values, vectors = np.linalg.eig(orbit.derivative * scales[None, :] / scales[:, None])
+        grows = np.abs(values) > 1.0
+        values, onto = values[grows], np.linalg.inv(vectors)[grows].T
+        n = 2 * int(np.log(LEAP) / np.log(growth) / 2)
+        for phase in range(orbit.period):
+            index = np.arange(section.shape[1] - 1 - phase, -1, -orbit.period)[::-1]
+            distance = geometry.difference(section[:, index[len(index) // 2 :]], orbit.points[0])
+            along = distance @ onto
+            error = np.abs(along[:, 2:] - along[:, :-2] * values**2)
+            allowed = LINEAR * (np.abs(values) ** 2 - 1.0) * np.abs(along[:, :-2])
+            linear = (error <= allowed).all(axis=(1, 2)) & (distance.shape[1] > PER_PHASE)
+            more = ((along[linear, -1] * (values**n - 1.0)) @ vectors[:, grows].T).real
+            states[linear] = orbit.points[0] + (distance[linear, -1] + more) * scales
+    return states
 
 
 def _leave(

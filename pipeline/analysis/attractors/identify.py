@@ -160,7 +160,7 @@ def _run_spirals(
     known = [states[i].orbits for i in asked]
     ends = follow(
         start, owner, known, engine.advance, engine.polish, RUN_ON_LEGS, options.max_orbit_period, geometry,
-        spirals_only=True,
+        jump=engine.jump,
     )  # fmt: skip
     for number, (index, guesses) in enumerate(asked.items()):
         states[index].orbits = ends.orbits[number]
