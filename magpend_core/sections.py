@@ -10,8 +10,8 @@ import numpy as np
 from magpend_core.engine.lanes import Cells, engine_of
 from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD_CLOSED, RECORD_LAST, Settings
 from magpend_core.engine.system import System
-from magpend_core.models.pendulum.parameters import Parameters
-from magpend_core.models.pendulum.systems import PENDULUM_FITTED, system_of
+from magpend_core.models.parameters import Parameters
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.validation import (
     check_array,
     check_count,
@@ -48,6 +48,9 @@ class Sections:
     step_size : ndarray, (branch,)
         Step size that the error control would try next [s]: with `final_state` it continues a
         branch bit for bit.
+    extremes : ndarray, (..., n_keep, n_quantities, 3), or None
+        Least and largest value and mean of each watched quantity over the drive period that ends at the
+        section; NaN for cells that failed, None if nothing was watched.
     """
 
     section: np.ndarray
@@ -59,6 +62,7 @@ class Sections:
     n_rejected: np.ndarray
     final_state: np.ndarray
     step_size: np.ndarray
+    extremes: np.ndarray | None = None
 
 
 SLACK = 1e4
@@ -262,7 +266,8 @@ def sections(
     >>> result.section.shape
     (1, 1, 4)
     """
-    initial = check_states(initial_states, 2, name="initial_states")
+    system = parameters.model.system
+    initial = check_states(initial_states, 2, system.n_states, "initial_states")
     frequency = np.asarray(frequency_hz, np.float64)
     if frequency.ndim == 0:
         frequency = np.full(len(initial), float(frequency))
@@ -270,7 +275,7 @@ def sections(
     packed = np.broadcast_to(parameters.pack(), (len(frequency), 1, len(parameters.names)))
     result = run_branches(
         packed, frequency, initial, n_transient=n_transient, n_keep=n_keep,
-        rtol=rtol, atol=atol, system=system_of(parameters), **options,
+        rtol=rtol, atol=atol, system=system, **options,
     )  # fmt: skip
     per_cell = ("section", "turns", "status", "orbit_period", "n_periods", "n_steps", "n_rejected")
     return replace(result, **{name: getattr(result, name)[:, 0] for name in per_cell})

@@ -26,8 +26,7 @@ from magpend_core.engine.observers import RECORD_LAST
 from magpend_core.engine.simd import WIDTH
 from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import TWO_PI
-from magpend_core.models.pendulum.parameters import Parameters
-from magpend_core.models.pendulum.systems import system_of
+from magpend_core.models.parameters import Parameters
 from magpend_core.sections import check_tolerances, slack_of
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_frequency, check_states
@@ -163,7 +162,7 @@ def trajectory(
         If the trajectory diverges or meets the step limit before the last time; the message is
         the sentence of the `Status`.
     """
-    system = system_of(parameters)
+    system = parameters.model.system
     frequency = float(check_frequency(frequency_hz, ndim=0))
     state = check_states(initial_state, 1, system.n_states, "initial_state")
     grid = check_array("times", times, 1)

@@ -3,9 +3,39 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections import namedtuple
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
+
+
+def positions(names: Iterable[str]) -> Any:
+    """Return where each name stands: a named tuple of integers 0, 1, 2, ...
+
+    Compiled functions read it as a global, so that they say ``p[AT.q]`` and not ``p[16]``; the number
+    is a constant of the machine code.
+
+    Parameters
+    ----------
+    names
+        Distinct Python identifiers that do not begin with an underscore, such as the parameters of a
+        system in the order of its packed vector.
+
+    Raises
+    ------
+    ValueError
+        If a name is given twice, or cannot be an attribute.
+    AttributeError
+        From the result, for a name that it does not have.
+
+    Examples
+    --------
+    >>> AT = positions(("mass", "stiffness"))
+    >>> AT.stiffness
+    1
+    """
+    ordered = tuple(names)
+    return namedtuple("Positions", ordered)(*range(len(ordered)))
 
 
 @dataclass(frozen=True)
@@ -57,6 +87,10 @@ class System:
         How many of the states, from the first, enter the error control; None for all.
     has_layers : bool
         False if there are none; then `layers` is never called.
+    quantity_names : tuple of str
+    quantities : callable or None
+        ``quantities(t, y, dy, u, c)``: a tuple of the named quantities at time `t` [s] since the last
+        section, from the states, their rates, the forcing and the constants.
     """
 
     name: str
@@ -75,11 +109,14 @@ class System:
     escape: tuple[float, ...]
     n_controlled: int | None = None
     has_layers: bool = True
+    quantity_names: tuple[str, ...] = ()
+    quantities: Callable[..., Any] | None = None
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
         """All compiled functions."""
-        return self.constants, self.forcing, self.rhs, self.edges, self.layers, self.jacobian
+        own = self.constants, self.forcing, self.rhs, self.edges, self.layers, self.jacobian
+        return own if self.quantities is None else (*own, self.quantities)
 
     @property
     def label(self) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.vocabulary import split_dims
+from pipeline.layout.vocabulary import split_dims
 
 
 def parameter_dims(attractors: xr.Dataset) -> list[str]:

@@ -49,7 +49,7 @@ def branches(
 
     Starts from the closed orbits that attract cells of the run. The result is kept in DIR/derived.
     """
-    from pipeline.products import branches as derived_branches
+    from pipeline.analysis.branches import product as derived_branches
     from pipeline.spec.problems import SpecError
 
     if csv is not None and not csv.parent.is_dir():
@@ -84,8 +84,8 @@ def draw_branches(
     """Draw branches of periodic orbits over the bifurcation diagram: solid stable, dashed unstable."""
     target = figure_target(directory, f"branches_{state.value}", out, file_format)
     from pipeline import open_run
+    from pipeline.analysis.branches import product as derived_branches
     from pipeline.plots import plot_branches, save_figure
-    from pipeline.products import branches as derived_branches
 
     ds = derived_branches.branches(
         directory, **_options(parameter, low, high, period, generations, recurrences)
@@ -113,8 +113,8 @@ def draw_multipliers(
 ) -> None:
     """Draw the Floquet multipliers along a branch in the complex plane, with the unit circle."""
     target = figure_target(directory, f"multipliers_{branch}", out, file_format)
+    from pipeline.analysis.branches import product as derived_branches
     from pipeline.plots import plot_multipliers, save_figure
-    from pipeline.products import branches as derived_branches
 
     ds = derived_branches.branches(
         directory, **_options(parameter, low, high, period, generations, recurrences)
@@ -145,8 +145,8 @@ def draw_curves(
     Continues the points that `magpend branches` locates; the curves are kept in DIR/derived.
     """
     target = figure_target(directory, f"curves_{second}", out, file_format)
+    from pipeline.analysis.branches import product as derived_branches
     from pipeline.plots import plot_curves, save_figure
-    from pipeline.products import branches as derived_branches
 
     options = _options(parameter, low, high, period, generations, recurrences)
     ds = derived_branches.curves(

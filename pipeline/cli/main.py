@@ -182,16 +182,15 @@ def presets(
     from rich.table import Table
 
     from magpend_core import load_preset, preset_names, preset_provenance
-    from magpend_core.models.pendulum.parameters import describe
 
     # Without a terminal rich would cut the table at 80 columns.
     console = Console(width=None if sys.stdout.isatty() else 160)
     for preset in [name] if name else preset_names():
         parameters = load_preset(preset)
-        origin, about = preset_provenance(preset), describe(parameters)
+        origin, about = preset_provenance(preset), {p.name: p for p in parameters.model.parameters}
         table = Table("name", "value", "unit", "meaning", "source", title=preset)
         for key, value in parameters.as_dict().items():
-            table.add_row(key, f"{value:g}", about[key]["unit"], about[key]["meaning"], origin.get(key, ""))
+            table.add_row(key, f"{value:g}", about[key].unit, about[key].meaning, origin.get(key, ""))
         console.print(table)
 
 
@@ -207,7 +206,7 @@ def _angle(name: str, radians: float | None, degrees: float | None) -> float:
 
 def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     """Exceptions that people can act on, and their exit codes."""
-    from magpend_core.models.pendulum.parameters import ParameterError
+    from magpend_core.models.parameters import ParameterError
     from pipeline.compute.execute import TaskFailedError
     from pipeline.spec.problems import SpecError
     from pipeline.store.directory import DamagedError, LockedError, StoreError

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.layout.schema import STATE_UNITS, STATES
+from magpend_core.models import load_model
 from pipeline.spec.problems import SpecError
 
 if TYPE_CHECKING:
     import xarray as xr
 
 SUFFIXES = (".csv", ".nc")
+STATES, STATE_UNITS = load_model().state_names, load_model().state_units
 MAX_SAMPLES = 100_000_000
 _NAMES = ("angle of link 1", "angle of link 2", "rate of link 1", "rate of link 2")
 

@@ -7,22 +7,47 @@ A task is named by the run directory, the run's digest and its index; it reads t
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from magpend_core import Status, kernel_version, lyapunov_exponents, run_branches
-from magpend_core.models.pendulum.systems import system_of
+from magpend_core import Sections, Status, kernel_version, run_branches
+from magpend_core.engine.system import System
 from pipeline.compute.refinement import infer
-from pipeline.layout.cells import CellMap
+from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.schema import VARIABLES
-from pipeline.products.lyapunov import exponents
+from pipeline.layout.schema import base_variables
+from pipeline.products.product import function_of
+from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec, parse_spec
 from pipeline.store.directory import RefusedError, RunInfo, read_run, write_task
+
+
+@dataclass(frozen=True)
+class Job:
+    """Cells that were integrated, for the products that go on from them.
+
+    Attributes
+    ----------
+    spec : Spec
+    inputs : Inputs
+        What `run_branches` took.
+    cells : Sections
+        What it returned, with leading dims (branch, point).
+    """
+
+    spec: Spec
+    inputs: Inputs
+    cells: Sections
+
+    @property
+    def system(self) -> System:
+        """What was integrated."""
+        return self.spec.model.system
 
 
 @lru_cache(maxsize=4)
@@ -40,31 +65,35 @@ def _prepare(directory: str, digest: str) -> tuple[RunInfo, Spec, Plan, CellMap]
     return info, spec, plan, CellMap(spec)
 
 
+def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
+    """Return all variables of some branches, with leading dims (branch, point)."""
+    keywords: dict[str, Any] = spec.integration.model_dump()
+    for name, options in spec.products.items():
+        keywords |= CELL_PRODUCTS[name].integrate(options)
+    cells = run_branches(
+        inputs.parameters, inputs.frequency_hz, inputs.initial_states, system=spec.model.system, **keywords
+    )
+    values = {v.name: np.asarray(getattr(cells, v.name), dtype=v.dtype) for v in base_variables(spec.model)}
+    job = Job(spec, inputs, cells)
+    for name, options in spec.products.items():
+        values |= function_of(CELL_PRODUCTS[name].compute)(job, options)
+    return values
+
+
 def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
     """Return all variables of a block of cells, in the block's shape."""
     inputs = cells.inputs(block)
-    system = system_of(spec.parameters.load())
-    integration = spec.integration.model_dump()
-
-    def integrate(branches: Any) -> dict[str, np.ndarray]:
-        result = run_branches(
-            inputs.parameters[branches], inputs.frequency_hz[branches], inputs.initial_states[branches],
-            system=system, **integration,
-        )  # fmt: skip
-        values = {v.name: np.asarray(getattr(result, v.name), dtype=v.dtype) for v in VARIABLES}
-        if spec.products.lyapunov:
-            frequency, parameters = inputs.frequency_hz[branches], inputs.parameters[branches]
-            values |= exponents(parameters, frequency, result, spec, system)
-        return values
-
     if spec.refine is None:
-        values = integrate(slice(None))
+        values = integrate(spec, inputs)
     else:
         tile = tuple(s.stop - s.start for s in block[len(spec.axes) :])
         values = infer(
-            tile, spec.refine, lambda branches: {k: v[:, 0] for k, v in integrate(branches).items()},
-            closure_tolerance=spec.integration.closure_tolerance, system=system,
-        )  # fmt: skip
+            tile,
+            spec.refine,
+            lambda rows: {k: v[:, 0] for k, v in integrate(spec, inputs.take(rows)).items()},
+            closure_tolerance=spec.integration.closure_tolerance,
+            system=spec.model.system,
+        )
         values = {name: array[:, None] for name, array in values.items()}
     return {name: cells.outputs(block, array) for name, array in values.items()}
 
@@ -96,19 +125,14 @@ def run_task(directory: str, digest: str, index: int) -> dict[str, Any]:
 def warm_up(spec: Spec) -> float:
     """Compile the kernel that the run needs into the compile cache and return the seconds it took.
 
-    One process compiles, so that workers find the machine code instead of each making it.
+    One process compiles, so that workers find the machine code instead of each making it: what they
+    will do is done here for a single cell over no more than a few periods.
     """
     started = time.perf_counter()
-    parameters = spec.parameters.load()
-    packed, system = parameters.pack().reshape(1, 1, -1), system_of(parameters)
-    options = {**spec.integration.model_dump(), "n_transient": 0, "n_keep": 1}
-    run_branches(packed, np.full((1, 1), 2.0), np.zeros((1, 4)), system=system, **options)
-    if spec.products.lyapunov:
-        n_exponents, short = (
-            spec.products.lyapunov.n_exponents,
-            {"n_transient": 0, "n_periods": 2, "n_blocks": 2},
-        )
-        lyapunov_exponents(
-            packed[0], np.full(1, 2.0), np.zeros((1, 4)), n_exponents=n_exponents, system=system, **short
-        )
+    short = Inputs(
+        spec.values.pack().reshape(1, 1, -1), np.ones((1, 1)), np.zeros((1, len(spec.model.states)))
+    )
+    integration = spec.integration.model_copy(update={"n_transient": 0, "n_keep": 1})
+    products = {name: CELL_PRODUCTS[name].shortest(options) for name, options in spec.products.items()}
+    integrate(replace(spec, integration=integration, products=products), short)
     return time.perf_counter() - started

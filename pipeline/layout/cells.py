@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core.models.pendulum.parameters import describe
-from pipeline.layout.schema import STATE_UNITS, STATES
-from pipeline.spec.parsing import FREQUENCY, GridStarts, ListStarts, RandomStarts, Range, Spec, Starts
+from magpend_core.models.model import Model, State
+from pipeline.layout.vocabulary import BRANCH, FREQUENCY_DIM, START, grid_dim
+from pipeline.spec.parsing import Spec
+from pipeline.spec.starts import GridStarts, ListStarts, RandomStarts, Starts, degrees_key
+from pipeline.spec.tables import FREQUENCY, Range
 
 DIRECTION_CODES = {"up": 1, "down": -1}
-STATE_NAMES = dict(
-    zip(STATES, ("angle of link 1", "angle of link 2", "rate of link 1", "rate of link 2"), strict=True)
-)
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class InitialStates:
         return math.prod(self.shape)
 
     def at(self, flat: np.ndarray) -> np.ndarray:
-        """Return the states with these flat indices, shape (n, 4) [rad, rad/s]."""
+        """Return the states with these flat indices, shape (n, n_states), in the model's units."""
         out = np.empty((len(flat), len(self.columns)))
         steps = np.unravel_index(flat, self.shape) if self.shape else ()
         for i, column in enumerate(self.columns):
@@ -78,17 +77,17 @@ class InitialStates:
 def parameter_axes(spec: Spec) -> tuple[ParameterAxis, ...]:
     """Return the swept parameters in the order of the file."""
     return tuple(
-        ParameterAxis("frequency" if name == FREQUENCY else name, name, axis.array())
+        ParameterAxis(FREQUENCY_DIM if name == FREQUENCY else name, name, axis.array())
         for name, axis in spec.axes.items()
     )
 
 
 def _state_value(table: Any, state: str) -> tuple[Any, float]:
     """Return what the table gives for a state, and the factor to SI units. Degrees end here."""
-    in_degrees = getattr(table, f"{state}_deg")
+    in_degrees = table.of(degrees_key(state))
     if in_degrees is not None:
         return in_degrees, math.pi / 180
-    value = getattr(table, state)
+    value = table.of(state)
     return (0.0 if value is None else value), 1.0
 
 
@@ -97,18 +96,18 @@ def initial_states(starts: Starts) -> InitialStates:
     if isinstance(starts, GridStarts):
         return _grid(starts)
     columns = _rows(starts) if isinstance(starts, ListStarts) else _samples(starts)
-    return InitialStates(("initial_condition",), (len(columns[0]),), tuple(columns))
+    return InitialStates((START,), (len(columns[0]),), tuple(columns))
 
 
 def _grid(starts: GridStarts) -> InitialStates:
     dims: list[str] = []
     columns: list[np.ndarray] = []
     grid: list[int | None] = []
-    for state in STATES:
+    for state in starts.system.state_names:
         value, factor = _state_value(starts, state)
         if isinstance(value, Range):
             grid.append(len(dims))
-            dims.append(f"{state}_0")
+            dims.append(grid_dim(state))
             columns.append(value.array() * factor)
         else:
             grid.append(None)
@@ -120,15 +119,19 @@ def _grid(starts: GridStarts) -> InitialStates:
 def _rows(starts: ListStarts) -> list[np.ndarray]:
     rows, factor = (starts.points, 1.0) if starts.points is not None else (starts.points_deg, math.pi / 180)
     assert rows is not None
-    table = np.array([(*row, 0.0, 0.0)[:4] for row in rows], dtype=np.float64) * factor
-    return list(table.T)
+    n_states = len(starts.system.states)
+    table = np.zeros((len(rows), n_states))
+    for i, row in enumerate(rows):
+        table[i, : len(row)] = row
+    return list((table * factor).T)
 
 
 def _samples(starts: RandomStarts) -> list[np.ndarray]:
-    # Four numbers are drawn per sample whatever is fixed, so that fixing a state leaves the others.
-    uniform = np.random.Generator(np.random.PCG64(starts.seed)).random((starts.n, len(STATES)))
+    # A number is drawn for every state whatever is fixed, so that fixing a state leaves the others.
+    names = starts.system.state_names
+    uniform = np.random.Generator(np.random.PCG64(starts.seed)).random((starts.n, len(names)))
     columns = []
-    for state, u in zip(STATES, uniform.T, strict=True):
+    for state, u in zip(names, uniform.T, strict=True):
         value, factor = _state_value(starts, state)
         low, high = value if isinstance(value, tuple) else (value, value)
         columns.append((low + (high - low) * u) * factor)
@@ -140,33 +143,33 @@ def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
 
     ``direction`` is +1 (up) or -1 (down) here; `open_run` shows words.
     """
-    parameters = describe(spec.parameters.load())
+    model = spec.model
     found = [
-        Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, parameters))
+        Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, model))
         for a in parameter_axes(spec)
     ]
     if FREQUENCY not in spec.axes:
         value = np.array(spec.parameters.frequency_hz, dtype=np.float64)
-        found.append(Coordinate("frequency", (), value, _parameter_attrs(FREQUENCY, parameters)))
+        found.append(Coordinate(FREQUENCY_DIM, (), value, _parameter_attrs(FREQUENCY, model)))
     states = initial_states(spec.initial_conditions)
-    return (*found, *(_branch_coords(spec, states) if spec.continuation else _start_coords(states)))
+    return (*found, *(_branch_coords(spec, states) if spec.continuation else _start_coords(model, states)))
 
 
-def _parameter_attrs(name: str, parameters: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
+def _parameter_attrs(name: str, model: Model) -> dict[str, str]:
     if name == FREQUENCY:
         return {"units": "Hz", "long_name": "drive frequency"}
-    return {"units": parameters[name]["unit"], "long_name": parameters[name]["meaning"]}
+    parameter = model.parameter(name)
+    return {"units": parameter.unit, "long_name": parameter.meaning}
 
 
-def _start_attrs(state: str) -> dict[str, str]:
-    unit = STATE_UNITS[STATES.index(state)]
-    return {"units": unit, "long_name": f"initial {STATE_NAMES[state]}"}
+def _start_attrs(state: State) -> dict[str, str]:
+    return {"units": state.unit, "long_name": f"initial {state.meaning}"}
 
 
-def _start_coords(states: InitialStates) -> list[Coordinate]:
+def _start_coords(model: Model, states: InitialStates) -> list[Coordinate]:
     found = []
-    for i, (state, column) in enumerate(zip(STATES, states.columns, strict=True)):
-        name = f"{state}_0"
+    for i, (state, column) in enumerate(zip(model.states, states.columns, strict=True)):
+        name = grid_dim(state.name)
         dims: tuple[str, ...] = ()
         if column.ndim:
             dims = (name,) if states.grid is not None else states.dims
@@ -180,16 +183,19 @@ def _branch_coords(spec: Spec, states: InitialStates) -> list[Coordinate]:
     n = len(states)
     seeds = np.tile(np.arange(n, dtype=np.int32), len(directions))
     codes = np.repeat([DIRECTION_CODES[d] for d in directions], n).astype(np.int8)
-    dims = ("branch",)
+    dims = (BRANCH,)
     table = states.at(seeds)
     return [
-        Coordinate("branch", dims, np.arange(len(seeds), dtype=np.int32), {"long_name": "branch"}),
+        Coordinate(BRANCH, dims, np.arange(len(seeds), dtype=np.int32), {"long_name": "branch"}),
         Coordinate(
             "direction", dims, codes,
             {"long_name": "direction of the walk", "flag_values": [1, -1], "flag_meanings": "up down"},
         ),
         Coordinate("seed", dims, seeds, {"long_name": "index of the initial condition"}),
-        *(Coordinate(f"{s}_0", dims, table[:, i], _start_attrs(s)) for i, s in enumerate(STATES)),
+        *(
+            Coordinate(grid_dim(s.name), dims, table[:, i], _start_attrs(s))
+            for i, s in enumerate(spec.model.states)
+        ),
     ]  # fmt: skip
 
 
@@ -201,12 +207,16 @@ class Inputs:
     ----------
     parameters : ndarray, (branch, point, parameter)
     frequency_hz : ndarray, (branch, point)
-    initial_states : ndarray, (branch, 4)
+    initial_states : ndarray, (branch, n_states)
     """
 
     parameters: np.ndarray
     frequency_hz: np.ndarray
     initial_states: np.ndarray
+
+    def take(self, branches: Any) -> Inputs:
+        """Return some of the branches."""
+        return Inputs(self.parameters[branches], self.frequency_hz[branches], self.initial_states[branches])
 
 
 class CellMap:
@@ -217,7 +227,7 @@ class CellMap:
     """
 
     def __init__(self, spec: Spec) -> None:
-        base = spec.parameters.load()
+        base = spec.values
         self._names = base.names
         self._packed = base.pack()
         self._fixed_hz = spec.parameters.frequency_hz
@@ -230,7 +240,7 @@ class CellMap:
             self.path: int | None = None
         else:
             n_branches = len(self._states) * len(self._walk.directions)
-            self.dims = (*(a.dim for a in self._axes), "branch")
+            self.dims = (*(a.dim for a in self._axes), BRANCH)
             self.shape = (*(len(a.values) for a in self._axes), n_branches)
             self.path = [a.parameter for a in self._axes].index(self._walk.path)
 

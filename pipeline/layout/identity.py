@@ -23,7 +23,8 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
         "format": FORMAT,
         "kernel_version": kernel_version,
         "spec": tables,
-        "parameter_values": spec.parameters.load().as_dict(),
+        "model_digest": spec.model.digest,
+        "parameter_values": spec.values.as_dict(),
         "chunks": {v.name: list(plan.chunks(v)) for v in plan.variables},
     }
 

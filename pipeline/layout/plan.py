@@ -8,21 +8,21 @@ files are the same bytes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.layout.cells import CellMap
-from pipeline.layout.schema import LYAPUNOV_VARIABLES, VARIABLES, Variable, own_sizes
-from pipeline.spec.parsing import FREQUENCY, Lyapunov, Spec
+from pipeline.layout.schema import sizes_of, variables_of
+from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.products.variable import Variable
+from pipeline.spec.parsing import Spec
+from pipeline.spec.tables import FREQUENCY
 
 MICROSECONDS_PER_PERIOD, MICROSECONDS_PER_SECOND = 9.0, 21.5
 """Rule of thumb for one trajectory on one core at rtol 1e-8: a period of length T takes
 9 us + 21.5 us T/s (measured between 0.1 and 3 Hz on AVX-512, good to 20 %)."""
-
-TANGENT_COST = 2.0
-"""A period with all tangent vectors in units of one without (1.6 for one vector)."""
 
 RTOL_OF_RULE = 1e-8
 ROOT = 6
@@ -56,11 +56,12 @@ class Plan:
         The dim that branches walk; None in a sweep.
     block : tuple of int
         Cells of a task, per dim.
-    n_keep : int
+    variables : tuple of Variable
+        Variables of the cube.
+    sizes : dict
+        Sizes of the dims that are not cell dims.
     seconds_per_cell : float
         Estimated time on one core [s].
-    lyapunov : Lyapunov or None
-        What is asked for of exponents.
     """
 
     kind: str
@@ -68,19 +69,9 @@ class Plan:
     shape: tuple[int, ...]
     path: int | None
     block: tuple[int, ...]
-    n_keep: int
+    variables: tuple[Variable, ...]
+    sizes: Mapping[str, int]
     seconds_per_cell: float
-    lyapunov: Lyapunov | None = None
-
-    @property
-    def variables(self) -> tuple[Variable, ...]:
-        """Variables of the cube."""
-        return variables_of(self.lyapunov)
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Sizes of the dims that are not cell dims."""
-        return _sizes(self.n_keep, self.lyapunov)
 
     @property
     def n_cells(self) -> int:
@@ -142,15 +133,6 @@ class Plan:
         return (*chunk, *(sizes[d] for d in variable.own_dims))
 
 
-def variables_of(lyapunov: Lyapunov | None) -> tuple[Variable, ...]:
-    """Return the variables of a cube with these products."""
-    return (*VARIABLES, *LYAPUNOV_VARIABLES) if lyapunov else VARIABLES
-
-
-def _sizes(n_keep: int, lyapunov: Lyapunov | None) -> dict[str, int]:
-    return own_sizes(n_keep, lyapunov.n_exponents, lyapunov.n_blocks) if lyapunov else own_sizes(n_keep)
-
-
 def make_plan(spec: Spec) -> Plan:
     """Lay out a run.
 
@@ -174,8 +156,8 @@ def make_plan(spec: Spec) -> Plan:
             wanted = max(wanted, min(LEAST_LATTICE * spec.refine ** len(grid), most))
         block = (*(1 for _ in spec.axes), *_tile(grid, spec.refine, wanted))
     return Plan(
-        spec.kind, cells.dims, cells.shape, cells.path, block, spec.integration.n_keep, seconds,
-        spec.products.lyapunov,
+        spec.kind, cells.dims, cells.shape, cells.path, block, variables_of(spec.model, spec.products),
+        sizes_of(spec.model, spec.products, spec.integration.n_keep), seconds,
     )  # fmt: skip
 
 
@@ -186,8 +168,7 @@ def _seconds_per_cell(spec: Spec) -> float:
     mean_period = float(np.mean(1.0 / np.asarray(frequency)))
     microseconds = MICROSECONDS_PER_PERIOD + MICROSECONDS_PER_SECOND * mean_period
     periods = float(integration.n_transient + integration.n_keep)
-    if spec.products.lyapunov:
-        periods += TANGENT_COST * (spec.products.lyapunov.n_transient + spec.products.lyapunov.n_periods)
+    periods += sum(CELL_PRODUCTS[name].cost(options) for name, options in spec.products.items())
     return periods * microseconds * 1e-6 * float((RTOL_OF_RULE / integration.rtol) ** (1 / ROOT))
 
 
@@ -202,9 +183,8 @@ def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: flo
 
 def _bytes_per_cell(spec: Spec) -> int:
     """Bytes of a cell's variables, uncompressed."""
-    lyapunov = spec.products.lyapunov
-    sizes = _sizes(spec.integration.n_keep, lyapunov)
-    return sum(v.itemsize(sizes) for v in variables_of(lyapunov))
+    sizes = sizes_of(spec.model, spec.products, spec.integration.n_keep)
+    return sum(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
 
 
 def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, ...]:

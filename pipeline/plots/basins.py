@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import AutoMinorLocator, LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.analysis.vocabulary import CLOSED_ORBIT, GRID_DIMS, INFERRED
+from pipeline.layout.vocabulary import CLOSED_ORBIT, INFERRED, is_grid_dim
 from pipeline.plots import palette, style
 
 _SIDE_IN = 3.9
@@ -91,7 +91,7 @@ def plot_basins(
 
 def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, str]:
     """Names of the two axes of the image: horizontal, vertical."""
-    grid = [d for d in GRID_DIMS if d in attractors["attractor_id"].dims]
+    grid = [str(d) for d in attractors["attractor_id"].dims if is_grid_dim(str(d))]
     if len(grid) < 2:
         have = ", ".join(start_dims(attractors)) or "none"
         raise ValueError(

@@ -23,8 +23,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import AutoMinorLocator
 
-from pipeline.analysis import vocabulary
 from pipeline.analysis.sides import Side, side
+from pipeline.layout import vocabulary
 from pipeline.plots import style
 
 MARKER_LIMIT = 200_000

@@ -13,7 +13,7 @@ from matplotlib.ticker import AutoMinorLocator
 
 from pipeline.analysis.chaos.lyapunov import GOOD, Motion, pooled_mean, summarise
 from pipeline.analysis.selection import select_points
-from pipeline.analysis.vocabulary import split_dims
+from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import style
 
 UNITS = ("s", "period")

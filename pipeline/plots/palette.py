@@ -24,8 +24,8 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.analysis import vocabulary
 from pipeline.analysis.sides import Side
+from pipeline.layout import vocabulary
 from pipeline.plots import style
 
 COLOURS = (

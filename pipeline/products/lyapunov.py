@@ -1,77 +1,121 @@
-"""The product ``lyapunov``: exponents of a task's cells, from the last kept section of each on."""
+"""The product ``lyapunov``: exponents along each cell's attractor, from its last kept section on."""
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from enum import IntEnum
+from typing import Any, Self
 
-from magpend_core import LyapunovExponents, Sections, Status, lyapunov_exponents
-from magpend_core.engine.lyapunov import MOST_LOSS
-from magpend_core.engine.system import System
-from pipeline.layout.schema import LYAPUNOV_VARIABLES, LyapunovFlag
-from pipeline.spec.parsing import STATES, Spec
+from pydantic import model_validator
 
-AUDIT = 0.01
-"""Largest allowed difference between the sum of the exponents and the divergence, in units of the sum of
-their moduli."""
+from pipeline.products.product import CellProduct, Options, option
+from pipeline.products.variable import Variable, flag_attrs
+
+TANGENT_COST = 2.0
+"""A period with all tangent vectors in units of one without (1.6 for one vector)."""
 
 
-def exponents(
-    parameters: np.ndarray, frequency_hz: np.ndarray, cells: Sections, spec: Spec, system: System
-) -> dict[str, np.ndarray]:
-    """Return `LYAPUNOV_VARIABLES` for the cells of a task.
+class LyapunovOptions(Options):
+    """``[products] lyapunov = {...}``."""
 
-    Parameters
-    ----------
-    parameters, frequency_hz
-        As `run_branches` took them, shapes (branch, point, parameter) and (branch, point).
-    cells
-        What it returned.
-    spec
-        Specification with the product.
-    system
-        What is integrated.
-
-    Returns
-    -------
-    dict
-        Arrays with leading dims (branch, point). A cell without an attractor (diverged, step limit,
-        unreached) has NaN and the flag ``ABSENT``.
-    """
-    options = spec.products.lyapunov
-    assert options is not None
-    integration = spec.integration
-    branch, point = np.nonzero(np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED)))
-    found = lyapunov_exponents(
-        parameters[branch, point], frequency_hz[branch, point], cells.section[branch, point, -1],
-        rtol=integration.rtol, atol=integration.atol,
-        max_steps_per_period=integration.max_steps_per_period, system=system, **options.model_dump(),
+    n_exponents: int | None = option(
+        None, "Exponents, from the largest on; by default one for each state.", ge=1
+    )
+    n_transient: int = option(
+        200, "Time in which the tangent vectors turn into their directions.", unit="drive periods",
+        ge=0, le=1_000_000,
     )  # fmt: skip
-    is_closed = cells.status[branch, point] == Status.PERIODIC
-    values = {
-        "lyapunov": np.where(is_closed[:, None], _falling(found.weighted), found.exponents),
-        "lyapunov_stderr": found.stderr,
-        "lyapunov_blocks": found.blocks,
-        "divergence": found.divergence,
-        "lyapunov_flag": flags(found),
-    }
-    filled = {}
-    for variable in LYAPUNOV_VARIABLES:
-        own = values[variable.name].shape[1:]
-        filled[variable.name] = np.full((*cells.status.shape, *own), variable.fill, variable.dtype)
-        filled[variable.name][branch, point] = values[variable.name]
-    return filled
+    n_periods: int = option(
+        400, "Time over which growth is averaged.", unit="drive periods", ge=2, le=100_000_000
+    )
+    n_blocks: int = option(16, "Blocks of that time, for standard errors.", ge=2, le=1000)
+
+    @model_validator(mode="after")
+    def _whole_blocks(self) -> Self:
+        if self.n_periods % self.n_blocks:
+            nearest = -(-self.n_periods // self.n_blocks) * self.n_blocks
+            raise ValueError(
+                f"n_periods = {self.n_periods} must be a multiple of n_blocks = {self.n_blocks}, "
+                f"such as {nearest}."
+            )
+        return self
 
 
-def _falling(rates: np.ndarray) -> np.ndarray:
-    return np.sort(rates, axis=1)[:, ::-1]
+class LyapunovFlag(IntEnum):
+    """How far a cell's Lyapunov exponents can be trusted."""
+
+    ABSENT = 0
+    GOOD = 1
+    AUDIT_FAILED = 2
+    UNRESOLVED = 3
+    FAILED = 4
+
+    @property
+    def sentence(self) -> str:
+        """What it means."""
+        return _FLAG_SENTENCES[self]
 
 
-def flags(found: LyapunovExponents) -> np.ndarray:
-    """Codes of `LyapunovFlag`; only a whole spectrum can be held against the divergence."""
-    flag = np.full(len(found.status), LyapunovFlag.GOOD, np.int8)
-    if found.exponents.shape[1] == len(STATES):
-        missing = np.abs(found.exponents.sum(axis=1) - found.divergence)
-        flag[missing > AUDIT * np.abs(found.exponents).sum(axis=1)] = LyapunovFlag.AUDIT_FAILED
-    flag[found.loss > MOST_LOSS] = LyapunovFlag.UNRESOLVED
-    flag[found.status != Status.BOUNDED] = LyapunovFlag.FAILED
-    return flag
+_FLAG_SENTENCES = {
+    LyapunovFlag.ABSENT: "pending, or the cell has no attractor to go on from",
+    LyapunovFlag.GOOD: "no objection",
+    LyapunovFlag.AUDIT_FAILED: "the exponents do not add up to the divergence; use a smaller rtol",
+    LyapunovFlag.UNRESOLVED: "tangent vectors became parallel; only the first exponent is resolved",
+    LyapunovFlag.FAILED: "the integration failed",
+}
+
+LYAPUNOV_VARIABLES = (
+    Variable(
+        "lyapunov", ("exponent",), "float64", math.nan, "1/s",
+        "Lyapunov exponents per unit time, in falling order",
+        {"comment": "divided by the frequency: per drive period. Plain averages; weighted Birkhoff averages "
+         "where the orbit is closed"},
+    ),
+    Variable("lyapunov_stderr", ("exponent",), "float64", math.nan, "1/s", "standard error over the blocks"),
+    Variable(
+        "lyapunov_blocks", ("block", "exponent"), "float64", math.nan, "1/s",
+        "mean growth rate in each block of drive periods",
+    ),
+    Variable("divergence", (), "float64", math.nan, "1/s", "time average of the flow's divergence"),
+    Variable(
+        "lyapunov_flag", (), "int8", int(LyapunovFlag.ABSENT), "1", "trust in the exponents",
+        flag_attrs(LyapunovFlag),
+    ),
+)  # fmt: skip
+"""Variables of ``[products] lyapunov``."""
+
+
+def _variables(options: LyapunovOptions, model: Any) -> tuple[Variable, ...]:
+    return LYAPUNOV_VARIABLES
+
+
+def _sizes(options: LyapunovOptions, model: Any) -> dict[str, int]:
+    return {"exponent": _settled(options, model).n_exponents or 0, "block": options.n_blocks}
+
+
+def _settled(options: LyapunovOptions, model: Any) -> LyapunovOptions:
+    n = len(model.states)
+    if options.n_exponents is not None and options.n_exponents > n:
+        raise ValueError(
+            f"n_exponents = {options.n_exponents}: must be at most {n}, the number of states of {model.name}."
+        )
+    return options.model_copy(update={"n_exponents": options.n_exponents or n})
+
+
+def _numbers(options: LyapunovOptions, model: Any) -> dict[str, Any]:
+    return {"exponent": range(1, (_settled(options, model).n_exponents or 0) + 1)}
+
+
+def _cost(options: LyapunovOptions) -> float:
+    return TANGENT_COST * (options.n_transient + options.n_periods)
+
+
+def _shortest(options: LyapunovOptions) -> LyapunovOptions:
+    return options.model_copy(update={"n_transient": 0, "n_periods": 2, "n_blocks": 2})
+
+
+LYAPUNOV = CellProduct(
+    "lyapunov", "Lyapunov exponents along each cell's attractor, with errors, convergence and an audit.",
+    LyapunovOptions, _variables, _sizes, _cost, "pipeline.compute.exponents:exponents",
+    settle=_settled, coordinates=_numbers, shortest=_shortest,
+)  # fmt: skip

@@ -13,7 +13,7 @@ import xarray as xr
 from pipeline.analysis.basins.basins import DIVERGED, outcomes
 from pipeline.analysis.basins.numbers import Interval, basin_fractions
 from pipeline.analysis.chaos.chaos import KINDS
-from pipeline.analysis.vocabulary import split_dims
+from pipeline.layout.vocabulary import split_dims
 
 FEW_POINTS = 6
 """Up to so many parameter points get a table each."""

@@ -14,9 +14,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pipeline.analysis.vocabulary import GRID_DIMS, START_DIMS
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.progress import Progress, duration, size
 from pipeline.spec.parsing import Spec, load_spec, parse_spec
 from pipeline.spec.problems import SpecError
@@ -227,9 +227,9 @@ def state(directory: str | Path) -> State:
 
 def first_figure(plan: Plan) -> str:
     """Name of the figure of ``magpend plot`` that shows a run as a whole."""
-    swept = [d for d in plan.dims if d not in START_DIMS]
+    swept = [d for d in plan.dims if not is_start_dim(d)]
     long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
-    n_swept, n_grid = (sum(d in names for d in long) for names in (swept, GRID_DIMS))
+    n_swept, n_grid = sum(d in swept for d in long), sum(is_grid_dim(d) for d in long)
     if n_swept >= 2:
         return "regimes"
     if n_swept == 0 and n_grid >= 2:

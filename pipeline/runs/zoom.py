@@ -11,21 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.spec.parsing import (
-    FREQUENCY,
-    STATES,
-    GridStarts,
-    RandomStarts,
-    Range,
-    Spec,
-    load_spec,
-    parse_spec,
-)
+from pipeline.spec.parsing import Spec, load_spec, parse_spec
 from pipeline.spec.problems import SpecError
+from pipeline.spec.starts import GridStarts, RandomStarts, degrees_key, state_of_key
+from pipeline.spec.tables import FREQUENCY, Range
 
 MARK = "(zoom)"
 _ORDER = ("parameters", "axes", "initial_conditions", "continuation", "integration", "products", "execution")
-STATE_KEYS = (*STATES, *(f"{state}_deg" for state in STATES))
 _ROUNDING = 1e-9
 """Relative amount by which a range may pass the old one's end without a note: degrees are converted."""
 
@@ -52,7 +44,7 @@ class Changes:
     Attributes
     ----------
     ranges : dict
-        Lowest and highest value by key: of states (``psi1`` [rad], ``psi1_deg``, ...), ``frequency_hz`` or
+        Lowest and highest value by key: of states (with ``_deg`` in degrees), ``frequency_hz`` or
         parameters.
     pins : dict
         One value by such a key.
@@ -107,14 +99,14 @@ def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
     data = spec.as_dict()
     notes: list[str] = []
     for key, value in changes.pins.items():
-        _put(data, key, value)
+        _put(spec, data, key, value)
     for key, (low, high) in changes.ranges.items():
         old = _extent(spec, key)
         if old and not (old[0] - _slack(old) <= low and high <= old[1] + _slack(old)):
             notes.append(f"{key}: {low:g} to {high:g} reaches beyond the old {old[0]:g} to {old[1]:g}.")
         num = _points(spec, key, changes)
-        as_interval = _state(key) is not None and isinstance(spec.initial_conditions, RandomStarts)
-        _put(data, key, [low, high] if as_interval else {"start": low, "stop": high, "num": num})
+        as_interval = _state(spec, key) is not None and isinstance(spec.initial_conditions, RandomStarts)
+        _put(spec, data, key, [low, high] if as_interval else {"start": low, "stop": high, "num": num})
     if changes.samples is not None:
         data["initial_conditions"]["n"] = changes.samples
     data["title"] = spec.title if spec.title.endswith(MARK) else f"{spec.title} {MARK}".strip()
@@ -146,17 +138,19 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
 # ---- changes -----------------------------------------------------------------------------------
 
 
-def _state(key: str) -> str | None:
+def _state(spec: Spec, key: str) -> str | None:
     """Name of the state that a key sets, None if it is a parameter's."""
-    return key.removesuffix("_deg") if key in STATE_KEYS else None
+    return state_of_key(key, spec.model)
 
 
 def _check(spec: Spec, changes: Changes) -> list[str]:
     """Problems with the changes themselves."""
     keys = [*changes.ranges, *changes.pins]
     if not keys:
-        return ["zoom: nothing to change; give a range such as --psi1-deg -10 10, or --at frequency_hz=2.2."]
-    names = [_state(key) or key for key in keys]
+        return [
+            "zoom: nothing to change; give a range such as --axis NAME=LOW:HIGH, or --at frequency_hz=2.2."
+        ]
+    names = [_state(spec, key) or key for key in keys]
     problems = [f"{n}: is changed twice; keep one." for n in dict.fromkeys(names) if names.count(n) > 1]
     for key, (low, high) in changes.ranges.items():
         if not low < high:
@@ -166,42 +160,42 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
         problems += [
             f"{key}: the initial conditions are a list, which has no ranges; zoom into parameters alone."
             for key in keys
-            if _state(key)
+            if _state(spec, key)
         ]
         return problems
-    ranged = {_state(key) or key for key in changes.ranges}
+    ranged = {_state(spec, key) or key for key in changes.ranges}
     sampled = isinstance(starts, RandomStarts)
     if changes.samples is not None and not sampled:
         problems.append(f"samples = {changes.samples}: the initial conditions are not random; drop it.")
-    if changes.num is not None and all(sampled and _state(key) for key in changes.ranges):
+    if changes.num is not None and all(sampled and _state(spec, key) for key in changes.ranges):
         problems.append(f"num = {changes.num}: no new range has points; give one, or drop it.")
     for name in changes.nums:
         if name not in ranged:
             problems.append(f"points of {name}: no range is given for it; give one or drop it.")
-        elif sampled and name in STATES:
+        elif sampled and name in spec.model.state_names:
             problems.append(
                 f"number of points of {name}: samples have none; --samples says how many are drawn."
             )
     for key in changes.ranges:
-        if not (sampled and _state(key)) and _points(spec, key, changes) < 2:
+        if not (sampled and _state(spec, key)) and _points(spec, key, changes) < 2:
             problems.append(f"{key}: a range has 2 points or more; say how many, such as --num 101.")
     return problems
 
 
 def _points(spec: Spec, key: str, changes: Changes) -> int:
     """Points of a new range: as asked for, else as before, else 0."""
-    asked = changes.nums.get(_state(key) or key, changes.num)
+    asked = changes.nums.get(_state(spec, key) or key, changes.num)
     old = _old_range(spec, key)
     return asked if asked is not None else (len(old.array()) if old is not None else 0)
 
 
 def _old(spec: Spec, key: str) -> tuple[Any, float]:
     """What the old specification has for the key, and the factor to the key's unit."""
-    state = _state(key)
+    state = _state(spec, key)
     if state is None:
         return spec.axes.get(key), 1.0
-    for name in (state, f"{state}_deg"):
-        value = getattr(spec.initial_conditions, name)
+    for name in (state, degrees_key(state)):
+        value = getattr(spec.initial_conditions, name, None)
         if value is not None:
             same = name == key
             return value, 1.0 if same else (math.pi / 180 if name != state else 180 / math.pi)
@@ -226,12 +220,12 @@ def _slack(extent: tuple[float, float]) -> float:
     return _ROUNDING * max(abs(extent[0]), abs(extent[1]))
 
 
-def _put(data: dict[str, Any], key: str, value: Any) -> None:
+def _put(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
     """Set a state's or parameter's value or range in plain data, and take its old one out."""
-    state = _state(key)
+    state = _state(spec, key)
     if state is not None:
         data["initial_conditions"].pop(state, None)
-        data["initial_conditions"].pop(f"{state}_deg", None)
+        data["initial_conditions"].pop(degrees_key(state), None)
         data["initial_conditions"][key] = value
         return
     parameters = data["parameters"]
@@ -253,7 +247,7 @@ def to_toml(spec: Spec) -> str:
     a line.
     """
     data = spec.as_dict()
-    lines = [f"{key} = {_value(data[key])}" for key in ("kind", "title") if data[key]]
+    lines = [f"{key} = {_value(data[key])}" for key in ("kind", "title", "model") if data[key]]
     names = [name for name in data if isinstance(data[name], dict)]
     for name in sorted(names, key=lambda n: _ORDER.index(n) if n in _ORDER else len(_ORDER)):
         # an empty table says nothing

@@ -42,7 +42,6 @@ from zarr.storage import LocalStore, WrapperStore
 from pipeline.layout.cells import Coordinate, coordinates
 from pipeline.layout.identity import canonical, differences, digest_of
 from pipeline.layout.plan import Plan
-from pipeline.layout.schema import STATES
 from pipeline.spec.parsing import Spec
 
 if TYPE_CHECKING:
@@ -191,7 +190,12 @@ def _versions() -> dict[str, str]:
 
 def _write_skeleton(cube: Path, spec: Spec, plan: Plan, attrs: Mapping[str, Any]) -> None:
     """Write the metadata of all variables, and the coordinates."""
-    kind = {"kind": plan.kind, "state": list(STATES), "Conventions": "CF-1.11"}
+    kind = {
+        "kind": plan.kind,
+        "model": spec.model_name,
+        "state": list(spec.model.state_names),
+        "Conventions": "CF-1.11",
+    }
     group = zarr.create_group(LocalStore(cube), zarr_format=3, attributes={**kind, **attrs})
     for variable in plan.variables:
         _create_array(

@@ -10,8 +10,8 @@ import numpy as np
 
 from pipeline.layout.cells import DIRECTION_CODES
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.schema import LINKS, STATE_UNITS, STATES
-from pipeline.spec.parsing import parse_spec
+from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.spec.parsing import Spec, parse_spec
 from pipeline.store import directory as store
 
 if TYPE_CHECKING:
@@ -66,38 +66,41 @@ def open_committed(
     ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
     names = [v.name for v in plan.variables]
     ds = ds.set_coords([name for name in ds.data_vars if name not in names])
-    ds = ds[names].assign_coords(_labels())
-    if "exponent" in ds.dims:
-        numbers = np.arange(1, ds.sizes["exponent"] + 1, dtype=np.int32)
-        ds = ds.assign_coords(exponent=("exponent", numbers, {"long_name": "number of the exponent"}))
+    spec = parse_spec(info.spec)
+    ds = ds[names].assign_coords(_labels(spec))
     if "direction" in ds.coords:
         ds = ds.assign_coords(direction=_words(ds.coords["direction"]))
     version = info.versions.get("magpend", "(not installed)")
-    spec = parse_spec(info.spec)
-    lyapunov = spec.products.lyapunov
     attrs: dict[str, Any] = {
         "title": info.title,
         "source": f"magpend {version}, kernel {info.identity['kernel_version']}",
         "kind": plan.kind,
+        "model": spec.model_name,
         "spec": info.spec_text,
         "digest": info.digest,
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
         # numbers only: netCDF knows no truth values
         **{name: int(v) if isinstance(v, bool) else v for name, v in spec.integration.model_dump().items()},
-        **{f"lyapunov_{k}": v for k, v in (lyapunov.model_dump() if lyapunov else {}).items()},
+        **{f"{name}_{k}": v for name, o in spec.products.items() for k, v in o.plain().items()},
     }
     if plan.path is not None:
         attrs["path"] = plan.dims[plan.path]
     return ds.assign_attrs(attrs)
 
 
-def _labels() -> dict[str, Any]:
-    """Return the names of states and links."""
-    return {
-        "state": ("state", list(STATES), {"long_name": "component of the state"}),
-        "state_units": ("state", list(STATE_UNITS), {"long_name": "unit of the component"}),
-        "link": ("link", list(LINKS), {"long_name": "link, by its angle"}),
+def _labels(spec: Spec) -> dict[str, Any]:
+    """Return the names along the dims that are not cell dims."""
+    model = spec.model
+    labels: dict[str, Any] = {
+        "state": ("state", list(model.state_names), {"long_name": "component of the state"}),
+        "state_units": ("state", list(model.state_units), {"long_name": "unit of the component"}),
     }
+    if model.angles:
+        labels[model.angle_dim] = (model.angle_dim, list(model.angles), {"long_name": "by its angle"})
+    for name, options in spec.products.items():
+        for dim, values in CELL_PRODUCTS[name].coordinates(options, model).items():
+            labels[dim] = (dim, list(values))
+    return labels
 
 
 def _words(direction: xr.DataArray) -> Any:

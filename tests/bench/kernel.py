@@ -284,7 +284,7 @@ def title_of(case: Case) -> str:
     return (
         f"{target()} ({numba.config.CPU_NAME or llvmlite.binding.get_host_cpu_name()}): "
         f"{len(case.initial)} trajectories, {case.n_periods} periods at {case.frequency_hz:g} Hz, "
-        f"tolerance {case.tolerance:.0e}, eps_drive {case.parameters.drive.eps_drive:g}"
+        f"tolerance {case.tolerance:.0e}, eps_drive {case.parameters['eps_drive']:g}"
     )
 
 

@@ -318,7 +318,7 @@ def describe(problem: Problem) -> str:
     """Heading of one drive's results."""
     m, n_periods = problem.reference.shape[:2]
     return (
-        f"eps_drive = {problem.parameters.drive.eps_drive:g}, {problem.frequency_hz[0]:g} Hz, "
+        f"eps_drive = {problem.parameters['eps_drive']:g}, {problem.frequency_hz[0]:g} Hz, "
         f"{len(problem.frequency_hz)} trajectories, median error of {m} at section {n_periods} "
         f"(reference good to {problem.uncertainty:.0e})"
     )

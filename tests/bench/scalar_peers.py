@@ -110,7 +110,7 @@ def split_solution(
     from scipy.integrate import solve_ivp
 
     function = _scipy_function(parameters, frequency_hz)
-    duty = parameters.drive.duty_cycle
+    duty = parameters["duty_cycle"]
     section = np.empty((n_periods, 4))
     y = initial_state
     for i in range(n_periods):

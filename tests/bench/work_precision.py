@@ -66,7 +66,7 @@ def draw_panel(axes: Any, problem: Problem, curves: list[Curve], letter: str) ->
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(which="major", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
-    steepness = rf"$\varepsilon_\mathrm{{drive}} = {problem.parameters.drive.eps_drive:g}$"
+    steepness = rf"$\varepsilon_\mathrm{{drive}} = {problem.parameters['eps_drive']:g}$"
     axes.set_title(f"({letter})  {steepness}, {problem.frequency_hz[0]:g} Hz", loc="left", fontsize=10)
     n_periods = problem.reference.shape[1]
     axes.set_xlabel(f"median scaled error after {n_periods} periods")

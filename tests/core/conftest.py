@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 import magpend_core
-from magpend_core import load_preset
+from magpend_core import load_model, load_preset
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import sincos
-from magpend_core.models.pendulum.parameters import DipoleMagnet, Parameters
 
 DATA = Path(__file__).parent / "data"
 
@@ -28,8 +27,7 @@ def preset():
 @pytest.fixture(scope="session")
 def dipoles(preset):
     """The preset with point dipoles that are about as strong as the fitted magnets."""
-    magnet = DipoleMagnet(pole1=120.0, pole2=120.0, l2=preset.magnet.l2, h=preset.magnet.h)
-    return Parameters(pendulum=preset.pendulum, friction=preset.friction, drive=preset.drive, magnet=magnet)
+    return load_model("pendulum-dipole").load(pole1=120.0, pole2=120.0)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ def by_scipy(parameters, frequency, start, times):
         return np.concatenate([y[2:], accelerations(t, y, parameters, frequency)])
 
     period = 1.0 / frequency
-    duty = parameters.drive.duty_cycle
+    duty = parameters["duty_cycle"]
     n_periods = int(np.ceil(times[-1] * frequency))
     edges = np.sort(np.concatenate([np.arange(n_periods + 1), np.arange(n_periods) + duty])) * period
     states, y = np.empty((len(times), 4)), np.array(start, dtype=float)

@@ -58,7 +58,7 @@ class LinkConstants(NamedTuple):
     omega: Any  # rad/s, of the drive
     phase: Any  # rad, Eq. 14 corrected
     offset: Any  # a of Eq. 13
-    drive_amplitude: Any  # N m, 2 q/pi
+    drive_amplitude: Any  # N m, 2 q/pi of the square wave, q of the sine
     eps_drive: Any
     compliance1: Any  # 1/(kg m2), acceleration per torque on link 1, links in line
     per_reversal1: Any  # 1/(rad2/s3), see `System.layers`
@@ -109,25 +109,43 @@ N_DIPOLE = len(DipoleConstants._fields)
 
 
 def link_constants(frequency: Any, p: Any) -> Any:
-    """Derive `LinkConstants` from the drive frequency [Hz] and the packed parameters."""
-    g, l1, m1, m2, e1, e2, J1, J2, T1, T2, c, mu, mu0, c0, eps, duty, q, eps_drive = (
-        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8],
-        p[9], p[10], p[11], p[12], p[13], p[14], p[15], p[16], p[17],
-    )  # fmt: skip
-    B1 = J1 + e1 * e1 * m1 + l1 * l1 * m2
-    B2 = J2 + e2 * e2 * m2
+    """Derive `LinkConstants` from the drive frequency [Hz] and the packed parameters.
+
+    A template: `AT` tells where each parameter stands, `drive_constants` is that of the drive.
+    """
+    g, l1, m1, m2, e1, e2 = p[AT.g], p[AT.l1], p[AT.m1], p[AT.m2], p[AT.e1], p[AT.e2]
+    T1, T2, c, mu, mu0, eps = p[AT.T1], p[AT.T2], p[AT.c], p[AT.mu], p[AT.mu0], p[AT.eps]
+    B1 = p[AT.J1] + e1 * e1 * m1 + l1 * l1 * m2
+    B2 = p[AT.J2] + e2 * e2 * m2
     N12 = m2 * e2 * l1
-    phase = (math.pi - TWO_PI * duty) / 2.0
+    phase, offset, amplitude, eps_drive = drive_constants(p)
     per_det = 1.0 / (B1 * B2 - N12 * N12)
     jump1 = 2.0 * (T1 + mu * g * (m1 + m2)) * B2 * per_det
     jump2 = 2.0 * (T2 + mu * g * m2) * (B1 + N12) * per_det
     return LinkConstants(
         B1, B2, N12, m1 * g * e1 + m2 * g * l1, m2 * g * e2, B1 * B2,
         m1 * g, m2 * g, m1 * e1, m2 * e2, m2 * l1, m1 * e1 + m2 * l1,
-        T1, T2, 2.0 * c, c, mu, TWO_OVER_PI * mu0, TWO_OVER_PI * (1.0 - mu0), c0, eps, 1.0 / eps,
-        TWO_PI * frequency, phase, -sin(phase), TWO_OVER_PI * q, eps_drive,
+        T1, T2, 2.0 * c, c, mu, TWO_OVER_PI * mu0, TWO_OVER_PI * (1.0 - mu0), p[AT.c0], eps, 1.0 / eps,
+        TWO_PI * frequency, phase, offset, amplitude, eps_drive,
         B2 * per_det, eps / max(jump1, 1e-30), eps / max(jump2, 1e-30),
     )  # fmt: skip
+
+
+def square_wave_constants(p: Any) -> Any:
+    """Phase and offset (Eq. 13, 14, corrected), amplitude over pi/2 and steepness. A template."""
+    phase = (math.pi - TWO_PI * p[AT.duty_cycle]) / 2.0
+    return phase, -sin(phase), TWO_OVER_PI * p[AT.q], p[AT.eps_drive]
+
+
+def sine_constants(p: Any) -> Any:
+    """Phase, offset, amplitude, steepness (without use) of a sine. A template."""
+    return 0.0, 0.0, p[AT.q], 1.0
+
+
+@inline
+def sine_drive(t: Any, k: Any) -> Any:
+    """Driving torque [N m] at time `t` [s] after a rising zero: a sine instead of Eq. 12."""
+    return k.drive_amplitude * sin(k.omega * t)
 
 
 @inline

@@ -1,13 +1,15 @@
-"""The pendulum as a system that the engine integrates: fitted magnet and point dipoles."""
+"""The pendulum as systems that the engine integrates: one for each kind of magnets and drive."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from magpend_core.engine.jit import inline
-from magpend_core.engine.system import System
+from magpend_core.engine.jit import inline, specialise
+from magpend_core.engine.system import System, positions
 from magpend_core.engine.vecmath import exp, sincos, wrapped
+from magpend_core.models.model import Model
+from magpend_core.models.pendulum import jacobian, quantities
 from magpend_core.models.pendulum.equations import (
     N_DIPOLE,
     N_FITTED,
@@ -20,96 +22,57 @@ from magpend_core.models.pendulum.equations import (
     drive,
     fitted_torques,
     link_constants,
+    sine_constants,
+    sine_drive,
     solve_accelerations,
+    square_wave_constants,
 )
-from magpend_core.models.pendulum.jacobian import (
-    acceleration_slopes,
-    dipole_torque_slopes,
-    fitted_torque_slopes,
-)
-from magpend_core.models.pendulum.parameters import (
-    DipoleMagnet,
-    Drive,
-    FittedMagnet,
-    Friction,
-    Parameters,
-    Pendulum,
-    _names,
-)
+from magpend_core.models.pendulum.models import DIPOLE, DIPOLE_SINE, FITTED, FITTED_SINE, FREE, FREE_SINE
 
-_LINK_NAMES = _names(Pendulum) + _names(Friction) + _names(Drive)
-_N_LINK_PARAMETERS = len(_LINK_NAMES)
-_link_constants = inline(link_constants)
+# ---- magnets: constants, torques, layers, slopes -------------------------------------------------
 
 
-@inline
-def _fitted_constants(frequency: Any, p: Any, out: Any) -> None:
-    """Fill `out` with `LinkConstants`, then `FittedConstants`."""
-    values = _link_constants(frequency, p)
-    for i in range(N_LINK):
-        out[i] = values[i]
-    alpha1, alpha2, beta1, beta2 = p[18], p[19], p[20], p[21]
-    gamma1, gamma2, p1, p2 = p[22], p[23], p[24], p[25]
-    r1, r2, c1, c2, eps_mag, l2, h, delta = p[26], p[27], p[28], p[29], p[30], p[31], p[32], p[33]
+def _fitted_magnet(p: Any, values: Any, out: Any) -> None:
+    """Fill `out` with `FittedConstants`. A template, as those below."""
+    alpha1, alpha2, eps_mag = p[AT.alpha1], p[AT.alpha2], p[AT.eps_mag]
+    p1, p2, r1, r2, l1, l2, h = p[AT.p1], p[AT.p2], p[AT.r1], p[AT.r2], p[AT.l1], p[AT.l2], p[AT.h]
     jump = (abs(alpha1) + abs(alpha2)) * values.compliance1
     per_magnet_jump = eps_mag / max(jump, 1e-30)
     magnet = FittedConstants(
-        0.5 * alpha1, 0.5 * alpha2, beta1, beta2, 1.0 / gamma1, 1.0 / gamma2, p1, p2, r1, r2,
-        1.0 / c1, 1.0 / c2, -0.5 * (p1 + p2), -0.5 * (r1 + r2), eps_mag, 1.0 / eps_mag,
-        p[1], l2, h, 1.0 / h, p[1] / h, l2 / h, delta * delta, per_magnet_jump,
+        0.5 * alpha1, 0.5 * alpha2, p[AT.beta1], p[AT.beta2], 1.0 / p[AT.gamma1], 1.0 / p[AT.gamma2],
+        p1, p2, r1, r2, 1.0 / p[AT.c1], 1.0 / p[AT.c2], -0.5 * (p1 + p2), -0.5 * (r1 + r2),
+        eps_mag, 1.0 / eps_mag, l1, l2, h, 1.0 / h, l1 / h, l2 / h, p[AT.delta] * p[AT.delta],
+        per_magnet_jump,
     )  # fmt: skip
     for i in range(N_FITTED):
         out[N_LINK + i] = magnet[i]
 
 
-@inline
-def _dipole_constants(frequency: Any, p: Any, out: Any) -> None:
-    """Fill `out` with `LinkConstants`, then `DipoleConstants`."""
-    values = _link_constants(frequency, p)
-    for i in range(N_LINK):
-        out[i] = values[i]
-    out[N_LINK] = VACUUM_PERMEABILITY * p[18] * p[19] / (4.0 * math.pi)
-    out[N_LINK + 1] = p[1]
-    out[N_LINK + 2] = p[20]
-    out[N_LINK + 3] = p[21]
+def _dipole_magnet(p: Any, values: Any, out: Any) -> None:
+    """Fill `out` with `DipoleConstants`."""
+    out[N_LINK] = VACUUM_PERMEABILITY * p[AT.pole1] * p[AT.pole2] / (4.0 * math.pi)
+    out[N_LINK + 1] = p[AT.l1]
+    out[N_LINK + 2] = p[AT.l2]
+    out[N_LINK + 3] = p[AT.h]
+
+
+def _no_magnet(p: Any, values: Any, out: Any) -> None:
+    """There is nothing to fill in."""
 
 
 @inline
-def _forcing(t: Any, c: Any) -> Any:
-    return drive(t, LinkConstants(*c[:N_LINK]))
+def _fitted_magnet_torques(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> Any:
+    return fitted_torques(y[0], y[1], s1, c1, s2, c2, FittedConstants(*c[N_LINK:]))
 
 
 @inline
-def _fitted_rhs(y: Any, u: Any, c: Any) -> Any:
-    psi1, psi2, w1, w2 = y
-    s1, c1 = sincos(psi1)
-    s2, c2 = sincos(psi2)
-    q1, q2 = fitted_torques(psi1, psi2, s1, c1, s2, c2, FittedConstants(*c[N_LINK:]))
-    a1, a2 = solve_accelerations(s1, c1, s2, c2, w1, w2, u + q1, q2, LinkConstants(*c[:N_LINK]))
-    return w1, w2, a1, a2
+def _dipole_magnet_torques(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> Any:
+    return dipole_torques(y[0], y[1], s1, c1, s2, c2, DipoleConstants(*c[N_LINK:]))
 
 
 @inline
-def _dipole_rhs(y: Any, u: Any, c: Any) -> Any:
-    psi1, psi2, w1, w2 = y
-    s1, c1 = sincos(psi1)
-    s2, c2 = sincos(psi2)
-    q1, q2 = dipole_torques(psi1, psi2, s1, c1, s2, c2, DipoleConstants(*c[N_LINK:]))
-    a1, a2 = solve_accelerations(s1, c1, s2, c2, w1, w2, u + q1, q2, LinkConstants(*c[:N_LINK]))
-    return w1, w2, a1, a2
-
-
-@inline
-def _edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
-    """Rising edge at 0, falling edge at d/f; sin(omega t + phase) + a has slope omega cos(phase)."""
-    k = _link_constants(frequency, p)
-    width = 1.0 / (k.eps_drive * k.omega * sincos(k.phase)[1])
-    jump = math.pi * k.drive_amplitude * k.compliance1
-    times[0] = 0.0
-    times[1] = p[15] / frequency
-    for i in range(2):
-        half_widths[i] = width
-        jumps[i] = abs(jump)
+def _no_magnet_torques(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> Any:
+    return 0.0 * s1, 0.0 * s1
 
 
 @inline
@@ -138,32 +101,57 @@ def _fitted_layers(y: Any, dy: Any, c: Any) -> Any:
 
 
 @inline
-def _dipole_layers(y: Any, dy: Any, c: Any) -> Any:
+def _plain_layers(y: Any, dy: Any, c: Any) -> Any:
     """The friction's layers; the dipoles' field has none."""
     return _friction_layers(y, dy, LinkConstants(*c[:N_LINK]))
 
 
 @inline
-def _fitted_jacobian(y: Any, u: Any, c: Any) -> Any:
-    psi1, psi2, w1, w2 = y
-    s1, c1 = sincos(psi1)
-    s2, c2 = sincos(psi2)
-    _, _, a1, a2 = _fitted_rhs(y, u, c)
-    slopes = fitted_torque_slopes(psi1, psi2, s1, c1, s2, c2, FittedConstants(*c[N_LINK:]))
-    zero = 0.0 * psi1
-    one = zero + 1.0
-    kinematic = (zero, zero, one, zero, zero, zero, zero, one)
-    k = LinkConstants(*c[:N_LINK])
-    return kinematic + acceleration_slopes(s1, c1, s2, c2, w1, w2, a1, a2, slopes, k)
+def _fitted_slopes(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> Any:
+    return jacobian.fitted_torque_slopes(y[0], y[1], s1, c1, s2, c2, FittedConstants(*c[N_LINK:]))
 
 
 @inline
-def _dipole_jacobian(y: Any, u: Any, c: Any) -> Any:
+def _dipole_slopes(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> Any:
+    return jacobian.dipole_torque_slopes(y[0], y[1], s1, c1, s2, c2, DipoleConstants(*c[N_LINK:]))
+
+
+@inline
+def _no_slopes(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> Any:
+    zero = 0.0 * s1
+    return zero, zero, zero, zero
+
+
+# ---- what all share: templates over magnets and drive --------------------------------------------
+
+
+def _constants(frequency: Any, p: Any, out: Any) -> None:
+    """Fill `out` with `LinkConstants`, then those of the magnets."""
+    values = all_link_constants(frequency, p)
+    for i in range(N_LINK):
+        out[i] = values[i]
+    fill_magnet(p, values, out)
+
+
+def _forcing(t: Any, c: Any) -> Any:
+    return drive_torque(t, LinkConstants(*c[:N_LINK]))
+
+
+def _rhs(y: Any, u: Any, c: Any) -> Any:
     psi1, psi2, w1, w2 = y
     s1, c1 = sincos(psi1)
     s2, c2 = sincos(psi2)
-    _, _, a1, a2 = _dipole_rhs(y, u, c)
-    slopes = dipole_torque_slopes(psi1, psi2, s1, c1, s2, c2, DipoleConstants(*c[N_LINK:]))
+    q1, q2 = magnet_torques(y, s1, c1, s2, c2, c)
+    a1, a2 = solve_accelerations(s1, c1, s2, c2, w1, w2, u + q1, q2, LinkConstants(*c[:N_LINK]))
+    return w1, w2, a1, a2
+
+
+def _jacobian(y: Any, u: Any, c: Any) -> Any:
+    psi1, psi2, w1, w2 = y
+    s1, c1 = sincos(psi1)
+    s2, c2 = sincos(psi2)
+    _, _, a1, a2 = rhs(y, u, c)
+    slopes = magnet_slopes(y, s1, c1, s2, c2, c)
     zero = 0.0 * psi1
     one = zero + 1.0
     kinematic = (zero, zero, one, zero, zero, zero, zero, one)
@@ -171,43 +159,84 @@ def _dipole_jacobian(y: Any, u: Any, c: Any) -> Any:
     return kinematic + acceleration_slopes(s1, c1, s2, c2, w1, w2, a1, a2, slopes, k)
 
 
-PENDULUM_FITTED = System(
-    name="pendulum_fitted",
-    state_names=("psi1", "psi2", "psi1_dot", "psi2_dot"),
-    is_angle=(True, True, False, False),
-    scales=(1.0, 1.0, 10.0, 10.0),
-    parameter_names=_LINK_NAMES + _names(FittedMagnet),
-    n_constants=N_LINK + N_FITTED,
-    constants=_fitted_constants,
-    forcing=_forcing,
-    rhs=_fitted_rhs,
-    n_edges=2,
-    edges=_edges,
-    layers=_fitted_layers,
-    jacobian=_fitted_jacobian,
-    escape=(math.inf, math.inf, 1e4, 1e4),
-)
-"""The pendulum with the fitted magnet torque (Eq. 1-20)."""
-
-PENDULUM_DIPOLE = System(
-    name="pendulum_dipole",
-    state_names=("psi1", "psi2", "psi1_dot", "psi2_dot"),
-    is_angle=(True, True, False, False),
-    scales=(1.0, 1.0, 10.0, 10.0),
-    parameter_names=_LINK_NAMES + _names(DipoleMagnet),
-    n_constants=N_LINK + N_DIPOLE,
-    constants=_dipole_constants,
-    forcing=_forcing,
-    rhs=_dipole_rhs,
-    n_edges=2,
-    edges=_edges,
-    layers=_dipole_layers,
-    jacobian=_dipole_jacobian,
-    escape=(math.inf, math.inf, 1e4, 1e4),
-)
-"""The pendulum with point dipoles (Eq. 1-16)."""
+def _square_wave_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
+    """Rising edge at 0, falling edge at d/f; sin(omega t + phase) + a has slope omega cos(phase)."""
+    k = all_link_constants(frequency, p)
+    width = 1.0 / (k.eps_drive * k.omega * sincos(k.phase)[1])
+    jump = math.pi * k.drive_amplitude * k.compliance1
+    times[0] = 0.0
+    times[1] = p[AT.duty_cycle] / frequency
+    for i in range(2):
+        half_widths[i] = width
+        jumps[i] = abs(jump)
 
 
-def system_of(parameters: Parameters) -> System:
-    """The system whose packed vector `parameters.pack()` is."""
-    return PENDULUM_DIPOLE if isinstance(parameters.magnet, DipoleMagnet) else PENDULUM_FITTED
+def _no_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
+    """A sine has none."""
+
+
+_MAGNETS: dict[str, tuple[int, Any, Any, Any, Any]] = {
+    "fitted": (N_FITTED, _fitted_magnet, _fitted_magnet_torques, _fitted_layers, _fitted_slopes),
+    "dipole": (N_DIPOLE, _dipole_magnet, _dipole_magnet_torques, _plain_layers, _dipole_slopes),
+    "none": (0, _no_magnet, _no_magnet_torques, _plain_layers, _no_slopes),
+}
+_DRIVES: dict[str, tuple[int, Any, Any, Any]] = {
+    "square": (2, square_wave_constants, drive, _square_wave_edges),
+    "sine": (0, sine_constants, sine_drive, _no_edges),
+}
+
+
+def _system(model: Model, magnets: str, driven: str) -> System:
+    """Bind the templates to kinds of magnets and drive."""
+    n_magnet, fill, torques, layers, slopes = _MAGNETS[magnets]
+    n_edges, drive_constants, drive_torque, edges = _DRIVES[driven]
+    name = "pendulum_" + (magnets if driven == "square" else f"{magnets}_{driven}")
+    bound: dict[str, Any] = {
+        "AT": positions(model.parameter_names),
+        "drive_torque": drive_torque,
+        "magnet_torques": torques,
+        "magnet_slopes": slopes,
+        "acceleration_slopes": jacobian.acceleration_slopes,
+    }
+
+    def bind(template: Any, key: str) -> Any:
+        bound[key] = inline(specialise(template, name, **bound))
+        return bound[key]
+
+    bind(drive_constants, "drive_constants")
+    bind(link_constants, "all_link_constants")
+    bind(fill, "fill_magnet")
+    return System(
+        name=name,
+        state_names=model.state_names,
+        is_angle=model.is_angle,
+        scales=model.scales,
+        parameter_names=model.parameter_names,
+        n_constants=N_LINK + n_magnet,
+        constants=bind(_constants, "constants"),
+        forcing=bind(_forcing, "forcing"),
+        rhs=bind(_rhs, "rhs"),
+        n_edges=n_edges,
+        edges=bind(edges, "edges"),
+        layers=layers,
+        jacobian=bind(_jacobian, "rhs_jacobian"),
+        escape=tuple(s.escape for s in model.states),
+        quantity_names=tuple(q.name for q in model.quantities),
+        quantities=bind(quantities.QUANTITIES[magnets], "quantities"),
+    )
+
+
+PENDULUM_FITTED = _system(FITTED, "fitted", "square")
+"""Fitted magnet torque (Eq. 1-20)."""
+
+PENDULUM_FITTED_SINE = _system(FITTED_SINE, "fitted", "sine")
+
+PENDULUM_DIPOLE = _system(DIPOLE, "dipole", "square")
+"""Point dipoles (Eq. 1-16)."""
+
+PENDULUM_DIPOLE_SINE = _system(DIPOLE_SINE, "dipole", "sine")
+
+PENDULUM_FREE = _system(FREE, "none", "square")
+"""No magnets (Eq. 1-15)."""
+
+PENDULUM_FREE_SINE = _system(FREE_SINE, "none", "sine")

@@ -78,7 +78,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.pendulum.parameters import Parameters
+from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.bounded import Rule
 from pipeline.analysis.attractors.deciding import DECISIONS
 from pipeline.analysis.attractors.features import Features
@@ -88,8 +88,8 @@ from pipeline.analysis.attractors.lifetimes import lifetimes
 from pipeline.analysis.attractors.matching import match
 from pipeline.analysis.attractors.points import BUDGET, engine_inputs, parameters_of, slabs
 from pipeline.analysis.sides import Side
-from pipeline.analysis.vocabulary import BOUNDED_SET, split_dims
-from pipeline.layout.schema import LyapunovFlag
+from pipeline.layout.vocabulary import BOUNDED_SET, parameters_of, split_dims
+from pipeline.products.lyapunov import LyapunovFlag
 
 __all__ = ["Rule", "hysteresis", "identify", "lifetimes", "match", "parameters_of"]
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import xarray as xr
 
+from magpend_core.models.parameters import Parameters
 from magpend_core.models.pendulum.mechanics import energy
-from magpend_core.models.pendulum.parameters import Parameters
 from magpend_core.status import Status
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.bounded import mean_rotation

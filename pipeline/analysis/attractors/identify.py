@@ -48,7 +48,7 @@ from pipeline.analysis.attractors.spirals import (
     spirals_of,
 )
 from pipeline.analysis.sets import Geometry, hashes, order_by_points
-from pipeline.analysis.vocabulary import BOUNDED_SET, CLOSED_ORBIT
+from pipeline.layout.vocabulary import BOUNDED_SET, CLOSED_ORBIT
 
 ROUNDS, ROUNDS_LOOSE = 3, 6
 """Most rounds of guessing and polishing, with a strict and a loose tolerance."""

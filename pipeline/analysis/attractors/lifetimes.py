@@ -59,13 +59,13 @@ import xarray as xr
 from scipy.stats import chi2
 
 from magpend_core.engine.system import System
-from magpend_core.models.pendulum.parameters import Parameters
+from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.cells import marks_of
 from pipeline.analysis.attractors.following import FAILED, LEG, ON_SET, Ends, Engine, follow
 from pipeline.analysis.attractors.orbits import Orbit
 from pipeline.analysis.attractors.points import BUDGET, Point, engine_inputs, slabs
 from pipeline.analysis.sets import Geometry
-from pipeline.analysis.vocabulary import BOUNDED_SET, split_dims
+from pipeline.layout.vocabulary import BOUNDED_SET, split_dims
 
 ABSENT, ATTRACTOR, TRANSIENT = range(3)
 """Values of `verdict`."""

@@ -10,10 +10,10 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.pendulum.parameters import Parameters, load_preset
+from magpend_core.models.parameters import Parameters, load_preset
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED, system_of
 from pipeline.analysis.attractors.cells import Block
-from pipeline.analysis.vocabulary import START_DIMS
+from pipeline.layout.vocabulary import START_DIMS
 
 BUDGET = 256 * 2**20
 """Bytes of sections held at once."""

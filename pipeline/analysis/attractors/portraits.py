@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.pendulum.parameters import Parameters
+from magpend_core.models.parameters import Parameters
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.attractors import parameters_of
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.analysis.vocabulary import CLOSED_ORBIT
+from pipeline.layout.vocabulary import CLOSED_ORBIT
 
 RTOL = 1e-9
 

@@ -11,12 +11,12 @@ from typing import Any, get_args
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis import vocabulary
 from pipeline.analysis.basins.boundaries import Scaling, basin_entropy, uncertainty_exponent
 from pipeline.analysis.basins.labels import check_confidence, check_resamples
 from pipeline.analysis.basins.numbers import Interval, basin_fractions
 from pipeline.analysis.basins.wada import Metric, wada_merge_test
-from pipeline.analysis.vocabulary import split_dims
+from pipeline.layout import vocabulary
+from pipeline.layout.vocabulary import split_dims
 
 DIVERGED = -2
 """Label of the cells that diverged: an outcome like an attractor. -1 is no outcome."""

@@ -9,8 +9,7 @@ from itertools import pairwise
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.pendulum.parameters import Parameters
-from magpend_core.models.pendulum.systems import system_of
+from magpend_core.models.parameters import Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Walk, correct, kernel_of, walk
 from pipeline.analysis.branches.bifurcations import KINDS, TORUS, multipliers_of
 from pipeline.analysis.branches.following import opposite
@@ -117,7 +116,7 @@ def _starts(
             continue
         frequency = float(ds["frequency_hz"][branch])
         family = Family(
-            system_of(parameters),
+            parameters.model.system,
             period,
             frequency,
             parameters.pack(),

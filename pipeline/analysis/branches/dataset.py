@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.variational import with_tangents
-from magpend_core.models.pendulum.parameters import Parameters
+from magpend_core.models.parameters import Parameters
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.branches.bifurcations import FOLD, KINDS, Bifurcation, multipliers_of, n_unstable

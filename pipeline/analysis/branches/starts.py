@@ -8,12 +8,11 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.pendulum.parameters import Parameters
-from magpend_core.models.pendulum.systems import system_of
+from magpend_core.models.parameters import Parameters
 from magpend_core.orbits import polish_orbits, scaled_distance, stroboscopic_map
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.analysis.vocabulary import START_DIMS
+from pipeline.layout.vocabulary import is_start_dim
 
 CLOSE = 0.1
 """Largest scaled distance of a recurrence that is worth a try."""
@@ -54,7 +53,7 @@ def attracting(
             one = point.isel(attractor=i)
             period = int(one["orbit_period"])
             if int(one["is_polished"]) and 1 <= period <= max_period:
-                family = family_of(system_of(parameters), period, frequency, packed, parameter, scale)
+                family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
                 state = np.asarray(one["attractor_points"].values[0])
                 starts.append(Start(family, state, value_of(family, frequency, packed)))
     return starts
@@ -77,7 +76,7 @@ def value_of(family: Family, frequency_hz: float, packed: np.ndarray) -> float:
 
 def _points(ds: xr.Dataset) -> list[xr.Dataset]:
     """Parameter points of a dataset."""
-    dims = [str(d) for d in ds["status"].dims if d not in START_DIMS]
+    dims = [str(d) for d in ds["status"].dims if not is_start_dim(str(d))]
     shape = [ds.sizes[d] for d in dims]
     indices = [dict(zip(dims, map(int, index), strict=True)) for index in np.ndindex(*shape)]
     return [ds.isel(index) for index in indices]
@@ -109,10 +108,10 @@ def recurrent(
     list of Start
         Different orbits, by rising period at each point of the cube.
     """
-    system = system_of(parameters)
+    system = parameters.model.system
     starts = []
     for point in _points(cube):
-        dims = [d for d in point["status"].dims if d in START_DIMS]
+        dims = [d for d in point["status"].dims if is_start_dim(str(d))]
         section = point["section"].transpose(*dims, "period_index", "state").values
         section = section.reshape(-1, *section.shape[len(dims) :])[point["status"].values.ravel() == BOUNDED]
         if not len(section):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from magpend_core.models.pendulum.parameters import describe, load_preset
+from magpend_core.models import load_model
 from pipeline.analysis.branches.problems import FREQUENCY
 
 
@@ -10,7 +10,7 @@ def units_of(parameter: str) -> str:
     """Unit of a parameter by name, empty if it is not the pendulum's."""
     if parameter == FREQUENCY:
         return "Hz"
-    return describe(load_preset()).get(parameter, {"unit": ""})["unit"]
+    return load_model().parameter(parameter).unit
 
 
 STATE_UNITS = "rad, rad, rad/s, rad/s"

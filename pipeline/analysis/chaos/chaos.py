@@ -28,8 +28,8 @@ from pipeline.analysis.chaos.indicators import (
 )
 from pipeline.analysis.chaos.lyapunov import Motion, pooled_mean, summarise
 from pipeline.analysis.selection import select_points
-from pipeline.analysis.vocabulary import BOUNDED, PERIODIC, split_dims
-from pipeline.layout.schema import LyapunovFlag
+from pipeline.layout.vocabulary import BOUNDED, PERIODIC, split_dims
+from pipeline.products.lyapunov import LyapunovFlag
 
 Floats = npt.NDArray[np.float64]
 

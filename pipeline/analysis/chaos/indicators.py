@@ -26,7 +26,7 @@ from scipy import fft
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.schema import LyapunovFlag
+from pipeline.products.lyapunov import LyapunovFlag
 
 Floats = npt.NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from pipeline.analysis.vocabulary import PERIODIC
+from pipeline.layout.vocabulary import PERIODIC
 
 Floats = npt.NDArray[np.float64]
 

@@ -164,7 +164,7 @@ def test_identify__grid_of_starts(cube, found):
 def test_identify__parameters_from_the_run_and_its_axes(cube, found):
     """An axis replaces the attribute of the same name."""
     lines = "\n".join(f"{k} = {v!r}" for k, v in load_preset(q=1.0).as_dict().items())
-    ds = cube.expand_dims(q=[load_preset().drive.q]).assign_attrs(parameters=lines)
+    ds = cube.expand_dims(q=[load_preset()["q"]]).assign_attrs(parameters=lines)
     result = identify(ds)
     assert same(found, result.isel(q=0))
     assert result["attractor_id"].dims == ("q", "initial_condition")

@@ -58,7 +58,7 @@ def test_outputs__every_cell_gets_its_own_numbers(walk_text, extra, first):
     spec = parse_spec(tomllib.loads(walk_text.replace(axis, axes)))
     cells = CellMap(spec)
     coords = {c.name: c.values for c in coordinates(spec)}
-    q = coords.get("q", np.array([load_preset().drive.q]))
+    q = coords.get("q", np.array([load_preset()["q"]]))
     for block in make_plan(spec).tasks():
         inputs = cells.inputs(block)
         echo = np.stack([inputs.frequency_hz, inputs.parameters[..., NAMES.index("q")]], axis=-1)

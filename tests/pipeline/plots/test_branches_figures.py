@@ -7,9 +7,9 @@ import pytest
 import xarray as xr
 from matplotlib.lines import Line2D
 
-from magpend_core.models.pendulum.parameters import ParameterError
+from magpend_core.models.parameters import ParameterError
+from pipeline.analysis.branches import product as derived_branches
 from pipeline.plots import plot_branches, plot_curves, plot_multipliers
-from pipeline.products import branches as derived_branches
 from pipeline.spec.problems import SpecError
 
 

@@ -13,9 +13,9 @@ import xarray as xr
 from matplotlib.colors import to_rgb
 
 from magpend_core.status import Status
-from pipeline.analysis import vocabulary
 from pipeline.analysis.attractors.hysteresis import hysteresis
 from pipeline.analysis.sides import Side
+from pipeline.layout import vocabulary
 from pipeline.plots import (
     palette,
     plot_basins,

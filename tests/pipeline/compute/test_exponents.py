@@ -5,9 +5,9 @@ import pytest
 
 from magpend_core import LyapunovExponents, Status, load_preset, lyapunov_exponents, polish_orbits
 from pipeline import open_run
+from pipeline.compute.exponents import flags
 from pipeline.layout.plan import make_plan
 from pipeline.layout.schema import LYAPUNOV_VARIABLES, LyapunovFlag
-from pipeline.products.lyapunov import flags
 from pipeline.runs.run import run
 from pipeline.spec.parsing import load_spec
 from pipeline.spec.problems import SpecError

@@ -1,0 +1,5 @@
+"""The forced Duffing oscillator."""
+
+from magpend_core.models.duffing.models import MODELS
+
+__all__ = ["MODELS"]

@@ -1,0 +1,325 @@
+"""What a model is, for everyone above the engine. Imports no compiler: a model describes itself without it.
+
+A model names its states and parameters, its presets with their provenance, and the system that the engine
+integrates. It may bring more: quantities of state and time, a classifier of motions with its words, a
+mirror symmetry, a drawing. Code outside of a model's own room reads them from here and assumes nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from magpend_core.models.parameters import Parameter, ParameterError, Parameters, near_names
+
+if TYPE_CHECKING:
+    from magpend_core.engine.system import System
+
+
+@dataclass(frozen=True)
+class State:
+    """One state of a model.
+
+    Attributes
+    ----------
+    name : str
+    unit : str
+    meaning : str
+        A short phrase for tables and axes.
+    symbol : str
+        LaTeX without dollar signs; empty for the name.
+    on_circle : bool
+        Whether it is an angle [rad] of which full turns do not matter.
+    scale : float
+        Size that counts as 1 when states are compared.
+    escape : float
+        Beyond this absolute value at a section a trajectory has diverged.
+    rate : str
+        Name of the state that is its time derivative, if one is; phase portraits show the pair.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    symbol: str = ""
+    on_circle: bool = False
+    scale: float = 1.0
+    escape: float = math.inf
+    rate: str = ""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of state and time that a model can tell: an energy, a torque, a position.
+
+    Attributes
+    ----------
+    name, unit, meaning, symbol : str
+        As for `State`.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    symbol: str = ""
+
+
+@dataclass(frozen=True)
+class Classifier:
+    """Words for the motions of a model, told from stored sections.
+
+    Attributes
+    ----------
+    words : tuple of str
+        Their codes are 0, 1, ...; the first is "unknown": there is nothing to judge.
+    neutral : tuple of int
+        Codes that say nothing of a motion, drawn grey.
+    meaning : str
+        What the words are about.
+    classify : callable
+        ``classify(section, turns, frequency_hz, parameters)`` with `section` (..., n_keep, n_states), `turns`
+        (..., n_angles), `frequency_hz` and the values of `parameters` (a mapping by name) of shapes that
+        broadcast to the leading one; returns int8 codes of the leading shape. Sections are finite; what is
+        not known stays with the caller.
+    """
+
+    words: tuple[str, ...]
+    neutral: tuple[int, ...]
+    meaning: str
+    classify: Callable[[np.ndarray, np.ndarray, np.ndarray, Mapping[str, Any]], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A symmetry that maps motions on motions: the state's components times `signs`, half a period later.
+
+    Attributes
+    ----------
+    signs : tuple of int
+        +1 or -1 for each state.
+    half_period : bool
+        Whether the image of a section point is that of the state half a drive period later.
+    """
+
+    signs: tuple[int, ...]
+    half_period: bool
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What a model looks like, for portraits and animations.
+
+    Attributes
+    ----------
+    points : callable
+        ``points(states, parameters)`` with `states` (..., n_states) and a mapping of parameters; returns the
+        place (..., 2) of each moving point by name, x to the right and y upwards.
+    fixed : callable
+        ``fixed(parameters)``: the place (2,) of each point that does not move, by name.
+    lines : tuple of tuple of str
+        Names of points that are joined.
+    trace : str
+        The moving point whose path is worth drawing.
+    unit : str
+    """
+
+    points: Callable[[np.ndarray, Mapping[str, float]], dict[str, np.ndarray]]
+    fixed: Callable[[Mapping[str, float]], dict[str, np.ndarray]]
+    lines: tuple[tuple[str, ...], ...]
+    trace: str
+    unit: str = "m"
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Named values of parameters, and where each comes from.
+
+    Attributes
+    ----------
+    name : str
+    values : dict
+    provenance : dict
+        A phrase by parameter name.
+    """
+
+    name: str
+    values: Mapping[str, float]
+    provenance: Mapping[str, str]
+
+    @classmethod
+    def read(cls, path: Path) -> Preset:
+        """Read a TOML file: tables of values, and ``[provenance]`` by parameter or by table."""
+        tables = tomllib.loads(path.read_text("utf-8"))
+        origin = tables.pop("provenance", {})
+        values = {name: value for table in tables.values() for name, value in table.items()}
+        known = {n: origin.get(n, origin.get(t, "")) for t, table in tables.items() for n in table}
+        return cls(path.stem, values, known)
+
+
+def _no_relations(values: Mapping[str, float]) -> list[str]:
+    return []
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A periodically forced system as everyone above the engine sees it.
+
+    Attributes
+    ----------
+    name : str
+        By which specifications and cubes know it.
+    title : str
+        What it is, in a line.
+    states : tuple of State
+    parameters : tuple of Parameter
+        In the order in which they are packed.
+    presets : tuple of Preset
+        The first is the default.
+    system_path : str
+        ``module:attribute`` of the engine's `System`; imported when it is first needed.
+    sources : tuple of Path
+        The files that decide what is integrated; `digest` covers them.
+    section : str
+        The instant of the drive's period at which sections are taken.
+    quantities : tuple of Quantity
+        In the order of ``system.quantities``.
+    classifier, mirror, drawing
+        What the model brings besides.
+    angle_dim : str
+        Dim of what there is one of per angle, such as full turns.
+    relations : callable
+        Sentences on values that are in bounds each, but not together.
+    """
+
+    name: str
+    title: str
+    states: tuple[State, ...]
+    parameters: tuple[Parameter, ...]
+    presets: tuple[Preset, ...]
+    system_path: str
+    sources: tuple[Path, ...]
+    section: str = "the start of the drive's period"
+    quantities: tuple[Quantity, ...] = ()
+    classifier: Classifier | None = None
+    mirror: Mirror | None = None
+    drawing: Drawing | None = None
+    angle_dim: str = "angle"
+    relations: Callable[[Mapping[str, float]], list[str]] = field(default=_no_relations)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states in order."""
+        return tuple(s.name for s in self.states)
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Units of the states in order."""
+        return tuple(s.unit for s in self.states)
+
+    @property
+    def is_angle(self) -> tuple[bool, ...]:
+        """Which states are on a circle."""
+        return tuple(s.on_circle for s in self.states)
+
+    @property
+    def angles(self) -> tuple[str, ...]:
+        """Names of the states on circles."""
+        return tuple(s.name for s in self.states if s.on_circle)
+
+    @property
+    def scales(self) -> tuple[float, ...]:
+        """Scale of each state."""
+        return tuple(s.scale for s in self.states)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters in order."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def portraits(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of states that phase portraits show: each with its rate, else neighbours."""
+        pairs = tuple((s.name, s.rate) for s in self.states if s.rate)
+        names = self.state_names
+        return pairs or tuple(itertools.pairwise(names)) or ((names[0], names[0]),)
+
+    @property
+    def preset_names(self) -> tuple[str, ...]:
+        """Names of the presets; the first is the default."""
+        return tuple(p.name for p in self.presets)
+
+    @cached_property
+    def system(self) -> System:
+        """What the engine integrates; imports the compiler."""
+        module, _, attribute = self.system_path.partition(":")
+        found: System = getattr(importlib.import_module(module), attribute)
+        return found
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of what the model's own sources mean; comments and docstrings do not count."""
+        from magpend_core.meaning import meaning_digest
+
+        return meaning_digest(self.sources)
+
+    def state(self, name: str) -> State:
+        """Return a state by name; raises `ParameterError` with the nearest names if there is none."""
+        for s in self.states:
+            if s.name == name:
+                return s
+        hint = near_names(name, self.state_names, "states")
+        raise ParameterError([f"{name!r} is not a state of {self.name}; {hint}"])
+
+    def quantity(self, name: str) -> Quantity:
+        """Return a quantity by name; raises `ParameterError` with the nearest names if there is none."""
+        for q in self.quantities:
+            if q.name == name:
+                return q
+        hint = near_names(name, (q.name for q in self.quantities), "quantities")
+        raise ParameterError([f"{name!r} is not a quantity of {self.name}; {hint}"])
+
+    def parameter(self, name: str) -> Parameter:
+        """Return a parameter by name; raises `ParameterError` with the nearest names if there is none."""
+        for p in self.parameters:
+            if p.name == name:
+                return p
+        hint = near_names(name, self.parameter_names, "parameters")
+        raise ParameterError([f"{name!r} is not a parameter of {self.name}; {hint}"])
+
+    def preset(self, name: str | None = None) -> Preset:
+        """Return a preset by name, by default the first; raises `ParameterError` if there is none."""
+        if name is None:
+            return self.presets[0]
+        for p in self.presets:
+            if p.name == name:
+                return p
+        hint = near_names(name, self.preset_names, "presets")
+        raise ParameterError([f"preset {name!r} does not exist for {self.name}; {hint}"])
+
+    def load(self, preset: str | None = None, **overrides: float) -> Parameters:
+        """Return the parameters of a preset, some of them replaced.
+
+        Parameters
+        ----------
+        preset
+            One of `preset_names`; by default the first.
+        overrides
+            Values by parameter name.
+
+        Raises
+        ------
+        ParameterError
+            If the preset or a name is unknown or a value is out of bounds; all problems at once.
+        """
+        values = self.preset(preset).values
+        own = {name: values[name] for name in self.parameter_names if name in values}
+        return Parameters(self, {**own, **overrides})

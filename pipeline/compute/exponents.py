@@ -1,0 +1,68 @@
+"""The product ``lyapunov``: exponents of a task's cells, from the last kept section of each on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magpend_core import LyapunovExponents, Status, lyapunov_exponents
+from magpend_core.engine.lyapunov import MOST_LOSS
+from pipeline.compute.task import Job
+from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag, LyapunovOptions
+
+AUDIT = 0.01
+"""Largest allowed difference between the sum of the exponents and the divergence, in units of the sum of
+their moduli."""
+
+
+def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
+    """Return `LYAPUNOV_VARIABLES` for the cells of a task.
+
+    Parameters
+    ----------
+    job
+        The cells as they were integrated.
+    options
+        What is asked for.
+
+    Returns
+    -------
+    dict
+        Arrays with leading dims (branch, point). A cell without an attractor (diverged, step limit,
+        unreached) has NaN and the flag ``ABSENT``.
+    """
+    cells, inputs, integration = job.cells, job.inputs, job.spec.integration
+    branch, point = np.nonzero(np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED)))
+    found = lyapunov_exponents(
+        inputs.parameters[branch, point], inputs.frequency_hz[branch, point],
+        cells.section[branch, point, -1], rtol=integration.rtol, atol=integration.atol,
+        max_steps_per_period=integration.max_steps_per_period, system=job.system, **options.model_dump(),
+    )  # fmt: skip
+    is_closed = cells.status[branch, point] == Status.PERIODIC
+    values = {
+        "lyapunov": np.where(is_closed[:, None], _falling(found.weighted), found.exponents),
+        "lyapunov_stderr": found.stderr,
+        "lyapunov_blocks": found.blocks,
+        "divergence": found.divergence,
+        "lyapunov_flag": flags(found, len(job.spec.model.states)),
+    }
+    filled = {}
+    for variable in LYAPUNOV_VARIABLES:
+        own = values[variable.name].shape[1:]
+        filled[variable.name] = np.full((*cells.status.shape, *own), variable.fill, variable.dtype)
+        filled[variable.name][branch, point] = values[variable.name]
+    return filled
+
+
+def _falling(rates: np.ndarray) -> np.ndarray:
+    return np.sort(rates, axis=1)[:, ::-1]
+
+
+def flags(found: LyapunovExponents, n_states: int) -> np.ndarray:
+    """Codes of `LyapunovFlag`; only a whole spectrum can be held against the divergence."""
+    flag = np.full(len(found.status), LyapunovFlag.GOOD, np.int8)
+    if found.exponents.shape[1] == n_states:
+        missing = np.abs(found.exponents.sum(axis=1) - found.divergence)
+        flag[missing > AUDIT * np.abs(found.exponents).sum(axis=1)] = LyapunovFlag.AUDIT_FAILED
+    flag[found.loss > MOST_LOSS] = LyapunovFlag.UNRESOLVED
+    flag[found.status != Status.BOUNDED] = LyapunovFlag.FAILED
+    return flag

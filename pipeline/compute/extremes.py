@@ -1,0 +1,27 @@
+"""The product ``extremes``: what the engine watched during the kept periods."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.compute.task import Job
+from pipeline.products.extremes import ExtremesOptions
+
+
+def extremes(job: Job, options: ExtremesOptions) -> dict[str, np.ndarray]:
+    """Return the least and largest value and the mean of each quantity in each kept period.
+
+    Parameters
+    ----------
+    job
+        The cells as they were integrated; the quantities were watched on the way.
+    options
+        What is asked for.
+
+    Returns
+    -------
+    dict
+        ``extremes`` with dims (branch, point, period_index, quantity, extreme); NaN where a cell failed.
+    """
+    assert job.cells.extremes is not None
+    return {"extremes": job.cells.extremes}

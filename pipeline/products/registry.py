@@ -1,0 +1,70 @@
+"""All products by name. A new one is a new file and a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pkgutil import resolve_name
+from typing import Generic, TypeVar
+
+from pipeline.products.product import Analysis, CellProduct, Figure
+
+P = TypeVar("P", CellProduct, Analysis, Figure)
+
+
+class Registry(Mapping[str, P], Generic[P]):
+    """Products by name, each imported when it is asked for.
+
+    Parameters
+    ----------
+    kind
+        What they are, for messages.
+    places
+        ``"module:object"`` by name.
+    """
+
+    def __init__(self, kind: str, places: Mapping[str, str]) -> None:
+        self.kind, self._places = kind, places
+
+    def __getitem__(self, name: str) -> P:
+        product: P = resolve_name(self._places[name])
+        return product
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+
+CELL_PRODUCTS: Registry[CellProduct] = Registry(
+    "product",
+    {
+        "lyapunov": "pipeline.products.lyapunov:LYAPUNOV",
+        "extremes": "pipeline.products.extremes:EXTREMES",
+    },
+)
+
+ANALYSES: Registry[Analysis] = Registry(
+    "analysis",
+    {
+        "attractors": "pipeline.products.attractors:ATTRACTORS",
+        "basins": "pipeline.products.basins:BASINS",
+        "hysteresis": "pipeline.products.attractors:HYSTERESIS",
+        "settling": "pipeline.products.attractors:SETTLING",
+        "chaos": "pipeline.products.chaos:CHAOS",
+        "dimension": "pipeline.products.chaos:DIMENSION",
+        "branches": "pipeline.products.branches:BRANCHES",
+        "curves": "pipeline.products.branches:CURVES",
+    },
+)
+
+FIGURES: Registry[Figure] = Registry(
+    "figure",
+    {
+        name: f"pipeline.products.figures:{name.upper()}"
+        for name in (
+            "bifurcation", "attractors", "gallery", "basins", "fractions", "regimes", "lyapunov",
+            "convergence", "dimension", "branches", "multipliers", "curves",
+        )
+    },
+)  # fmt: skip

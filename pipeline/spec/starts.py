@@ -1,0 +1,196 @@
+"""Initial conditions: grids, lists and random samples of a model's own states.
+
+Keys are the names of the states; angles and their rates can be given in degrees, with ``_deg`` behind the
+name. The models of the tables are made for each model of a system, and checked by pydantic.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Discriminator,
+    Field,
+    Tag,
+    create_model,
+    model_validator,
+)
+
+from magpend_core.models import load_model
+from magpend_core.models.model import Model
+from pipeline.spec.tables import MAX_POINTS, Range, Table
+
+STRIDES = (2, 4, 8, 16, 32, 64)
+IN_DEGREES = ("rad", "rad/s")
+"""Units that degrees stand for."""
+
+
+def _number_or_range(value: Any) -> str:
+    return "(range)" if isinstance(value, (dict, Range)) else "(number)"
+
+
+def _number_or_interval(value: Any) -> str:
+    return "(interval)" if isinstance(value, (list, tuple)) else "(number)"
+
+
+def _rising(interval: tuple[float, float]) -> tuple[float, float]:
+    if interval[1] <= interval[0]:
+        raise ValueError(f"[{interval[0]!r}, {interval[1]!r}]: the second number must be the greater one.")
+    return interval
+
+
+Extent = Annotated[
+    Annotated[float, Tag("(number)")] | Annotated[Range, Tag("(range)")], Discriminator(_number_or_range)
+]
+Interval = Annotated[
+    Annotated[float, Tag("(number)")]
+    | Annotated[tuple[float, float], Field(strict=False), Tag("(interval)")],
+    Discriminator(_number_or_interval),
+]
+Rows = Annotated[
+    tuple[Annotated[tuple[float, ...], Field(strict=False)], ...], Field(strict=False, min_length=1)
+]
+
+
+def degrees_key(state: str) -> str:
+    """Key of a state's value in degrees."""
+    return f"{state}_deg"
+
+
+def state_keys(model: Model) -> tuple[str, ...]:
+    """All keys that set a state: its name, and that in degrees where it is an angle or an angle's rate."""
+    return tuple(
+        key
+        for s in model.states
+        for key in ((s.name, degrees_key(s.name)) if s.unit in IN_DEGREES else (s.name,))
+    )
+
+
+def state_of_key(key: str, model: Model) -> str | None:
+    """Name of the state that a key sets, None if it sets none."""
+    if key not in state_keys(model):
+        return None
+    return key if key in model.state_names else key.removesuffix(degrees_key(""))
+
+
+class _PerState(Table):
+    """Values by state; the fields are added by `starts_model`."""
+
+    system: ClassVar[Model]
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> _PerState:
+        for name in self.system.state_names:
+            if self.of(name) is not None and getattr(self, degrees_key(name), None) is not None:
+                raise ValueError(f"{name} and {degrees_key(name)} are both given; keep one.")
+        return self
+
+    def of(self, key: str) -> Any:
+        """What is given for a key; None if it is not there."""
+        return getattr(self, key, None)
+
+
+def _power_of_two(stride: int) -> int:
+    if stride not in STRIDES:
+        raise ValueError(f"{stride} is not among {', '.join(map(str, STRIDES))}; take one of these.")
+    return stride
+
+
+class GridStarts(_PerState):
+    """``[initial_conditions] kind = "grid"``: ranges span the grid, numbers are fixed, the rest is 0.
+
+    With `refine` a sweep computes every `refine`-th cell first; see `pipeline.compute.refinement`.
+    """
+
+    nested_model: ClassVar[type[BaseModel] | None] = Range
+
+    kind: Literal["grid"]
+    refine: Annotated[int, AfterValidator(_power_of_two)] | None = None
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """What spans the grid, by key."""
+        return {key: value for key, value in self if isinstance(value, Range)}
+
+
+class ListStarts(Table):
+    """``[initial_conditions] kind = "list"``: rows of states in the model's order.
+
+    Rows may end before the rates of states, which are 0 then.
+    """
+
+    system: ClassVar[Model]
+
+    kind: Literal["list"]
+    points: Rows | None = None
+    points_deg: Rows | None = None
+
+    @model_validator(mode="after")
+    def _rows(self) -> ListStarts:
+        names = self.system.state_names
+        degrees = all(s.unit in IN_DEGREES for s in self.system.states)
+        if self.points_deg is not None and not degrees:
+            raise ValueError(f"points_deg: not all of {', '.join(names)} are angles; give points.")
+        if (self.points is None) == (self.points_deg is None):
+            both = (
+                "points (rad, rad/s) or points_deg (degrees, degrees/s), one of them" if degrees else "points"
+            )
+            raise ValueError(f"give {both}.")
+        lengths = sorted({len(positions(self.system)), len(names)})
+        for i, row in enumerate(self.points or self.points_deg or ()):
+            if len(row) not in lengths:
+                wanted = " or ".join(", ".join(names[:n]) for n in lengths)
+                raise ValueError(f"row {i} has {len(row)} numbers; give {wanted}.")
+        return self
+
+
+def positions(model: Model) -> tuple[str, ...]:
+    """Return the leading states up to the first that is a rate; a list's rows may end there."""
+    rates = {s.rate for s in model.states if s.rate}
+    names = model.state_names
+    first = next((i for i, name in enumerate(names) if name in rates), len(names))
+    return names[:first] if set(names[first:]) <= rates else names
+
+
+class RandomStarts(_PerState):
+    """``[initial_conditions] kind = "random"``: seeded uniform samples of a box ``[low, high]`` per state."""
+
+    kind: Literal["random"]
+    n: Annotated[int, Field(ge=1, le=MAX_POINTS)]
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _boxes(self) -> RandomStarts:
+        for key, value in self:
+            if isinstance(value, tuple):
+                try:
+                    _rising(value)
+                except ValueError as error:
+                    raise ValueError(f"{key} = {error}") from None
+        return self
+
+
+Starts = GridStarts | ListStarts | RandomStarts
+STARTS: dict[str, type[Starts]] = {"grid": GridStarts, "list": ListStarts, "random": RandomStarts}
+
+
+@cache
+def starts_model(kind: str, model: str) -> type[Starts]:
+    """Return the table of initial conditions for a model's states.
+
+    Parameters
+    ----------
+    kind
+        ``"grid"``, ``"list"`` or ``"random"``.
+    model
+        Name of the model.
+    """
+    base, system = STARTS[kind], load_model(model)
+    annotation: Any = {"grid": Extent | None, "random": Interval | None}.get(kind)
+    fields: Any = {} if annotation is None else dict.fromkeys(state_keys(system), (annotation, None))
+    made: type[Starts] = create_model(base.__name__, __base__=base, __module__=__name__, **fields)
+    made.system = system
+    return made

@@ -1,0 +1,105 @@
+"""Tables of a specification that are the same for every model."""
+
+from __future__ import annotations
+
+import itertools
+from fractions import Fraction
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+FREQUENCY = "frequency_hz"
+"""The drive's frequency among the parameters."""
+
+MAX_POINTS = 10_000_000
+
+
+class Table(BaseModel):
+    """A table of the specification: strict types, no unknown keys, no NaN or infinity."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+    nested_model: ClassVar[type[BaseModel] | None] = None
+
+
+class Range(Table):
+    """Values in rising order: ``start, stop, num``, or ``start, stop, step``, or ``values``."""
+
+    start: float | None = None
+    stop: float | None = None
+    num: Annotated[int, Field(ge=2, le=MAX_POINTS)] | None = None
+    step: Annotated[float, Field(gt=0)] | None = None
+    values: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Range:
+        given = frozenset(self.model_dump(exclude_none=True))
+        forms = [{"start", "stop", "num"}, {"start", "stop", "step"}, {"values"}]
+        if given not in forms:
+            have = ", ".join(sorted(given)) or "nothing"
+            raise ValueError(
+                f"give start, stop and num, or start, stop and step, or values alone (given: {have})."
+            )
+        if self.values is not None:
+            if any(b <= a for a, b in itertools.pairwise(self.values)):
+                raise ValueError("values must rise strictly; sort them and drop repeated ones.")
+        elif self.start is not None and self.stop is not None:
+            if self.stop <= self.start:
+                raise ValueError(
+                    f"stop = {self.stop!r} must be greater than start = {self.start!r}; "
+                    "for one value give values = [x]; to walk downwards set continuation.direction."
+                )
+            if self.step is not None and (self.stop - self.start) / self.step >= MAX_POINTS:
+                raise ValueError(f"step = {self.step!r} makes more than {MAX_POINTS} points; make it larger.")
+        return self
+
+    def array(self) -> np.ndarray:
+        """Return the values: the float64 nearest to each decimal number, as one would write it by hand."""
+        if self.values is not None:
+            return np.array(self.values, dtype=np.float64)
+        start, stop = Fraction(repr(self.start)), Fraction(repr(self.stop))
+        if self.num is not None:
+            step, num = (stop - start) / (self.num - 1), self.num
+        else:
+            step = Fraction(repr(self.step))
+            num = (stop - start) // step + 1
+        return np.array([float(start + i * step) for i in range(num)], dtype=np.float64)
+
+
+class ParametersTable(Table):
+    """``[parameters]``: the preset, what differs from it, and the frequency unless it is an axis."""
+
+    preset: str | None = None
+    overrides: dict[str, float] = {}
+    frequency_hz: Annotated[float, Field(gt=0)] | None = None
+
+
+class Continuation(Table):
+    """``[continuation]``: which axis the branches walk, and which way."""
+
+    path: str = FREQUENCY
+    direction: Literal["up", "down", "both"] = "up"
+
+    @property
+    def directions(self) -> tuple[str, ...]:
+        """The directions walked, one or two."""
+        return ("up", "down") if self.direction == "both" else (self.direction,)
+
+
+class Integration(Table):
+    """``[integration]``: tolerances, and what is discarded and kept of each cell."""
+
+    rtol: Annotated[float, Field(ge=1e-13, lt=1)] = 1e-8
+    atol: Annotated[float, Field(gt=0, lt=1)] = 1e-8
+    n_transient: Annotated[int, Field(ge=0, le=100_000_000)] = 300
+    n_keep: Annotated[int, Field(ge=1, le=1_000_000)] = 60
+    max_steps_per_period: Annotated[int, Field(ge=1, le=1_000_000_000)] = 20_000
+    stop_when_closed: bool = False
+    closure_tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-6
+    max_orbit_period: Annotated[int, Field(ge=1, le=32_000)] = 16
+
+
+class Execution(Table):
+    """``[execution]``: sizes of tasks. They decide the layout of the store, never the numbers."""
+
+    trajectories_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = None
