@@ -61,6 +61,10 @@ class Options(BaseModel):
             if type(self).model_fields[name].is_required() or value != default_of(type(self), name)
         }
 
+    def part(self, model: type[Options]) -> dict[str, Any]:
+        """Options that another model has too, for the analysis that takes these."""
+        return {name: getattr(self, name) for name in model.model_fields}
+
 
 def default_of(model: type[Options], name: str) -> Any:
     """Default of an option as a JSON value, ``None`` if it is a required one."""
@@ -148,7 +152,8 @@ class Analysis:
         ``"module:function"``: ``compute(run, options)`` gives a Dataset. ``run.cube()`` is the cube,
         ``run.derive(name, **options)`` another analysis of the same cells.
     table : str
-        ``"module:function"``: ``table(ds)`` gives a `Table`.
+        ``"module:function"``: ``table(ds)`` gives a `Table`. Empty: a result that others build on, without
+        a command.
     needs : str
         ``"module:function"`` or empty: ``needs(run, options)`` raises ValueError with a sentence if the
         run does not have what the analysis takes; called before anything is computed.
@@ -168,7 +173,7 @@ class Analysis:
     help: str
     options: type[Options]
     compute: str
-    table: str
+    table: str = ""
     needs: str = ""
     settle: str = ""
     builds_on: tuple[str, ...] = ()

@@ -47,6 +47,7 @@ CELL_PRODUCTS: Registry[CellProduct] = Registry(
 ANALYSES: Registry[Analysis] = Registry(
     "analysis",
     {
+        "identified": "pipeline.products.attractors:IDENTIFIED",
         "attractors": "pipeline.products.attractors:ATTRACTORS",
         "basins": "pipeline.products.basins:BASINS",
         "hysteresis": "pipeline.products.attractors:HYSTERESIS",
