@@ -20,7 +20,7 @@ class Block:
         Their places among all cells of the point.
     section : ndarray, (cell, period_index, state)
     status, orbit_period : ndarray, (cell,)
-    turns : ndarray, (cell, link)
+    turns : ndarray, (cell, angle)
     """
 
     cells: slice

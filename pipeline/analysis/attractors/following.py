@@ -203,7 +203,7 @@ def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np
     Beside a bifurcation that takes thousands of periods, along which the orbit's monodromy matrix tells the
     motion. Let u be the parts of a cell's distance along the unstable eigenvectors, at the sections that
     share the phase of the orbit's first point, and lambda the multipliers. A cell leaps as long as
-    ``|u'' - lambda**2 u| <= 0.1 (|lambda|**2 - 1) |u|`` over the younger half of them, two returns apart, since
+    ``|u'' - lambda**2 u| <= 0.1 (|lambda|**2 - 1) |u|`` over the younger half of them, two returns apart:
     near a doubling what is quadratic cancels over two.
 
     Parameters

@@ -39,7 +39,7 @@ variable                own dims                  dtype, fill   meaning
 ``sample_destination``  attractor, sample         int32, -1     destination; -1 still on the set, -2 failed
 ``sample_periods``      attractor, sample         float64, NaN  time at risk [drive periods]
 ``new_orbit_period``    new_orbit                 int32, 0      drive periods
-``new_orbit_points``    new_orbit, state          float64, NaN  first section point [rad, rad/s]
+``new_orbit_points``    new_orbit, state          float64, NaN  first section point
 ``new_orbit_multiplier``  new_orbit               float64, NaN  largest modulus
 ======================= ========================= ============= ===========================================
 
@@ -63,9 +63,9 @@ from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.cells import marks_of
 from pipeline.analysis.attractors.following import FAILED, LEG, ON_SET, Ends, Engine, follow
 from pipeline.analysis.attractors.orbits import Orbit
-from pipeline.analysis.attractors.points import BUDGET, Point, engine_inputs, slabs
-from pipeline.analysis.sets import Geometry
+from pipeline.analysis.attractors.points import BUDGET, Dynamics, Point, slabs
 from pipeline.layout.vocabulary import BOUNDED_SET, split_dims
+from pipeline.products.attractors import SettlingOptions
 
 ABSENT, ATTRACTOR, TRANSIENT = range(3)
 """Values of `verdict`."""
@@ -111,17 +111,12 @@ def lifetime_interval(n_left: int, time_at_risk: float, confidence: float = 0.95
 def lifetimes(
     ds: xr.Dataset,
     attractors: xr.Dataset,
+    options: SettlingOptions | None = None,
     *,
-    n_sample: int = 32,
-    n_periods: int = 1024,
-    confidence: float = 0.95,
-    max_orbit_period: int = 16,
-    residual: float = 1e-10,
-    rtol: float = 0.0,
-    atol: float = 0.0,
     parameters: Parameters | np.ndarray | None = None,
     system: System | None = None,
     block_bytes: int = BUDGET,
+    **changes: Any,
 ) -> xr.Dataset:
     """Run a sample of every bounded set on, and say how many left it, where they went and how fast.
 
@@ -131,20 +126,14 @@ def lifetimes(
         The cube.
     attractors
         What `identify` or `match` made of it.
-    n_sample
-        Cells of each set, those of least hash; all if it has fewer.
-    n_periods
-        Drive periods that they are run on, rounded up to whole legs of `LEG`.
-    confidence
-        Of the intervals, see `lifetime_interval`.
-    max_orbit_period
-        Longest period of an orbit not known before [drive periods].
-    residual
-        Scaled residual that Newton's method is to reach.
-    rtol, atol
-        Tolerances; 0 takes those of the run, from the attributes of `ds`, else 1e-8.
+    options
+        By default those of `SettlingOptions`: of each set the `n_sample` cells of least hash are run on, all
+        if it has fewer, for `n_periods` rounded up to whole legs of `LEG`. Tolerances of 0 stand for those
+        of the run, from the attributes of `ds`, else 1e-8.
     parameters, system, block_bytes
         As for `identify`.
+    changes
+        Fields of the options, instead of `options`.
 
     Returns
     -------
@@ -158,21 +147,20 @@ def lifetimes(
         If an option is out of bounds, the parameters are missing, or `attractors` are those of another
         cube.
     """
-    for name, value in (("n_sample", n_sample), ("n_periods", n_periods)):
-        if value < 1:
-            raise ValueError(f"{name} = {value!r} is out of bounds: it must be 1 or more.")
-    lifetime_interval(0, 0.0, confidence)
+    options = options or SettlingOptions(**changes)
     if attractors["attractor_id"].sizes != ds["status"].sizes:
         raise ValueError("attractors and ds have other cells; give what identify made of this cube.")
-    base, system = engine_inputs(ds, parameters, system, needed=True)
-    tolerances = rtol or float(ds.attrs.get("rtol", 1e-8)), atol or float(ds.attrs.get("atol", 1e-8))
-    dims, start_dims = split_dims(ds["status"])
-    geometry = Geometry.of(system)
-    n_legs = -(-n_periods // LEG)
+    dynamics = Dynamics.of(ds, parameters, system)
+    tolerances = (
+        options.rtol or float(ds.attrs.get("rtol", 1e-8)),
+        options.atol or float(ds.attrs.get("atol", 1e-8)),
+    )
+    dims, _ = split_dims(ds["status"])
+    n_legs = -(-options.n_periods // LEG)
     courses: dict[tuple[int, ...], Courses] = {}
-    for points in slabs(ds, start_dims, base, system, block_bytes):
+    for points in slabs(ds, dynamics, block_bytes):
         ids = {i: attractors.isel(dict(zip(dims, i, strict=True))) for i in points}
-        samples = {i: _sample(point, ids[i], n_sample) for i, point in points.items()}
+        samples = {i: _sample(point, ids[i], options.n_sample) for i, point in points.items()}
         places = {i: s for i, s in samples.items() if len(s.cell)}
         if not places:
             continue
@@ -181,19 +169,22 @@ def lifetimes(
         engine = Engine(
             np.stack([points[i].packed for i in places]),
             np.array([points[i].frequency for i in places]),
-            owner, start, tolerances=tolerances, max_orbit_period=max_orbit_period, residual=residual,
-            geometry=geometry, system=system,
+            owner, start, tolerances=tolerances, max_orbit_period=options.max_orbit_period,
+            residual=options.residual, geometry=dynamics.geometry, system=dynamics.integrates,
         )  # fmt: skip
         known = engine.known([_orbits_of(ids[i]) for i in places])
-        ends = follow(start, owner, known, engine.advance, engine.polish, n_legs, max_orbit_period, geometry)
+        ends = follow(
+            start, owner, known, engine.advance, engine.polish, n_legs,
+            options.max_orbit_period, dynamics.geometry,
+        )  # fmt: skip
         first = 0
         for number, (index, sample) in enumerate(places.items()):
             rows = slice(first, first + len(sample.cell))
             rows_of = _orbits_of(ids[index])[0]
             courses[index] = Courses(sample, ends.take(rows), rows_of, ends.orbits[number])
             first = rows.stop
-    options = {"n_sample": n_sample, "n_periods": n_legs * LEG, "confidence": confidence}
-    return _dataset(attractors, dims, courses, n_sample, options)
+    done = {"n_sample": options.n_sample, "n_periods": n_legs * LEG, "confidence": options.confidence}
+    return _dataset(attractors, dims, courses, done)
 
 
 # ---- sample and engine -------------------------------------------------------------------------
@@ -222,7 +213,7 @@ def _sample(point: Point, ids: xr.Dataset, n_sample: int) -> Sample:
     """Return the cells of least hash of every bounded set; cells of equal sections count once."""
     label = ids["attractor_id"].transpose(*point.start_dims).values.ravel()
     sets = np.flatnonzero(ids["kind"].values == BOUNDED_SET)
-    n = len(point.state_names)
+    n = point.n_states
     best = {int(a): (np.zeros(0, np.uint64), np.zeros(0, np.int64), np.zeros((0, n))) for a in sets}
     for block in point.blocks():
         own = label[block.cells]
@@ -269,12 +260,12 @@ class Courses:
 
 
 def _dataset(
-    attractors: xr.Dataset, dims: tuple[str, ...], courses: dict[tuple[int, ...], Courses], n_sample: int,
-    options: dict[str, float],
+    attractors: xr.Dataset, dims: tuple[str, ...], courses: dict[tuple[int, ...], Courses],
+    options: dict[str, Any],
 ) -> xr.Dataset:  # fmt: skip
     shape, n = tuple(attractors.sizes[d] for d in dims), attractors.sizes["attractor"]
     n_new = max((len(c.new) for c in courses.values()), default=0)
-    sizes = {"destination": n + n_new, "sample": n_sample, "new_orbit": n_new,
+    sizes = {"destination": n + n_new, "sample": options["n_sample"], "new_orbit": n_new,
              "state": attractors.sizes["state"], "attractor": n}  # fmt: skip
     arrays = {
         name: np.full((*shape, *(sizes[d] for d in own)), fill, dtype)
@@ -324,8 +315,6 @@ def _fill(
         arrays[f"sample_{name}"][at][: len(rows)] = values
 
 
-_STATE_UNITS = "rad, rad, rad/s, rad/s"
-
 _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "verdict": (("attractor",), "int8", 0, "1", "transient or attractor, as far as seen"),
     "n_sampled": (("attractor",), "int64", 0, "1", "cells of the set that were run on"),
@@ -340,7 +329,7 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "sample_destination": (("attractor", "sample"), "int32", ON_SET, "1", "where it ended, -1 on the set"),
     "sample_periods": (("attractor", "sample"), "float64", np.nan, "1", "its time on the set, drive periods"),
     "new_orbit_period": (("new_orbit",), "int32", 0, "1", "period in drive periods"),
-    "new_orbit_points": (("new_orbit", "state"), "float64", np.nan, _STATE_UNITS, "section point"),
+    "new_orbit_points": (("new_orbit", "state"), "float64", np.nan, "see state_units", "section point"),
     "new_orbit_multiplier": (("new_orbit",), "float64", np.nan, "1", "largest modulus of a multiplier"),
 }  # fmt: skip
 """Own dims, dtype, fill, units and long name."""

@@ -5,36 +5,105 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.parameters import Parameters, load_preset
-from magpend_core.models.pendulum.systems import PENDULUM_FITTED, system_of
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.cells import Block
-from pipeline.layout.vocabulary import START_DIMS
+from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of, parameters_of, split_dims
 
 BUDGET = 256 * 2**20
 """Bytes of sections held at once."""
 
 
+@dataclass(frozen=True)
+class Dynamics:
+    """What a cube's cells obey.
+
+    Attributes
+    ----------
+    model : Model or None
+        None if another system was given: then nothing is known of it but its equations.
+    parameters : Parameters, ndarray or None
+        Of the run; swept ones are replaced at each point. A packed vector with a system of its own. None
+        if nothing is to be integrated.
+    system : System or None
+        None, too, if nothing is to be integrated: it would bring the compiler with it.
+    geometry : Geometry
+    """
+
+    model: Model | None
+    parameters: Parameters | np.ndarray | None
+    system: System | None
+    geometry: Geometry
+
+    @classmethod
+    def of(
+        cls, ds: xr.Dataset, parameters: Parameters | np.ndarray | None = None, system: System | None = None,
+        *, needed: bool = True,
+    ) -> Dynamics:  # fmt: skip
+        """Those given, else those of the run.
+
+        Raises
+        ------
+        ValueError
+            If the parameters are `needed` and not there.
+        """
+        if system is not None:
+            return cls(None, parameters, system, Geometry.of(system))
+        if parameters is None and (needed or ds.attrs.get("parameters")):
+            parameters = parameters_of(ds)
+        model = parameters.model if isinstance(parameters, Parameters) else model_of(ds)
+        return cls(model, parameters, model.system if needed else None, Geometry.of(model))
+
+    @property
+    def integrates(self) -> System:
+        """What is integrated; it must be there."""
+        assert self.system is not None
+        return self.system
+
+    @property
+    def n_angles(self) -> int:
+        """Number of states on circles."""
+        return sum(self.geometry.is_angle)
+
+
 @dataclass
 class Point:
-    """One parameter point: where its cells are, and what is integrated there."""
+    """One parameter point: where its cells are, and what is integrated there.
+
+    Attributes
+    ----------
+    parameters : Parameters or None
+        With the values of the swept ones; None for a system without a model.
+    packed : ndarray
+        The same as the engine takes them.
+    frequency : float
+        Of the drive [Hz].
+    """
 
     cube: xr.Dataset
     start_dims: tuple[str, ...]
     frequency: float
     packed: np.ndarray
     parameters: Parameters | None
-    state_names: tuple[str, ...]
+    n_angles: int
     block_cells: int
 
     @property
     def n_cells(self) -> int:
         """Number of cells."""
         return math.prod(self.cube.sizes[d] for d in self.start_dims)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.cube.sizes["state"])
 
     def blocks(self) -> Iterator[Block]:
         """All cells in blocks, in the order of the start dims."""
@@ -48,57 +117,20 @@ class Point:
             yield self._block(part, slice(begin * inner, begin * inner + n), n)
 
     def _block(self, part: xr.Dataset, cells: slice, n: int) -> Block:
-        def values(name: str, own: tuple[str, ...]) -> np.ndarray:
+        def values(name: str, *own: Any) -> np.ndarray:
             array = part[name].transpose(*self.start_dims, *own)
             return np.asarray(array.values).reshape(n, *array.shape[len(self.start_dims) :])
 
-        section = values("section", ("period_index", "state")).astype(np.float64)
-        links = sum(name in ("psi1", "psi2") for name in self.state_names)
-        turns = values("turns", ("link",)) if "turns" in part else np.zeros((n, links), np.int64)
-        return Block(cells, section, values("status", ()), values("orbit_period", ()), turns)
+        section = values("section", "period_index", "state").astype(np.float64)
+        turns = values("turns", ...) if "turns" in part else np.zeros((n, self.n_angles), np.int64)
+        return Block(cells, section, values("status"), values("orbit_period"), turns)
 
 
-def parameters_of(ds: xr.Dataset) -> Parameters:
-    """Parameters that a run's attribute ``parameters`` tells, a line ``name = value`` for each.
-
-    Raises
-    ------
-    ValueError
-        If it is not there.
-    """
-    lines = str(ds.attrs.get("parameters", "")).splitlines()
-    values = {name.strip(): float(value) for name, _, value in (line.partition("=") for line in lines)}
-    if not values:
-        raise ValueError(
-            "The dataset has no attribute 'parameters'; give parameters, or set polish to False."
-        )
-    return load_preset().replace(**values)
-
-
-def engine_inputs(
-    ds: xr.Dataset, parameters: Parameters | np.ndarray | None, system: System | None, *, needed: bool
-) -> tuple[Parameters | np.ndarray | None, System]:
-    """Parameters and system: those given, else those of the run."""
-    base = parameters_of(ds) if parameters is None and needed else parameters
-    if system is None:
-        system = system_of(base) if isinstance(base, Parameters) else PENDULUM_FITTED
-    return base, system
-
-
-# ---- reading -----------------------------------------------------------------------------------
-
-
-def slabs(
-    ds: xr.Dataset,
-    start_dims: tuple[str, ...],
-    base: Parameters | np.ndarray | None,
-    system: System,
-    budget: int,
-) -> Iterator[dict[tuple[int, ...], Point]]:
+def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
     """Parameter points, some at a time: what fits is loaded at once, since chunks span many points."""
     names = [n for n in ("section", "status", "orbit_period", "turns") if n in ds]
-    cube = ds[names].reset_coords(drop=True) if "frequency" in ds.dims else ds[names]
-    dims = [str(d) for d in ds["status"].dims if d not in START_DIMS]
+    cube = ds[names].reset_coords(drop=True) if FREQUENCY_DIM in ds.dims else ds[names]
+    dims, start_dims = split_dims(ds["status"])
     shape = [ds.sizes[d] for d in dims]
     per_point = ds["section"].size * 8 // max(math.prod(shape), 1)
     cell = 8 * math.prod(ds.sizes[d] for d in ("period_index", "state"))
@@ -107,29 +139,34 @@ def slabs(
         slab = cube.isel({dims[0]: slice(begin, begin + rows)}) if dims else cube
         if slab["section"].size * 8 <= budget:
             slab = slab.load()
-        sizes = [slab.sizes[d] for d in dims]
         points = {}
-        for local in np.ndindex(*sizes):
+        for local in np.ndindex(*(slab.sizes[d] for d in dims)):
             index = (local[0] + begin, *local[1:]) if dims else ()
             one = slab.isel(dict(zip(dims, local, strict=True)))
             values = {d: float(ds[d].values[i]) for d, i in zip(dims, index, strict=True)}
-            points[index] = _point(one, ds, start_dims, values, base, system, max(1, budget // (4 * cell)))
+            values = {**_fixed(ds), **values}
+            points[index] = _point(one, start_dims, values, dynamics, max(1, budget // (4 * cell)))
         yield points
 
 
+def _fixed(ds: xr.Dataset) -> dict[str, float]:
+    """Parameters of which one value was chosen."""
+    return {str(name): float(c) for name, c in ds.coords.items() if not c.ndim and c.dtype.kind in "fiu"}
+
+
 def _point(
-    one: xr.Dataset, ds: xr.Dataset, start_dims: tuple[str, ...], values: Mapping[str, float],
-    base: Parameters | np.ndarray | None, system: System, block_cells: int,
+    one: xr.Dataset, start_dims: tuple[str, ...], values: Mapping[str, float], dynamics: Dynamics,
+    block_cells: int,
 ) -> Point:  # fmt: skip
-    own = dict(values)
-    fixed = float(ds["frequency"]) if "frequency" in ds.coords and not ds["frequency"].ndim else math.nan
-    frequency = own.pop("frequency", fixed)
-    parameters = base.replace(**own) if isinstance(base, Parameters) else None
-    if parameters is not None:
-        packed = parameters.pack()
-    else:
-        packed = np.zeros(len(system.parameter_names)) if base is None else np.array(base, np.float64)
-        for name, value in own.items():
-            if name in system.parameter_names:
-                packed[system.parameter_names.index(name)] = value
-    return Point(one, start_dims, frequency, packed, parameters, system.state_names, block_cells)
+    frequency, base = values.get(FREQUENCY_DIM, math.nan), dynamics.parameters
+    if isinstance(base, Parameters):
+        parameters = base.replace(**{name: value for name, value in values.items() if name in base})
+        return Point(
+            one, start_dims, frequency, parameters.pack(), parameters, dynamics.n_angles, block_cells
+        )
+    names = dynamics.system.parameter_names if dynamics.system is not None else ()
+    packed = np.zeros(len(names)) if base is None else np.array(base, np.float64)
+    for name, value in values.items():
+        if name in names:
+            packed[names.index(name)] = value
+    return Point(one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells)
