@@ -1,43 +1,104 @@
-"""Digests of what sources mean, so that an edited sentence is not another program."""
+"""What sources mean, as a digest: results carry it, so that they can be compared with what would be computed.
+
+Two sources mean the same if they differ in comments, docstrings, layout, or the wording of errors alone. A
+run that was begun with one is completed with the other.
+"""
 
 from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
-_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-
-
-def meaning(source: str) -> str:
-    """Return a text that is the same for two sources that differ in comments, docstrings or layout alone.
-
-    Strings that stand as statements by themselves count as docstrings, wherever they are.
-    """
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
-        if isinstance(node, _DOCUMENTED):
-            node.body = [s for s in node.body if not _is_text(s)] or [ast.Pass()]
-    return ast.dump(tree)
-
-
-def _is_text(statement: ast.stmt) -> bool:
-    return (
-        isinstance(statement, ast.Expr)
-        and isinstance(statement.value, ast.Constant)
-        and isinstance(statement.value.value, str)
-    )
+_PACKAGE = Path(__file__).parent
+_NOT_KERNEL = ("models",)  # a model has a digest of its own
+_WITHOUT_MEANING = ("type_comment", "kind", "ctx")
 
 
 def meaning_digest(paths: Iterable[Path]) -> str:
-    """Digest of the meaning of Python files and the bytes of others, in the order given; 16 hex digits.
+    """Digest of what Python sources do, whatever is said about it and where they lie.
 
-    File names count, folders do not: a package that is moved as a whole is the same.
+    Left out are comments, docstrings and other bare strings, layout and line numbers, and what errors say
+    (their types count). Names count, and so does the order of statements.
+
+    Parameters
+    ----------
+    paths
+        Files, and folders for all ``*.py`` below them, in any order. A file counts with its name, one in a
+        folder with its path from there; what is not Python, with its bytes.
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits, the same with every version of Python that reads the sources alike.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read.
+    SyntaxError
+        If one is not Python.
     """
     digest = hashlib.sha256()
-    for path in paths:
-        digest.update(path.name.encode() + b"\0")
-        data = meaning(path.read_text("utf-8")).encode() if path.suffix == ".py" else path.read_bytes()
-        digest.update(hashlib.sha256(data).digest())
+    for name, path in sorted(_files(paths)):
+        content = path.read_bytes()
+        if path.suffix == ".py":
+            tokens: list[str] = []
+            _write(ast.parse(content), tokens)
+            content = "".join(tokens).encode()
+        digest.update(name.encode() + b"\0" + hashlib.sha256(content).digest())
     return digest.hexdigest()[:16]
+
+
+@cache
+def kernel_version() -> str:
+    """Digest of the numerical core without its models: what stored results carry as ``kernel_version``.
+
+    It follows the meaning of the sources (see `meaning_digest`): an edited sentence bars nobody from
+    completing a run.
+    """
+    own = (path for path in _PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir())
+    return meaning_digest(path for path in own if path.name not in _NOT_KERNEL)
+
+
+def _files(paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
+    for path in paths:
+        if path.is_dir():
+            for file in path.rglob("*.py"):
+                yield f"{path.name}/{file.relative_to(path).as_posix()}", file
+        else:
+            yield path.name, path
+
+
+def _write(node: object, out: list[str]) -> None:
+    """Write a syntax tree as text.
+
+    `ast.dump` would do but for its changes from one version of Python to the next: empty fields come and
+    go, new ones are added.
+    """
+    if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+        node = ast.Raise(node.exc.func, node.cause)
+    if isinstance(node, ast.AST):
+        out.append(f"{type(node).__name__}(")
+        for field, value in ast.iter_fields(node):
+            if field not in _WITHOUT_MEANING and value is not None and value != []:
+                out.append(f"{field}=")
+                _write(value, out)
+        out.append(")")
+    elif isinstance(node, list):
+        out.append("[")
+        for entry in node:
+            if not _is_remark(entry):
+                _write(entry, out)
+        out.append("]")
+    else:
+        out.append(f"{node!r},")
+
+
+def _is_remark(node: object) -> bool:
+    """Whether a statement does nothing: a docstring, another bare string, ``pass`` or ``...``."""
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        return isinstance(node.value.value, str) or node.value.value is ...
+    return isinstance(node, ast.Pass)

@@ -7,21 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core.engine.lanes import Cells, engine_of
+from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD_CLOSED, RECORD_LAST, Settings
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
-from magpend_core.validation import (
-    check_array,
-    check_count,
-    check_frequency,
-    check_states,
-    check_tolerance,
-)
-
-N_LANES = 64
-"""Lanes in flight: four groups, whose numbers just fit the first-level caches."""
+from magpend_core.validation import check_count, check_frequency, check_states, check_tolerance
 
 
 @dataclass(frozen=True)
@@ -63,33 +54,6 @@ class Sections:
     final_state: np.ndarray
     step_size: np.ndarray
     extremes: np.ndarray | None = None
-
-
-SLACK = 1e4
-"""Product of slack and tolerance in the step limiter (see `lanes.step_ratio`), chosen on the preset.
-
-Over 2 to 2.8 Hz and tolerances from 1e-5 to 1e-11 it needs the fewest steps for the error reached, or
-nearly so, with at most 6 % of the attempts rejected; ten times more or less costs 10 to 20 %.
-"""
-
-LEAST_RTOL = 1e-13
-"""Below this, rounding errors decide and the step size collapses."""
-
-
-def slack_of(rtol: float, atol: float) -> float:
-    """Slack of the step limiter for given tolerances."""
-    return SLACK * (rtol + atol)
-
-
-def check_tolerances(rtol: Any, atol: Any) -> tuple[float, float]:
-    """Return both tolerances as numbers.
-
-    Raises
-    ------
-    ValueError
-        If one is out of bounds.
-    """
-    return check_tolerance("rtol", rtol, LEAST_RTOL), check_tolerance("atol", atol)
 
 
 def run_branches(
@@ -162,13 +126,13 @@ def run_branches(
     n_keep = check_count("n_keep", n_keep, 1)
     max_orbit_period = check_count("max_orbit_period", max_orbit_period, 1)
     tolerance = check_tolerance("closure_tolerance", closure_tolerance)
-    rtol, atol = check_tolerances(rtol, atol)
     settings = Settings(n_transient, n_keep, max_orbit_period, tolerance, max(64, 4 * max_orbit_period))
-    cells = _cells(parameters, frequency_hz, initial_states, step_size, n_keep, slack_of(rtol, atol), system)
-    attempts = float(check_count("max_steps_per_period", max_steps_per_period, 1))
-    if cells.status.size:
-        engine = engine_of(system, RECORD_CLOSED if stop_when_closed else RECORD_LAST)
-        engine(cells, check_count("n_lanes", n_lanes, 1), rtol, atol, attempts, settings)
+    cells = integrate(
+        system, RECORD_CLOSED if stop_when_closed else RECORD_LAST, settings,
+        parameters=parameters, frequency_hz=frequency_hz, initial_states=initial_states,
+        n_keep=n_keep, n_measures=FIRST_TURN + system.n_states, rtol=rtol, atol=atol,
+        max_steps_per_period=max_steps_per_period, step_size=step_size, n_lanes=n_lanes,
+    )  # fmt: skip
     angles = [FIRST_TURN + i for i, angle in enumerate(system.is_angle) if angle]
     return Sections(
         section=cells.section,
@@ -180,47 +144,6 @@ def run_branches(
         n_rejected=cells.n_rejected.astype(np.int32),
         final_state=cells.state,
         step_size=cells.step_size,
-    )
-
-
-def _cells(
-    parameters: Any,
-    frequency_hz: Any,
-    initial_states: Any,
-    step_size: Any,
-    n_keep: int,
-    slack: float,
-    system: System,
-) -> Cells:
-    """Check the input arrays and allocate the output."""
-    frequency = check_frequency(frequency_hz, 2)
-    n_branches, n_points = frequency.shape
-    packed = check_array("parameters", parameters, 3)
-    wanted = (n_branches, n_points, len(system.parameter_names))
-    if packed.shape != wanted:
-        raise ValueError(
-            f"parameters has shape {packed.shape}; frequency_hz of shape {frequency.shape} and "
-            f"{system.name} with {wanted[2]} parameters ask for {wanted}."
-        )
-    initial = check_states(initial_states, 2, system.n_states, "initial_states")
-    first_step = np.zeros(n_branches) if step_size is None else check_array("step_size", step_size, 1)
-    for name, array in (("initial_states", initial), ("step_size", first_step)):
-        if len(array) != n_branches:
-            raise ValueError(f"{name} has {len(array)} rows; frequency_hz has {n_branches} branches.")
-    n = system.n_states
-    return Cells(
-        frequency=frequency,
-        parameters=packed,
-        slack=slack,
-        state=initial.copy(),
-        step_size=first_step.copy(),
-        turns=np.zeros((n_branches, n), np.int64),
-        section=np.full((n_branches, n_points, n_keep, n), np.nan),
-        measures=np.zeros((n_branches, n_points, 1 + n)),
-        status=np.zeros((n_branches, n_points), np.int64),
-        n_periods=np.zeros((n_branches, n_points), np.int64),
-        n_steps=np.zeros((n_branches, n_points), np.int64),
-        n_rejected=np.zeros((n_branches, n_points), np.int64),
     )
 
 

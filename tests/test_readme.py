@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
+from magpend_core.models import load_model
 from pipeline.cli.main import app
-from pipeline.layout.schema import VARIABLES
+from pipeline.layout.schema import base_variables
 from pipeline.runs.run import shipped_workflows
 from pipeline.spec.parsing import parse_spec
+
+VARIABLES = base_variables(load_model())
 
 README = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
 

@@ -3,7 +3,9 @@
 numba's own ``cache=True`` watches the file of the cached function alone: after an edit of a callee
 in another file the cached caller goes on returning the old result. Here the cache folder is named
 by a digest of all sources of ``magpend_core`` with the versions of numba and llvmlite, so that any
-edit starts an empty folder. numba itself separates CPU models inside it.
+edit starts an empty folder. numba itself separates CPU models inside it. The digest is of bytes, not of
+meaning like `kernel_version`: no rule about what matters can then let an old answer through, and one
+compilation is all that a needless change costs.
 
 Environment variables, read once at import:
 
@@ -36,11 +38,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def source_digest() -> str:
-    """Digest of the numerical core: every source file of ``magpend_core``, in name order.
-
-    Results carry it as ``kernel_version``: stored numbers and the code that made them can be
-    compared.
-    """
+    """Digest of the numerical core for the compile cache: the bytes of every source, in name order."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode())

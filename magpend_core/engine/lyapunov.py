@@ -17,14 +17,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.jit import inline
-from magpend_core.engine.lanes import Cells, engine_of
 from magpend_core.engine.observers import PENDING, Observer
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.engine.vecmath import exp, log
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
-from magpend_core.sections import N_LANES, check_tolerances, slack_of
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_frequency, check_states
 
@@ -60,6 +59,8 @@ class LyapunovExponents:
         exponents are not resolved.
     status : ndarray of int8, (cell,)
         ``BOUNDED`` if all went well, or how the trajectory failed.
+    is_whole : bool
+        Whether there is an exponent for each state. Only then does their sum have to be `divergence`.
     """
 
     exponents: np.ndarray
@@ -69,6 +70,7 @@ class LyapunovExponents:
     divergence: np.ndarray
     loss: np.ndarray
     status: np.ndarray
+    is_whole: bool
 
 
 LENGTH = 1e-3
@@ -156,7 +158,7 @@ def lyapunov_exponents(
     frequency_hz: np.ndarray,
     states: np.ndarray,
     *,
-    n_exponents: int = 4,
+    n_exponents: int | None = None,
     n_transient: int = 200,
     n_periods: int = 400,
     n_blocks: int = 16,
@@ -189,7 +191,7 @@ def lyapunov_exponents(
     states
         States at a rising edge of the drive, shape (cell, n_states) [rad, rad/s].
     n_exponents
-        How many, from the largest.
+        How many, from the largest; None for all, one per state.
     n_transient
         Drive periods in which the tangent vectors turn into their directions.
     n_periods
@@ -223,16 +225,17 @@ def lyapunov_exponents(
             f"parameters, frequency_hz and states have {len(packed)}, {len(frequency)} and {len(start)} "
             "rows; they must agree."
         )
+    n_exponents = system.n_states if n_exponents is None else n_exponents
     settings = _settings(n_exponents, n_transient, n_periods, n_blocks, system)
-    rtol, atol = check_tolerances(rtol, atol)
     n = system.n_states
     extended = with_tangents(system, n_exponents, divergence=True)
     extended = dataclasses.replace(extended, n_controlled=n * (1 + n_exponents))
-    cells = _cells(packed, frequency, start, n_exponents, settings.n_blocks, slack_of(rtol, atol), extended)
-    attempts = float(check_count("max_steps_per_period", max_steps_per_period, 1))
-    if len(start):
-        engine = engine_of(extended, _observer(n, n_exponents))
-        engine(cells, check_count("n_lanes", n_lanes, 1), rtol, atol, attempts, settings)
+    cells = integrate(
+        extended, _observer(n, n_exponents), settings,
+        parameters=packed[:, None], frequency_hz=frequency[:, None],
+        initial_states=_with_vectors(start, n_exponents), n_keep=n_blocks, n_measures=n_exponents + 3,
+        rtol=rtol, atol=atol, max_steps_per_period=max_steps_per_period, n_lanes=n_lanes,
+    )  # fmt: skip
     seconds = settings.periods_per_block / frequency
     sums = cells.section[:, 0] / seconds[:, None, None]
     means = sums[:, :, :n_exponents].mean(axis=1)
@@ -248,6 +251,7 @@ def lyapunov_exponents(
         divergence=sums[:, :, n_exponents].mean(axis=1),
         loss=measures[:, n_exponents + 2],
         status=cells.status[:, 0].astype(np.int8),
+        is_whole=n_exponents == n,
     )
 
 
@@ -265,27 +269,8 @@ def _settings(n_exponents: int, n_transient: int, n_periods: int, n_blocks: int,
     return _Settings(n_transient, n_blocks, n_periods // n_blocks)
 
 
-def _cells(
-    packed: np.ndarray, frequency: np.ndarray, start: np.ndarray, n_vectors: int, n_blocks: int,
-    slack: float, extended: System,
-) -> Cells:  # fmt: skip
-    """Branches of one point, with the first unit vectors as tangents."""
-    n_cells, n = start.shape
-    state = np.zeros((n_cells, extended.n_states))
-    state[:, :n] = start
-    state[:, n : n + n * n_vectors] = LENGTH * np.eye(n)[:n_vectors].ravel()
-    per_cell = (n_cells, 1)
-    return Cells(
-        frequency=frequency[:, None].copy(),
-        parameters=packed[:, None, :].copy(),
-        slack=slack,
-        state=state,
-        step_size=np.zeros(n_cells),
-        turns=np.zeros(state.shape, np.int64),
-        section=np.full((*per_cell, n_blocks, extended.n_states), np.nan),
-        measures=np.zeros((*per_cell, n_vectors + 3)),
-        status=np.zeros(per_cell, np.int64),
-        n_periods=np.zeros(per_cell, np.int64),
-        n_steps=np.zeros(per_cell, np.int64),
-        n_rejected=np.zeros(per_cell, np.int64),
-    )
+def _with_vectors(states: np.ndarray, n_vectors: int) -> np.ndarray:
+    """Append the first unit vectors as tangents, and the divergence's integral."""
+    n = states.shape[1]
+    vectors = np.broadcast_to(LENGTH * np.eye(n)[:n_vectors].ravel(), (len(states), n * n_vectors))
+    return np.concatenate([states, vectors, np.zeros((len(states), 1))], axis=1)

@@ -12,9 +12,9 @@ from pipeline.cli.options import speaking, taking
 
 
 def _names() -> list[str]:
-    from pipeline.products.registry import ANALYSES
+    from pipeline.products.registry import COMMANDS
 
-    return [name for name in ANALYSES if name != "identified"]
+    return list(COMMANDS)
 
 
 def _make(name: str) -> Any:
@@ -33,6 +33,7 @@ def _make(name: str) -> Any:
         if "source" in ds.encoding:
             console.note(f"stored: {ds.encoding['source']}")
 
+    command.__name__ = name
     return made(name, taking(analysis.options, command), analysis.help)
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -64,7 +64,9 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
         rows = [{name: _json(value) for name, value in row.items()} for row in table.rows]
         console.result(json.dumps(rows, indent=1))
     elif csv == "-":
-        write_csv(table.rows, sys.stdout)
+        text = io.StringIO()
+        write_csv(table.rows, text)
+        console.result(text.getvalue().rstrip("\n"))
     else:
         for line in table.lines:
             console.result(line)

@@ -9,13 +9,22 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+
+from pipeline.products.reporting import reporting
+from pipeline.runs.progress import duration
 
 LOG = logging.getLogger("magpend")
 
-FIRST_LINE_S, LINE_EVERY_S = 2.0, 10.0
+FIRST_LINE_S, LINE_EVERY_S, BAR_EVERY_S = 2.0, 10.0, 0.3
+
+
+class EnoughError(Exception):
+    """Whoever read the standard output has enough, as ``head`` does."""
 
 
 def note(line: str) -> None:
@@ -24,8 +33,23 @@ def note(line: str) -> None:
 
 
 def result(line: str) -> None:
-    """Write a line of a result to the standard output."""
-    sys.stdout.write(f"{line}\n")
+    """Write a line of a result to the standard output.
+
+    Raises
+    ------
+    EnoughError
+        If nobody reads it any more.
+    """
+    try:
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise EnoughError from None
+
+
+def is_shown() -> bool:
+    """Whether notes are shown, not with ``--quiet``."""
+    return any(isinstance(h, _Stderr) and h.level <= logging.INFO for h in LOG.handlers)
 
 
 class _Stderr(logging.Handler):
@@ -72,73 +96,116 @@ def close() -> None:
 
 
 class Display:
-    """Shows what `pipeline.products.reporting` reports: a bar on a terminal, else a line now and then.
+    """Shows how far a command is: a bar on a terminal, else a line now and then.
+
+    It hears what `pipeline.products.reporting` reports, and from the first seconds on says at intervals
+    what is being done and for how long, reports or not.
 
     Parameters
     ----------
+    name
+        What is shown while nothing is reported.
     terminal
-        Draw a bar.
+        Draw a bar; by default if the standard error is a terminal.
     clock
         Seconds that only ever grow.
     """
 
     current: Display | None = None
 
-    def __init__(self, *, terminal: bool | None = None, clock: object = time.monotonic) -> None:
+    def __init__(
+        self, name: str, *, terminal: bool | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._terminal = sys.stderr.isatty() if terminal is None else terminal
-        self._clock = clock
-        self._what, self._started, self._begun, self._last = "", 0.0, 0.0, 0.0
+        self._clock, self._started = clock, clock()
+        self._work = Work(name, self._started)
         self._drawn = False
+        self._lock, self._over = threading.RLock(), threading.Event()
 
     def __call__(self, what: str, done: float, total: float) -> None:
         """Take a report."""
-        now = self._clock()  # type: ignore[operator]
-        if what != self._what:
-            self.clear()
-            self._what, self._started, self._begun = what, now, done
-            self._last = now - LINE_EVERY_S + FIRST_LINE_S
-        due = 0.1 if self._terminal else LINE_EVERY_S
-        if now - self._last < due and not (self._drawn and done >= total):
-            return
-        self._last = now
-        line = self._line(done, total, now - self._started)
-        if self._terminal and LOG.handlers and LOG.handlers[0].level <= logging.INFO:
-            sys.stderr.write(f"\r\x1b[2K{_bar(done, total)} {line}")
-            sys.stderr.flush()
-            self._drawn = True
-        else:
-            note(line)
+        with self._lock:
+            if what != self._work.what:
+                self._work = Work(what, self._clock(), done)
+            self._work.done, self._work.total = done, total
 
-    def _line(self, done: float, total: float, elapsed: float) -> str:
-        from pipeline.runs.progress import duration
-
-        share = f"{self._what}: {done:g} of {total:g} ({100 * done / max(total, 1e-300):.0f} %)"
-        rate = (done - self._begun) / elapsed if elapsed > 0 else 0.0
-        return f"{share}, {duration((total - done) / rate)} left" if rate > 0 and done < total else share
+    def show(self) -> None:
+        """Say now how far the work is."""
+        with self._lock:
+            line = self._work.line(self._clock())
+            if not self._terminal:
+                note(line)
+            elif is_shown():
+                sys.stderr.write(f"\r\x1b[2K{line}")
+                sys.stderr.flush()
+                self._drawn = True
 
     def clear(self) -> None:
         """Take the bar away."""
-        if self._drawn:
-            sys.stderr.write("\r\x1b[2K")
-            sys.stderr.flush()
-            self._drawn = False
+        with self._lock:
+            if self._drawn:
+                sys.stderr.write("\r\x1b[2K")
+                sys.stderr.flush()
+                self._drawn = False
+
+    def watch(self) -> None:
+        """Show at intervals until `stop` is called."""
+        pause = FIRST_LINE_S
+        while not self._over.wait(pause):
+            self.show()
+            pause = BAR_EVERY_S if self._terminal else LINE_EVERY_S
+
+    def stop(self) -> None:
+        """End `watch`, and take the bar away."""
+        self._over.set()
+        self.clear()
 
 
-def _bar(done: float, total: float, width: int = 24) -> str:
-    filled = min(width, int(width * done / max(total, 1e-300)))
-    return f"[{'#' * filled}{'.' * (width - filled)}]"
+@dataclass
+class Work:
+    """A piece of work and how far it is.
+
+    Attributes
+    ----------
+    what : str
+    started : float
+        When the first report of it came [s].
+    begun : float
+        How much was done then.
+    done, total : float
+        As last reported; without a total, only the time is known.
+    """
+
+    what: str
+    started: float
+    begun: float = 0.0
+    done: float = 0.0
+    total: float = 0.0
+
+    def line(self, now: float) -> str:
+        """Say how far it is, and how long it will take."""
+        elapsed = max(now - self.started, 0.0)
+        if not self.total:
+            return f"{self.what}: {duration(elapsed)} so far"
+        share = min(self.done / self.total, 1.0)
+        text = f"{self.what}: {self.done:g} of {self.total:g} ({100 * share:.0f} %)"
+        rate = (self.done - self.begun) / elapsed if elapsed > 0 else 0.0
+        if rate > 0 and share < 1:
+            return f"{text}, {duration((self.total - self.done) / rate)} left"
+        return text if share == 1 else f"{text}, {duration(elapsed)} so far"
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[None]:
-    """Show the progress of what is done inside."""
-    from pipeline.products.reporting import reporting
-
-    display = Display()
+def progress(name: str) -> Iterator[None]:
+    """Show the progress of what is done inside, which has a name."""
+    display = Display(name)
     Display.current = display
+    watcher = threading.Thread(target=display.watch, daemon=True)
+    watcher.start()
     try:
         with reporting(display):
             yield
     finally:
-        display.clear()
+        display.stop()
+        watcher.join()
         Display.current = None

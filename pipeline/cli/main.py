@@ -11,6 +11,7 @@ import typer
 
 from pipeline.cli.analyse import analyse_app
 from pipeline.cli.common import EXIT_HELP, CommandError
+from pipeline.cli.console import EnoughError
 from pipeline.cli.exits import Exit
 from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.models import models, presets
@@ -92,7 +93,7 @@ def main() -> None:
     try:
         code = app(standalone_mode=False) or Exit.DONE
         sys.stdout.flush()
-    except BrokenPipeError:
+    except (EnoughError, BrokenPipeError):
         _leave_quietly()
     except CommandError as error:
         _usage(error)
@@ -112,6 +113,9 @@ def _usage(error: Any) -> None:
     """Say which word of a command is wrong, and where help is."""
     context = getattr(error, "ctx", None)
     message = error.format_message()
+    near = getattr(error, "possibilities", None)
+    if near and hasattr(error, "option_name"):
+        message = f"no option {error.option_name}; did you mean {' or '.join(near)}?"
     if context is not None and not message.strip():  # a group without a command shows its help
         message = context.get_help()
     hint = f"\nhelp: {context.command_path} --help" if context is not None else ""

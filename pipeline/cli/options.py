@@ -32,7 +32,7 @@ def speaking(command: Command) -> Command:
         from pipeline.cli import console
 
         console.configure(**{name: given.pop(name) for name in _VOICES})
-        with console.progress():
+        with console.progress(command.__name__):
             command(*args, **given)
 
     voices = [_keyword(name, kind, default) for name, (kind, default) in _VOICES.items()]

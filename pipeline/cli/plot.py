@@ -30,6 +30,7 @@ def _make(name: str) -> Any:
         draw(directory, name, options)
 
     figure = FIGURES[name]
+    command.__name__ = f"figure {name}"
     return made(name, taking(figure.options, command), figure.help)
 
 
@@ -45,24 +46,19 @@ plot_app = typer.Typer(
 def draw(directory: Path, name: str, options: FigureOptions) -> None:
     """Draw a figure of a run, write it and the data drawn, and say where."""
     from pipeline.cli import console
-    from pipeline.products.product import function_of
-    from pipeline.products.registry import FIGURES
-    from pipeline.runs.derive import AnalysedRun, prepared, refused
+    from pipeline.runs.drawing import drawn, ready
 
-    figure = FIGURES[name]
     if options.out:
         check_figure_path(_target_of(options))
-    run = AnalysedRun.of(directory, console.note)
-    wanted: Any = prepared(run, figure, options)
+    run, wanted = ready(directory, name, options, console.note)
     target = _target_of(wanted) if wanted.out else _in_run(directory, name, wanted)
-    with refused(directory):
-        drawn = function_of(figure.draw)(run, wanted)
+    figure = drawn(run, name, wanted)
     from pipeline.plots import save_data, save_figure
 
     target.parent.mkdir(exist_ok=True)
-    console.result(f"figure: {save_figure(drawn, target)}")
-    if hasattr(drawn, "data"):
-        console.result(f"data: {save_data(drawn, target)}")
+    console.result(f"figure: {save_figure(figure, target)}")
+    if hasattr(figure, "data"):
+        console.result(f"data: {save_data(figure, target)}")
 
 
 def _target_of(options: FigureOptions) -> Path:

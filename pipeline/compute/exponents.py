@@ -43,7 +43,7 @@ def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
         "lyapunov_stderr": found.stderr,
         "lyapunov_blocks": found.blocks,
         "divergence": found.divergence,
-        "lyapunov_flag": flags(found, len(job.spec.model.states)),
+        "lyapunov_flag": flags(found),
     }
     filled = {}
     for variable in LYAPUNOV_VARIABLES:
@@ -57,10 +57,10 @@ def _falling(rates: np.ndarray) -> np.ndarray:
     return np.sort(rates, axis=1)[:, ::-1]
 
 
-def flags(found: LyapunovExponents, n_states: int) -> np.ndarray:
+def flags(found: LyapunovExponents) -> np.ndarray:
     """Codes of `LyapunovFlag`; only a whole spectrum can be held against the divergence."""
     flag = np.full(len(found.status), LyapunovFlag.GOOD, np.int8)
-    if found.exponents.shape[1] == n_states:
+    if found.is_whole:
         missing = np.abs(found.exponents.sum(axis=1) - found.divergence)
         flag[missing > AUDIT * np.abs(found.exponents).sum(axis=1)] = LyapunovFlag.AUDIT_FAILED
     flag[found.loss > MOST_LOSS] = LyapunovFlag.UNRESOLVED

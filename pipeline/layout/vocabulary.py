@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
+from magpend_core.status import Status
 from pipeline.spec.tables import FREQUENCY
 
 if TYPE_CHECKING:
@@ -27,8 +28,7 @@ BRANCH, START = "branch", "initial_condition"
 ABSENT, CLOSED_ORBIT, BOUNDED_SET = range(3)
 """Values of `kind`, see `pipeline.analysis.attractors`."""
 
-PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = range(8)
-"""Values of `magpend_core.status.Status`, whose package brings the compiler with it."""
+PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = map(int, Status)
 
 FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED)
 """What became of cells that could not be integrated to the end."""

@@ -43,7 +43,7 @@ def _settled(options: ExtremesOptions, model: Any) -> ExtremesOptions:
         if options.quantities.count(name) > 1
     ]
     if problems:
-        raise ValueError(" ".join(problems))
+        raise ValueError(f"quantities: {' '.join(problems)}")
     return options
 
 

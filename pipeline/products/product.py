@@ -116,7 +116,7 @@ class CellProduct:
         were integrated; returns the variables, with leading dims (branch, point).
     settle : callable
         ``settle(options, model)``: the options with what follows from the model filled in; raises
-        ValueError with a sentence if they do not fit it.
+        ValueError with a sentence that begins with the option's name if they do not fit it.
     coordinates : callable
         ``coordinates(options, model)``: values of the product's own dims by name, where they have names.
     integrate : callable

@@ -59,6 +59,9 @@ ANALYSES: Registry[Analysis] = Registry(
     },
 )
 
+COMMANDS = tuple(name for name in ANALYSES if name != "identified")
+"""Analyses that have a table, and so a command."""
+
 FIGURES: Registry[Figure] = Registry(
     "figure",
     {

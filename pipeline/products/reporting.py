@@ -44,6 +44,11 @@ def report(what: str, done: float, total: float) -> None:
         listener(what, done, total)
 
 
+def is_heard() -> bool:
+    """Whether anybody listens."""
+    return _listener.get() is not None
+
+
 def track(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
     """Yield items, and report how many are done.
 

@@ -207,7 +207,7 @@ def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dic
         try:
             found[name] = product.settle(options, model)
         except ValueError as error:
-            problems.append(f"{path}: {error}")
+            problems.append(f"{path}.{error}")
     # one order, whatever that of the file: the cube's layout follows from it
     return {name: found[name] for name in CELL_PRODUCTS if name in found}
 

@@ -30,7 +30,6 @@ from scalar_peers import scipy_runner
 from magpend_core import load_preset, sections
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.attractors import identify
-from pipeline.layout.schema import LINKS, STATES
 
 FREQUENCY_HZ = 2.2
 TOLERANCE = 1e-8
@@ -94,7 +93,8 @@ def cube_of(parts: Sequence[Any], size: int, options: dict[str, Any]) -> xr.Data
     for name, own in OWN_DIMS.items():
         values = np.concatenate([getattr(part, name) for part in parts])
         data[name] = (("psi1_0", "psi2_0", *own), values.reshape(size, size, *values.shape[1:]))
-    coords = {"state": list(STATES), "link": list(LINKS), "frequency": FREQUENCY_HZ}
+    model = load_preset().model
+    coords = {"state": list(model.state_names), "link": list(model.angles), "frequency": FREQUENCY_HZ}
     tolerance = options.get("closure_tolerance", 1e-6)
     return xr.Dataset(data, coords, attrs={"closure_tolerance": tolerance})
 

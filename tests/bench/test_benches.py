@@ -35,7 +35,7 @@ def test_kernel__prints_all_tables(bench, monkeypatch, capsys):
 
 def test_kernel__limiter_is_back_after_the_run_without(bench):
     kernel = bench("kernel")
-    module = importlib.import_module("magpend_core.sections")
+    module = importlib.import_module("magpend_core.engine.entry")
     before = module.SLACK
     with kernel.no_limiter():
         assert before < module.SLACK

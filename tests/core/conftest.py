@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -131,6 +132,14 @@ def duffing(oscillator):
         rhs=_duffing_rhs,
         escape=(1e3, 1e3),
     )
+
+
+@pytest.fixture
+def copied(tmp_path):
+    """A copy of the package that a test may edit: the folder that holds it."""
+    source = Path(magpend_core.__file__).parent
+    shutil.copytree(source, tmp_path / "copy" / "magpend_core", ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path / "copy"
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -194,10 +195,11 @@ def rotation_of(branch: Branch) -> np.ndarray:
         return np.zeros(0)
     n = family.system.n_states
     rows = family.rows(branch.points[0].u[None])
-    # with tangents, since that code is compiled already
+    # with tangents in the error control, since that code is compiled already
+    extended = dataclasses.replace(with_tangents(family.system, n), n_controlled=None)
     result = run_branches(
         rows.parameters[:, None], rows.frequency_hz[:, None], np.append(rows.states[0], np.eye(n))[None],
-        n_transient=0, n_keep=family.period + 1, rtol=RTOL, atol=RTOL, system=with_tangents(family.system, n),
+        n_transient=0, n_keep=family.period + 1, rtol=RTOL, atol=RTOL, system=extended,
     )  # fmt: skip
     return np.asarray(result.turns[0, 0] / family.period, np.float64)
 

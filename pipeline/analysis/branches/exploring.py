@@ -15,11 +15,12 @@ from pipeline.analysis.branches.following import (
     doubled_start,
     first_point,
     half_branch,
+    half_orbit,
     joined,
     opposite,
 )
 from pipeline.analysis.branches.lockstep import Steps, run_together
-from pipeline.analysis.branches.problems import Family, OrbitProblem
+from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
 
 SAME = 1e-6
 """Scaled distance within which two orbits at one parameter value are the same."""
@@ -160,7 +161,7 @@ def _same_others(a: Family, b: Family) -> bool:
 
 def _fixed(family: Family) -> np.ndarray:
     values = np.append(family.parameters, family.frequency_hz)
-    names = (*family.system.parameter_names, "frequency_hz")
+    names = (*family.system.parameter_names, FREQUENCY)
     return np.array([v for n, v in zip(names, values, strict=True) if n not in family.free])
 
 
@@ -216,13 +217,8 @@ def _gap(family: Family, end: Point, one: Bifurcation) -> float:
 
 def _half_orbit(branch: Branch, which: int) -> Start:
     """The middle between the two halves of the orbit at the end of a branch."""
-    family, end = branch.family, branch.points[-which]
-    half = family.period // 2
-    step = family.mismatch(end.u, end.value.images[half - 1])
-    u = end.u.copy()
-    u[:-1] += 0.5 * step
-    single = replace(family, period=half)
-    return Start(single, single.state(u), float(single.values(u)[0]))
+    state, value = half_orbit(branch.family, branch.points[-which])
+    return Start(replace(branch.family, period=branch.family.period // 2), state, value)
 
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:

@@ -7,6 +7,7 @@ for little more than the price of one. The numbers of each are those that it wou
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -91,6 +92,9 @@ def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
     states = np.concatenate([r.states for r in rows])
     finite = np.isfinite(states).all(axis=1)
     identity = np.broadcast_to(np.eye(n).ravel(), (len(states), n * n))
+    # tangents in the error control: else a corner in the Jacobian leaves an error in the multipliers that
+    # the tolerance does not bound
+    extended = dataclasses.replace(with_tangents(system, n), n_controlled=None)
     result = run_branches(
         np.concatenate([r.parameters for r in rows])[:, None],
         np.concatenate([r.frequency_hz for r in rows])[:, None],
@@ -99,7 +103,7 @@ def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
         n_keep=max(r.period for r in rows),
         rtol=RTOL,
         atol=RTOL,
-        system=with_tangents(system, n),
+        system=extended,
     )
     section = result.section[:, 0]
     found, first = [], 0

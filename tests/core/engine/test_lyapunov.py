@@ -19,7 +19,7 @@ def of_duffing(duffing, parameters, n_cells=32, **options):
     rng = np.random.default_rng(4)
     return lyapunov_exponents(
         np.tile(np.array(parameters), (n_cells, 1)), np.full(n_cells, UNIT_FREQUENCY),
-        rng.uniform(-1.0, 1.0, (n_cells, 2)), n_exponents=2, system=duffing, **options,
+        rng.uniform(-1.0, 1.0, (n_cells, 2)), system=duffing, **options,
     )  # fmt: skip
 
 
@@ -39,6 +39,7 @@ def test_duffing__exponents_add_up_to_minus_the_damping(duffing, parameters):
     found = of_duffing(duffing, parameters, 4, n_periods=64, rtol=1e-11, atol=1e-11)
     assert found.exponents.sum(axis=1) == pytest.approx(-parameters[0], abs=1e-8)
     assert found.divergence == pytest.approx(-parameters[0], abs=1e-12)
+    assert found.is_whole
 
 
 def test_linear_oscillator__exponents_are_half_the_damping(duffing):

@@ -145,7 +145,7 @@ def only(branch, kind):
 def test_explore__linear_oscillator():
     """The exact orbit and multipliers at every frequency."""
     damping, linear, amplitude = 0.3, 4.0, 1.0
-    orbits = family(0.2, [damping, 0, linear, 0, amplitude], "frequency_hz", 0.5)
+    orbits = family(0.2, [damping, 0, linear, 0, amplitude], "frequency", 0.5)
     (branch,) = explore([Start(orbits, np.zeros(2), 0.2)], Scope(0.1, 0.6))
     assert branch.ends == ("bound", "bound")
     assert not branch.bifurcations
@@ -163,7 +163,7 @@ def test_explore__linear_oscillator():
 @pytest.fixture(scope="module")
 def resonance():
     """The bent resonance of a hardening spring: stable, unstable, stable again."""
-    orbits = family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency_hz", 0.3)
+    orbits = family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency", 0.3)
     (branch,) = explore([Start(orbits, np.array([0.3, 0.0]), 0.1)], Scope(0.1, 0.4))
     return orbits, branch
 
@@ -205,7 +205,7 @@ def test_explore__determinant(resonance):
 def test_dataset_of__resonance(resonance):
     """Three stable segments' worth of tables: numbers as on the branch."""
     _, branch = resonance
-    ds = dataset_of([branch], "frequency_hz", None)
+    ds = dataset_of([branch], "frequency", None)
     upper, lower = sorted(table_of(ds), key=lambda row: -row["value"])
     assert [upper["type"], lower["type"]] == ["fold", "fold"]
     assert (upper["unstable_below"], upper["unstable_above"]) == ("0|1", "none")
@@ -269,7 +269,7 @@ def test_explore__start_on_doubled_orbit(cascade):
 def test_explore__neimark_sacker():
     """A forced van der Pol oscillator leaves entrainment through a torus."""
     parameters = [-0.2, 0.2, 1.0, 0.0, 0.4]
-    orbits = family(0.16, parameters, "frequency_hz", 0.05)
+    orbits = family(0.16, parameters, "frequency", 0.05)
     (branch,) = explore(
         [Start(orbits, settled([1.0, 1.5], 0.16, parameters), 0.16)],
         Scope(0.15, 0.22, settings=Settings(longest_step=0.03)),
@@ -315,7 +315,7 @@ def test_explore__symmetry_breaking():
 def test_continue_curves__fold_of_duffing(resonance):
     """The fold at another amplitude, against scipy."""
     orbits, branch = resonance
-    family_2 = Family(OSCILLATOR, 1, 0.1, orbits.parameters, ("frequency_hz", "amplitude"), (0.3, 0.2))
+    family_2 = Family(OSCILLATOR, 1, 0.1, orbits.parameters, ("frequency", "amplitude"), (0.3, 0.2))
     fold = only(branch, "fold")[0]
     start = family_2.unknowns(orbits.state(fold.point.u), [orbits.values(fold.point.u)[0], 0.3])
     (curve,) = continue_curves([(0, family_2, "fold", start)], ((0.1, 0.4), (0.2, 0.4)))
@@ -402,7 +402,7 @@ def test_run_together__same_bits():
     settings = Settings()
     problems = [
         (OrbitProblem(o), o.unknowns(np.array([0.4, 0.1]), [0.1]))
-        for o in (family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency_hz", 0.3, period=p) for p in (1, 2, 3))
+        for o in (family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency", 0.3, period=p) for p in (1, 2, 3))
     ]
     alone = [run_alone(first_point(p, u, settings)) for p, u in problems]
     for count in (3, 9):
@@ -429,14 +429,14 @@ def test_explore__closed_branch():
     """A weakly forced van der Pol oscillator: the entrained orbits and their saddles form a closed curve."""
     parameters = [-0.2, 0.2, 1.0, 0.0, 0.1]
     frequency = 1.0 / (2.0 * np.pi)
-    orbits = family(frequency, parameters, "frequency_hz", 0.02)
+    orbits = family(frequency, parameters, "frequency", 0.02)
     start = Start(orbits, settled([1.0, 1.5], frequency, parameters, 200), frequency)
     (branch,) = explore([start], Scope(0.15, 0.17, max_period=1, settings=Settings(longest_step=0.05)))
     assert branch.ends == ("closed", "closed")
     assert sorted(b.kind for b in branch.bifurcations) == ["fold", "fold"]
     assert np.abs(branch.points[-1].u - branch.points[0].u).max() < 0.1
     # stable from fold to fold, across the start
-    (window,) = windows_of(dataset_of([branch], "frequency_hz", None))
+    (window,) = windows_of(dataset_of([branch], "frequency", None))
     folds = sorted(orbits.values(b.point.u)[0] for b in branch.bifurcations)
     assert [window["from"], window["to"]] == folds
     # another orbit of it is recognised
@@ -452,7 +452,7 @@ def right_family():
     """The right one-sided orbit of period 1 and what hangs on it, around the period halving near 2.5 Hz."""
     parameters = load_preset()
     state = [0.01421118, 0.19932267, -2.74881127, 3.65512389]
-    orbits = family(2.2, parameters.pack(), "frequency_hz", 1.0, system=PENDULUM_FITTED)
+    orbits = family(2.2, parameters.pack(), "frequency", 1.0, system=PENDULUM_FITTED)
     scope = Scope(2.15, 2.55, max_period=2, max_generations=1, settings=Settings(longest_step=0.02))
     return parameters, orbits, explore([Start(orbits, np.array(state), 2.2)], scope)
 
@@ -472,7 +472,7 @@ def test_explore__right_family(right_family):
 def test_explore__brute_force_agrees(right_family):
     """Inside the stable segments, sections of trajectories lie on the branch to 1e-6."""
     parameters, _, branches = right_family
-    ds = dataset_of(branches, "frequency_hz", parameters)
+    ds = dataset_of(branches, "frequency", parameters)
     chosen = [
         (i, j)
         for i, branch in enumerate(branches)

@@ -13,7 +13,7 @@ from pipeline.analysis.chaos.indicators import (
     zero_one_test,
 )
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.schema import LyapunovFlag
+from pipeline.products.lyapunov import LyapunovFlag
 
 LINE, PLANE = Geometry((False,), (1.0,)), Geometry((False, False), (1.0, 1.0))
 CIRCLE, TORUS = Geometry((True,), (1.0,)), Geometry((True, True), (1.0, 1.0))

@@ -7,7 +7,7 @@ from magpend_core import LyapunovExponents, Status, load_preset, lyapunov_expone
 from pipeline import open_run
 from pipeline.compute.exponents import flags
 from pipeline.layout.plan import make_plan
-from pipeline.layout.schema import LYAPUNOV_VARIABLES, LyapunovFlag
+from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag
 from pipeline.runs.run import run
 from pipeline.spec.parsing import load_spec
 from pipeline.spec.problems import SpecError
@@ -123,6 +123,7 @@ def made_up(**changes):
         "exponents": np.tile([0.5, 0.0, -0.2, -1.0], (2, 1)), "stderr": np.zeros((2, 4)),
         "weighted": np.zeros((2, 4)), "blocks": np.zeros((2, 4, 4)), "divergence": np.full(2, -0.7),
         "loss": np.full(2, 1e3), "status": np.full(2, Status.BOUNDED, np.int8),
+        "is_whole": True,
     }  # fmt: skip
     return LyapunovExponents(**{**values, **changes})
 
@@ -143,8 +144,13 @@ def test_flags__say_what_is_wrong(changes, expected):
 
 
 def test_flags__a_part_of_the_spectrum_is_not_held_against_the_divergence():
-    part = made_up(exponents=np.tile([0.5], (2, 1)))
+    part = made_up(exponents=np.tile([0.5], (2, 1)), is_whole=False)
     assert flags(part).tolist() == [LyapunovFlag.GOOD] * 2
+
+
+def test_flags__audit_a_whole_spectrum_of_any_length():
+    two = made_up(exponents=np.tile([0.1, -0.3], (2, 1)), divergence=np.array([-0.2, -0.3]))
+    assert flags(two).tolist() == [LyapunovFlag.GOOD, LyapunovFlag.AUDIT_FAILED]
 
 
 @pytest.mark.parametrize(

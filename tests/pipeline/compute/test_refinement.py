@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magpend_core import Status
+from magpend_core.models import load_model
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.sections import run_branches
 from pipeline import open_run
@@ -21,10 +22,12 @@ from pipeline.compute.task import compute
 from pipeline.layout.cells import CellMap
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.layout.schema import REFINEMENT, VARIABLES
+from pipeline.layout.schema import REFINEMENT, base_variables
 from pipeline.runs.run import run, state
 from pipeline.spec.parsing import parse_spec
 from pipeline.spec.problems import SpecError
+
+VARIABLES = base_variables(load_model())
 
 RUN = """
 kind = "sweep"

@@ -12,11 +12,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from magpend_core.models import load_model
 from pipeline.layout import plan as planning
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.schema import VARIABLES
+from pipeline.layout.schema import base_variables, sizes_of
 from pipeline.spec.parsing import parse_spec
+
+VARIABLES = base_variables(load_model())
+
+
+def sizes(n_keep):
+    return sizes_of(load_model(), {}, n_keep)
+
 
 ROOT = Path(__file__).parents[3]
 
@@ -27,7 +35,7 @@ SHAPES = st.lists(st.integers(1, 9), min_size=0, max_size=4)
 def test_tasks__every_cell_in_one_task(shape, wanted, data):
     path = data.draw(st.sampled_from([None, *range(len(shape))]))
     block = planning._block(tuple(shape), path, wanted)
-    plan = Plan("sweep", tuple("abcd"[: len(shape)]), tuple(shape), path, block, 3, 1.0)
+    plan = Plan("sweep", tuple("abcd"[: len(shape)]), tuple(shape), path, block, VARIABLES, sizes(3), 1.0)
     seen = np.zeros(shape, dtype=int)
     for task in plan.tasks():
         seen[task] += 1
@@ -41,7 +49,7 @@ def test_tasks__every_cell_in_one_task(shape, wanted, data):
 def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
     shape = (n_points, n_branches)
     block = planning._block(shape, 0, 16)
-    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, n_keep, 1.0)
+    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, VARIABLES, sizes(n_keep), 1.0)
     for variable in VARIABLES:
         chunks = plan.chunks(variable)
         for task in plan.tasks():

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from magpend_core import Status
+from magpend_core.models import load_model
 from pipeline import open_run
-from pipeline.layout.schema import VARIABLES
+from pipeline.layout.schema import base_variables
 from pipeline.store import directory as store
+
+VARIABLES = base_variables(load_model())
 
 
 def test_open_run__explains_itself(made):

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import zarr
 
+from magpend_core.models import load_model
 from pipeline import open_run
-from pipeline.layout.schema import VARIABLES
+from pipeline.layout.schema import base_variables
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store import directory as store
+
+VARIABLES = base_variables(load_model())
 
 CUBE_WRITES = len(VARIABLES)
 

@@ -1,0 +1,190 @@
+"""The models that ship, each against something that shares no code with it."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from magpend_core import (
+    ParameterError,
+    energy,
+    evaluate,
+    jacobian,
+    load_model,
+    model_names,
+    rates,
+    sections,
+    torques,
+)
+from magpend_core.models.pendulum.sides import Side, classify, slowest_hz
+
+FREQUENCY = 1.7
+CASES = [(name, preset) for name in model_names() for preset in load_model(name).preset_names]
+
+
+def states_of(model, n=12):
+    return np.random.default_rng(5).normal(size=(n, len(model.states))) * model.scales
+
+
+@pytest.mark.parametrize("name", model_names())
+def test_model__describes_itself_as_its_system_is(name):
+    model = load_model(name)
+    system = model.system
+    assert system.state_names == model.state_names
+    assert system.is_angle == model.is_angle
+    assert system.scales == model.scales
+    assert system.parameter_names == model.parameter_names
+    assert system.quantity_names == tuple(q.name for q in model.quantities)
+    assert all(s.unit and s.meaning for s in model.states)
+    assert all(q.unit and q.meaning for q in model.quantities)
+    assert len(model.digest) == 16
+
+
+def test_model__digests_tell_models_apart():
+    rooms = {load_model(name).digest for name in model_names()}
+    assert len(rooms) == 2  # the pendulum's kinds share their sources
+
+
+def test_load_model__reports_an_unknown_name():
+    with pytest.raises(ParameterError, match="model 'dufing' does not exist; did you mean duffing"):
+        load_model("dufing")
+
+
+@pytest.mark.parametrize(("name", "preset"), CASES)
+def test_jacobian__is_the_derivative_of_the_rates(name, preset):
+    parameters = load_model(name).load(preset)
+    model = parameters.model
+    y, h = states_of(model), 1e-6
+    found = jacobian(0.21, y, parameters, FREQUENCY)
+    for j in range(len(model.states)):
+        step = np.eye(len(model.states))[j] * h * model.scales[j]
+        ahead, behind = (rates(0.21, y + s, parameters, FREQUENCY) for s in (step, -step))
+        by_differences = (ahead - behind) / (2.0 * step[j])
+        np.testing.assert_allclose(found[..., j], by_differences, rtol=2e-4, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", [n for n in model_names() if load_model(n).mirror])
+def test_mirror__maps_rates_on_rates(name):
+    model = load_model(name)
+    even = {"duty_cycle": 0.5} if "duty_cycle" in model.parameter_names else {}
+    parameters, y = model.load(**even), states_of(model)
+    # the calibrated magnets are mirror images of each other: r1 = -r2, alpha1 = -alpha2
+    signs = np.array(model.mirror.signs)
+    here = rates(0.1 / FREQUENCY, y, parameters, FREQUENCY)
+    there = rates(0.6 / FREQUENCY, signs * y, parameters, FREQUENCY)
+    np.testing.assert_allclose(there, signs * here, rtol=1e-9, atol=1e-9)
+
+
+def test_duffing__section_agrees_with_another_integrator():
+    parameters = load_model("duffing").load("hardening", damping=0.17, linear=-0.3, cubic=0.8)
+    p, y0 = parameters.as_dict(), [0.4, -0.2]
+
+    def rhs(t, y):
+        force = p["amplitude"] * math.cos(2 * math.pi * FREQUENCY * t)
+        return [y[1], force - p["damping"] * y[1] - p["linear"] * y[0] - p["cubic"] * y[0] ** 3]
+
+    end = solve_ivp(rhs, (0.0, 3 / FREQUENCY), y0, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    found = sections(parameters, FREQUENCY, [y0], n_transient=2, n_keep=1, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(found.section[0, 0], end, rtol=0, atol=2e-10)
+    assert found.turns.shape == (1, 0)
+
+
+def test_duffing__two_wells_have_the_published_orbits():
+    # DynamicalSystemsBase.jl, issue 139
+    parameters = load_model("duffing").load("twin-well-periodic")
+    found = sections(parameters, 1 / (2 * math.pi), [[0.2, 0.2], [1.0, 0.0]], n_transient=600, n_keep=1)
+    points = found.section[np.argsort(found.section[:, 0, 0]), 0]
+    left, right = [-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]
+    expected = [right] if points[0, 0] > 0 else [left]
+    np.testing.assert_allclose(points[:1], expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("drive", ["", "-sine"])
+def test_pendulum_free__is_the_pendulum_with_magnets_switched_off(drive):
+    free = load_model(f"pendulum-free{drive}").load()
+    off = load_model(f"pendulum{drive}").load(alpha1=0.0, alpha2=0.0)
+    y = states_of(free.model)
+    np.testing.assert_array_equal(rates(0.1, y, free, FREQUENCY), rates(0.1, y, off, FREQUENCY))
+    assert (torques(0.1, y, free, FREQUENCY).magnet_torque == 0.0).all()
+
+
+def test_pendulum_sine__has_a_sinusoidal_torque():
+    parameters = load_model("pendulum-sine").load(q=1.2)
+    t = np.linspace(0.0, 1.0, 50)
+    drive = torques(t, np.zeros((50, 4)), parameters, FREQUENCY).drive
+    np.testing.assert_allclose(drive, 1.2 * np.sin(2 * np.pi * FREQUENCY * t), atol=1e-12)
+
+
+def test_evaluate__energy_changes_by_the_powers(preset):
+    model, h = preset.model, 1e-6
+    y = states_of(model)
+    rate = rates(0.1, y, preset, FREQUENCY)
+    slope = (energy(y + h * rate, preset) - energy(y - h * rate, preset)) / (2 * h)
+    names = ["energy", "power_in", "power_dissipated", "magnet_torque1", "magnet_torque2"]
+    e, power_in, lost, q1, q2 = evaluate(names, 0.1, y, preset, FREQUENCY).T
+    np.testing.assert_allclose(e, energy(y, preset), rtol=1e-13)
+    magnets = q1 * y[:, 2] + q2 * y[:, 3]
+    np.testing.assert_allclose(slope, power_in - lost + magnets, rtol=1e-6, atol=1e-6)
+
+
+def test_evaluate__duffing_energy_changes_by_the_powers():
+    parameters = load_model("duffing").load("twin-well")
+    h, y = 1e-5, states_of(parameters.model)
+    rate = rates(0.1, y, parameters, FREQUENCY)
+    ahead, behind = (
+        evaluate(["energy"], 0.1, y + s * h * rate, parameters, FREQUENCY)[:, 0] for s in (1, -1)
+    )
+    power_in, lost = evaluate(["power_in", "power_dissipated"], 0.1, y, parameters, FREQUENCY).T
+    np.testing.assert_allclose((ahead - behind) / (2 * h), power_in - lost, rtol=1e-7, atol=1e-7)
+
+
+def test_evaluate__names_the_nearest_quantity(preset):
+    with pytest.raises(ParameterError, match="'energie' is not a quantity of pendulum; did you mean energy"):
+        evaluate(["energie"], 0.0, np.zeros(4), preset, 2.2)
+
+
+def test_drawing__magnet_is_where_the_quantities_say(preset):
+    model = preset.model
+    y = states_of(model)
+    points = model.drawing.points(y, preset)
+    expected = evaluate(["magnet_x", "magnet_y"], 0.0, y, preset, FREQUENCY)
+    np.testing.assert_allclose(points[model.drawing.trace], expected, atol=1e-13)
+    np.testing.assert_allclose(model.drawing.fixed(preset)["fixed magnet"], [0.0, -0.3742])
+
+
+def test_slowest_hz__is_a_root_of_the_characteristic_polynomial(preset):
+    assert slowest_hz(preset) == pytest.approx(0.926, abs=5e-4)
+    p = preset.replace(l1=0.31, m2=2.0)
+    b = np.array(
+        [
+            [p["J1"] + p["e1"] ** 2 * p["m1"] + p["l1"] ** 2 * p["m2"], p["m2"] * p["e2"] * p["l1"]],
+            [p["m2"] * p["e2"] * p["l1"], p["J2"] + p["e2"] ** 2 * p["m2"]],
+        ]
+    )
+    k = p["g"] * np.diag([p["m1"] * p["e1"] + p["m2"] * p["l1"], p["m2"] * p["e2"]])
+    root = brentq(lambda f: np.linalg.det(k - (2 * np.pi * f) ** 2 * b), 0.1, 1.05 * float(slowest_hz(p)))
+    assert slowest_hz(p) == pytest.approx(root, rel=1e-9)
+
+
+def test_classify__follows_the_arms_of_the_run(preset):
+    # psi1 right, psi2 left: which side the magnet is on depends on the lengths
+    section = np.array([[[0.3, -0.25, 0.0, 0.0]] * 3])
+    turns, frequency = np.zeros((1, 2)), np.array([2.2])
+    assert classify(section, turns, frequency, preset).tolist() == [Side.RIGHT]
+    long = preset.replace(l2=0.3, h=0.6)
+    assert classify(section, turns, frequency, long).tolist() == [Side.LEFT]
+    # swept lengths: one value per cell
+    both = {**preset.as_dict(), "l2": np.array([0.1788, 0.3])}
+    two = classify(np.repeat(section, 2, axis=0), np.zeros((2, 2)), np.full(2, 2.2), both)
+    assert two.tolist() == [Side.RIGHT, Side.LEFT]
+
+
+def test_classify__words_for_every_case(preset):
+    right, left = [0.3, 0.2, 0, 0], [-0.3, -0.2, 0, 0]
+    section = np.array([[right, right], [left, left], [right, left], [right, right], [right, right]], float)
+    turns = np.array([[0, 0], [0, 0], [0, 0], [1, 0], [0, 0]])
+    frequency = np.array([2.0, 2.0, 2.0, 2.0, 0.5])
+    found = [preset.model.classifier.words[c] for c in classify(section, turns, frequency, preset)]
+    assert found == ["right", "left", "straddling", "rotating", "undecided"]

@@ -1,0 +1,132 @@
+"""The package as people import it: names without the compiler; and the version of the kernel."""
+
+import pytest
+
+import magpend_core
+from magpend_core.meaning import kernel_version, meaning_digest
+
+
+def test_import__leaves_the_compiler_out(run_python):
+    script = (
+        "import sys, magpend_core\n"
+        "from magpend_core import ParameterError, Parameters, Status, kernel_version\n"
+        "from magpend_core import load_model, load_preset\n"
+        "from magpend_core.status import Status as same\n"
+        "assert Status is same and Status.PERIODIC == 1\n"
+        "kernel_version(), load_preset(q=1.5).pack(), load_model('duffing').digest, dir(magpend_core)\n"
+        "print([m for m in ('numba', 'llvmlite', 'scipy') if m in sys.modules])\n"
+    )
+    assert run_python(script).strip() == "[]"
+
+
+def test_package__has_all_its_names_and_no_other():
+    assert set(magpend_core.__all__) <= set(dir(magpend_core))
+    for name in magpend_core.__all__:
+        assert getattr(magpend_core, name).__name__ == name
+    assert set(magpend_core._HOME_OF) == set(magpend_core.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'section'"):
+        _ = magpend_core.section
+
+
+@pytest.mark.parametrize("first", ["sections", "trajectory"])
+def test_package__functions_are_not_hidden_by_modules_of_their_name(run_python, first):
+    script = (
+        f"import magpend_core.{first}\n"
+        "from magpend_core import sections, trajectory\n"
+        "print(callable(sections), callable(trajectory), callable(magpend_core.sections))"
+    )
+    assert run_python(script).split() == ["True"] * 3
+
+
+SOURCE = '''"""Module."""
+
+import math  # why
+
+RATE = 0.5
+"""Half."""
+
+
+def grow(x: float) -> float:
+    """Grow."""
+    if x < 0.0:
+        raise ValueError(f"x = {x} is negative")
+    return math.exp(RATE * x)
+'''
+
+
+@pytest.fixture
+def digest(tmp_path):
+    def of(source, name="one.py"):
+        (tmp_path / name).write_text(source, "utf-8")
+        return meaning_digest([tmp_path / name])
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"""Module."""', '"""A module\nof two lines."""'),
+        ('    """Grow."""\n', ""),
+        ('"""Half."""', '"""One half."""'),
+        ("  # why", ""),
+        ("RATE * x", "(RATE\n  * x)"),
+        ("is negative", "is less than 0"),
+        ("= 0.5", "= .50"),
+    ],
+)
+def test_meaning_digest__passes_over_what_is_said(digest, old, new):
+    assert SOURCE.count(old) == 1
+    assert digest(SOURCE.replace(old, new)) == digest(SOURCE)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("= 0.5", "= 0.25"),
+        ("x < 0.0", "x <= 0.0"),
+        ("RATE * x", "x * RATE"),
+        ("math.exp", "math.expm1"),
+        ("ValueError", "ArithmeticError"),
+        ("    return", "    if x: return"),
+        ("x: float", "x: float = 1.0"),
+    ],
+)
+def test_meaning_digest__sees_what_is_done(digest, old, new):
+    assert SOURCE.count(old) == 1
+    assert digest(SOURCE.replace(old, new)) != digest(SOURCE)
+
+
+def test_meaning_digest__sees_names_and_places_of_files(digest, tmp_path):
+    assert digest(SOURCE, "two.py") != digest(SOURCE, "one.py")
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    (tmp_path / "deep" / "one.py").write_text(SOURCE, "utf-8")
+    above = meaning_digest([tmp_path / "deep"])
+    (tmp_path / "deep" / "one.py").rename(tmp_path / "deep" / "er" / "one.py")
+    assert meaning_digest([tmp_path / "deep"]) != above
+
+
+def version_after(run_python, copied, name, old, new):
+    path = copied / "magpend_core" / name
+    text = path.read_text("utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), "utf-8")
+    return run_python(
+        "from magpend_core import kernel_version; print(kernel_version())", package=copied
+    ).strip()
+
+
+def test_kernel_version__follows_the_engines_meaning(run_python, copied):
+    edited = version_after(run_python, copied, "engine/lanes.py", "# accepted in this cell", "# so far")
+    assert edited == kernel_version()
+    edited = version_after(run_python, copied, "status.py", '"""Outcome of one cell', '"""What one cell gave')
+    assert edited == kernel_version()
+    edited = version_after(run_python, copied, "engine/lanes.py", "SAFETY = 0.85", "SAFETY = 0.84")
+    assert edited != kernel_version()
+
+
+def test_kernel_version__leaves_models_to_their_own_digests(run_python, copied):
+    name = "models/parameters.py"
+    assert (
+        version_after(run_python, copied, name, 'FRACTION = "between', 'FRACTION = "in') == kernel_version()
+    )
