@@ -11,6 +11,7 @@ from magpend_core import load_preset, run_branches
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import sincos
+from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance
 from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
@@ -27,7 +28,6 @@ from pipeline.analysis.branches.problems import (
     fold_test,
     torus_test,
 )
-from pipeline.analysis.sides import Side
 
 
 @inline
