@@ -12,7 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.vocabulary import CLOSED_ORBIT, INFERRED, model_of
+from pipeline.layout.vocabulary import CLOSED_ORBIT, INFERRED, grid_dim, model_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import BasinFigureOptions
@@ -101,7 +101,8 @@ def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
 
 def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, str]:
     """Names of the two axes of the image: horizontal, vertical."""
-    grid = [d for d in start_dims(attractors) if d.endswith("_0")]
+    dims = start_dims(attractors)
+    grid = [grid_dim(name) for name in model_of(attractors).state_names if grid_dim(name) in dims]
     if len(grid) < 2:
         have = ", ".join(start_dims(attractors)) or "none"
         raise ValueError(

@@ -201,7 +201,7 @@ class Diagram:
         }
         dims = ("layer", self.parameter)
         drawn = drawn.assign({name: (dims, values) for name, values in counts.items() if values.any()})
-        drawn = drawn.assign_coords({self.parameter: axis.variable}, **_fixed(self.view.ds))
+        drawn = drawn.assign_coords({self.parameter: axis.variable, **_fixed(self.view.ds)})
         return drawn.assign_attrs(title="bifurcation diagram", parameter=self.parameter)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,14 +12,13 @@ import matplotlib
 import xarray as xr
 from matplotlib.figure import Figure
 
-from pipeline.plots.style import DPI, DataFigure
+from pipeline.plots.style import DPI, TEXT_LOCK, DataFigure
 
 SUFFIXES = (".png", ".pdf", ".svg")
 VECTOR_DPI = 400
 """Resolution of the images inside PDF and SVG files, which get magnified."""
 
 _SETTINGS: dict[str, Any] = {"svg.hashsalt": "magpend", "svg.fonttype": "none", "pdf.fonttype": 42}
-_settings_lock = threading.Lock()
 
 
 def save_figure(fig: Figure, path: str | Path) -> Path:
@@ -61,10 +59,11 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
         "metadata": _metadata(fig.data.attrs if isinstance(fig, DataFigure) else {}, suffix),
         "facecolor": "white",
     }
-    if suffix == ".png":
-        fig.savefig(buffer, **options)
-    else:
-        _save_vectors(fig, buffer, options)
+    with TEXT_LOCK:
+        if suffix == ".png":
+            fig.savefig(buffer, **options)
+        else:
+            _save_vectors(fig, buffer, options)
     path.write_bytes(buffer.getvalue())
     return path
 
@@ -105,11 +104,10 @@ def _save_vectors(fig: Figure, buffer: io.BytesIO, options: dict[str, Any]) -> N
     matplotlib takes these from the shared settings alone; these few keys are set while the lock is held,
     and all others are left as they are.
     """
-    with _settings_lock:
-        settings: Any = matplotlib.rcParams
-        before = {key: settings[key] for key in _SETTINGS}
-        settings.update(_SETTINGS)
-        try:
-            fig.savefig(buffer, **options)
-        finally:
-            settings.update(before)
+    settings: Any = matplotlib.rcParams
+    before = {key: settings[key] for key in _SETTINGS}
+    settings.update(_SETTINGS)
+    try:
+        fig.savefig(buffer, **options)
+    finally:
+        settings.update(before)

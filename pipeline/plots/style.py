@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -20,6 +21,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import AutoMinorLocator, MaxNLocator
+
+TEXT_LOCK = threading.Lock()
+"""Held while texts are measured or drawn: matplotlib parses mathematics with one parser for all threads."""
 
 MM = 1.0 / 25.4
 """Inches per millimetre."""
@@ -155,7 +159,8 @@ def finish(figure: DataFigure) -> None:
         text.set_math_fontfamily(MATH_FONT)
     engine = figure.get_layout_engine()
     if engine is not None:
-        engine.execute(figure)
+        with TEXT_LOCK:
+            engine.execute(figure)
         figure.set_layout_engine("none")
 
 
