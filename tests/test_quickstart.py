@@ -14,7 +14,7 @@ import pytest
 import pipeline
 from magpend_core import Status
 from pipeline.analysis.sides import Side, side
-from pipeline.runs.run import shipped_workflows
+from pipeline.runs.workflows import shipped_workflows
 
 # see tests/core/data/README.md for where these points come from
 ORBITS = json.loads((Path(__file__).parent / "core" / "data" / "orbits.json").read_text("utf-8"))

@@ -12,7 +12,7 @@ from typer.main import get_command
 from magpend_core.models import load_model
 from pipeline.cli.main import app
 from pipeline.layout.schema import base_variables
-from pipeline.runs.run import shipped_workflows
+from pipeline.runs.workflows import shipped_workflows
 from pipeline.spec.parsing import parse_spec
 
 VARIABLES = base_variables(load_model())

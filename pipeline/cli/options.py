@@ -22,6 +22,7 @@ VERBOSE = Annotated[bool, typer.Option("--verbose", "-v", help="Say more, and sh
 LOGFILE = Annotated[
     Path | None, typer.Option("--log", metavar="FILE", help="Write a log, with times, to this file, too.")
 ]
+_METAVARS = {int: "N", float: "X", str: "TEXT"}
 _VOICES = {"quiet": (QUIET, False), "verbose": (VERBOSE, False), "log": (LOGFILE, None)}
 
 
@@ -119,6 +120,8 @@ def _parameter(model: type[Options], name: str) -> inspect.Parameter:
         kind = list[str]
     elif get_origin(kind) is tuple:
         declared |= {"metavar": "LOW HIGH"}
+    elif kind in _METAVARS:
+        declared |= {"metavar": _METAVARS[kind]}
     return _keyword(
         name,
         Annotated[kind if info.is_required() else kind | None, typer.Option(flag, **declared)],

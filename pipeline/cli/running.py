@@ -42,20 +42,21 @@ def run(
     Stop it whenever you like: the same command goes on where it was, and the finished files are the same.
     """
     from pipeline.cli import console
+    from pipeline.runs import preview
     from pipeline.runs import run as runs
 
     if dry_run:
-        for line in runs.describe_plan(spec, out, workers=workers, smoke=smoke):
+        for line in preview.describe_plan(spec, out, workers=workers, smoke=smoke):
             console.result(line)
         return
     if plot:
-        runs.check_diagram(spec, smoke=smoke)
+        preview.check_diagram(spec, smoke=smoke)
     state = runs.run(spec, out, workers=workers, scheduler=scheduler, smoke=smoke, echo=console.note)
     console.result(f"cube: {state.directory / 'cube.zarr'}")
     if plot:
         _diagram(state.directory)
     else:
-        figure = runs.first_figure(state.plan)
+        figure = preview.first_figure(state.plan)
         console.result(f"plot it with: magpend plot {figure} {state.directory}")
 
 
@@ -64,15 +65,15 @@ def _diagram(directory: Path) -> None:
     from pipeline.products.registry import FIGURES
 
     options = FIGURES["bifurcation"].options
-    draw(directory, "bifurcation", options())  # type: ignore[call-arg]
+    draw(directory, "bifurcation", options())
 
 
 def status(directory: Directory) -> None:
     """Say how much of a run is committed and what became of its cells."""
     from pipeline.cli import console
-    from pipeline.runs import run as runs
+    from pipeline.runs.status import describe_state, state
 
-    for line in runs.describe_state(runs.state(directory)):
+    for line in describe_state(state(directory)):
         console.result(line)
 
 

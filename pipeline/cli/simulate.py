@@ -75,7 +75,8 @@ def read_named(words: list[str], n: int) -> dict[str, Any]:
     found: dict[str, Any] = {}
     problems, left = [], list(words)
     while left:
-        word, own = left.pop(0), []
+        word = left.pop(0)
+        own: list[str] = []
         name, is_joined, value = word.partition("=")
         if is_joined:
             left.insert(0, value)

@@ -24,7 +24,9 @@ from pipeline.layout.schema import base_variables
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec, parse_spec
-from pipeline.store.directory import RefusedError, RunInfo, read_run, write_task
+from pipeline.store.commits import write_task
+from pipeline.store.errors import RefusedError
+from pipeline.store.runfile import RunInfo, read_run
 
 
 @dataclass(frozen=True)

@@ -4,29 +4,69 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from magpend_core.meaning import meaning_digest
+from pipeline.layout.cells import coordinates
 from pipeline.layout.plan import Plan
 from pipeline.layout.schema import FORMAT, REFINEMENT
+from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec
+
+_PIPELINE = Path(__file__).parents[1]
+CODE = ("layout.cells", "compute.task")
+"""Modules of the pipeline that decide the numbers of every task; those of refined grids and of products are
+added where they are used. The numerical core and the model have versions of their own."""
 
 
 def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
-    """Return all that decides the store's bytes: specification, parameter values, layout, kernel.
+    """Return all that decides the store's bytes: specification, parameter values, layout, kernel, code.
 
-    The title and ``[execution]`` are left out; the layout that the latter leads to is in.
+    The title and ``[execution]`` are left out; the layout that the latter leads to is in. So are the
+    coordinates as numbers: what a range or a seed stands for.
     """
     tables = {k: v for k, v in spec.as_dict().items() if k not in ("title", "execution")}
     return {
         **({} if spec.refine is None else {"refinement": REFINEMENT}),
         "format": FORMAT,
         "kernel_version": kernel_version,
+        "code": {name: code_version(name) for name in code_of(spec)},
         "spec": tables,
         "model_digest": spec.model.digest,
         "parameter_values": spec.values.as_dict(),
+        "coordinates": _coordinates_digest(spec),
         "chunks": {v.name: list(plan.chunks(v)) for v in plan.variables},
     }
+
+
+def _coordinates_digest(spec: Spec) -> str:
+    """Digest of the coordinates' names, dims, types and bytes."""
+    digest = hashlib.sha256()
+    for coordinate in coordinates(spec):
+        values = np.asarray(coordinate.values)
+        values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+        digest.update(repr((coordinate.name, coordinate.dims, values.dtype.str, values.shape)).encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def code_of(spec: Spec) -> list[str]:
+    """Modules of the pipeline that decide the numbers of a run's tasks."""
+    products = [CELL_PRODUCTS[name].compute.partition(":")[0] for name in spec.products]
+    refined = ["compute.refinement"] if spec.refine is not None else []
+    return [*CODE, *refined, *(module.removeprefix("pipeline.") for module in products)]
+
+
+@lru_cache
+def code_version(module: str) -> str:
+    """Digest of the meaning of a module of the pipeline; see `magpend_core.meaning`."""
+    return meaning_digest([_PIPELINE / f"{module.replace('.', '/')}.py"])
 
 
 def canonical(data: Any) -> str:
@@ -40,12 +80,14 @@ def digest_of(identity: Mapping[str, Any]) -> str:
 
 
 def _numbers(data: Any) -> Any:
-    """Make ``2`` and ``2.0`` the same."""
+    """Make ``2`` and ``2.0`` the same, and no two numbers that differ."""
     if isinstance(data, Mapping):
         return {k: _numbers(v) for k, v in data.items()}
     if isinstance(data, (list, tuple)):
         return [_numbers(v) for v in data]
-    return float(data) if isinstance(data, int) and not isinstance(data, bool) else data
+    # -0.0 has its own bits, and so have the cells that start there
+    is_minus_zero = data == 0 and isinstance(data, float) and math.copysign(1.0, data) < 0
+    return int(data) if isinstance(data, float) and data.is_integer() and not is_minus_zero else data
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:

@@ -127,9 +127,11 @@ class Plan:
         sizes = self.sizes
         chunk = list(self.block)
         if self.path is not None:
-            per_point = math.prod(chunk) // chunk[self.path] * variable.itemsize(sizes)
-            n_chunks = math.ceil(chunk[self.path] * per_point / CHUNK_BYTES)
-            chunk[self.path] = math.ceil(chunk[self.path] / n_chunks)
+            n_points = chunk[self.path]
+            per_point = math.prod(chunk) // n_points * variable.itemsize(sizes)
+            most = max(1, CHUNK_BYTES // per_point)
+            # as few chunks as can be, about equal: a chunk that is rounded up stays within the most
+            chunk[self.path] = -(-n_points // -(-n_points // most))
         return (*chunk, *(sizes[d] for d in variable.own_dims))
 
 
@@ -161,15 +163,27 @@ def make_plan(spec: Spec) -> Plan:
     )  # fmt: skip
 
 
+def seconds_per_period(frequency_hz: np.ndarray, rtol: float) -> np.ndarray:
+    """Time of a drive period of one trajectory on one core by the rule of thumb [s]."""
+    microseconds = MICROSECONDS_PER_PERIOD + MICROSECONDS_PER_SECOND / np.asarray(frequency_hz)
+    return np.asarray(microseconds * 1e-6 * (RTOL_OF_RULE / rtol) ** (1 / ROOT))
+
+
+def mean_seconds_per_period(spec: Spec) -> float:
+    """`seconds_per_period`, in the mean over the run's frequencies [s]."""
+    frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else spec.parameters.frequency_hz
+    return float(np.mean(seconds_per_period(np.asarray(frequency), spec.integration.rtol)))
+
+
+def periods_per_cell(spec: Spec) -> tuple[float, float]:
+    """Most drive periods of a cell's sections, and those of its products in units of their time."""
+    products = sum(CELL_PRODUCTS[name].cost(options) for name, options in spec.products.items())
+    return float(spec.integration.n_transient + spec.integration.n_keep), float(products)
+
+
 def _seconds_per_cell(spec: Spec) -> float:
     """Mean time of a cell [s]."""
-    integration = spec.integration
-    frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else spec.parameters.frequency_hz
-    mean_period = float(np.mean(1.0 / np.asarray(frequency)))
-    microseconds = MICROSECONDS_PER_PERIOD + MICROSECONDS_PER_SECOND * mean_period
-    periods = float(integration.n_transient + integration.n_keep)
-    periods += sum(CELL_PRODUCTS[name].cost(options) for name, options in spec.products.items())
-    return periods * microseconds * 1e-6 * float((RTOL_OF_RULE / integration.rtol) ** (1 / ROOT))
+    return sum(periods_per_cell(spec)) * mean_seconds_per_period(spec)
 
 
 def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:

@@ -15,7 +15,7 @@ from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable, flag_attrs
 
-FORMAT = 1
+FORMAT = 2
 """Version of the run directory's layout."""
 
 REFINEMENT = 1

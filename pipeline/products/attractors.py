@@ -37,6 +37,10 @@ class AttractorOptions(IdentifyOptions):
 
     threshold: float = option(0.3, "Matching: largest distance between appearances of one id.", gt=0.0)
     look_back: int = option(3, "Matching: steps over which an id is remembered.", ge=1)
+    connect: bool = option(
+        True,
+        "Matching: follow closed orbits along the axes, which integrates; without it, ids rest on distance.",
+    )
 
 
 class SettlingOptions(AttractorOptions):

@@ -201,7 +201,9 @@ class FigureOptions(Options):
     def label(self) -> str:
         """What the file's name says beside the figure's: options that are not as by default."""
         given = {name: value for name, value in self.changed().items() if name not in ("out", "format")}
-        return "".join(f"_{_words(name, value)}" for name, value in given.items())
+        first = [name for name in _SPEAKS_FOR_ITSELF if name in given]
+        order = [*first, *(name for name in given if name not in first)]
+        return "".join(f"_{_words(name, given[name])}" for name in order)
 
 
 class StateOptions(FigureOptions):

@@ -37,7 +37,8 @@ class Variable:
 
     def attributes(self) -> dict[str, Any]:
         """All attributes as written to the store."""
-        return {"units": self.units, "long_name": self.long_name, **self.attrs}
+        units = {"units": self.units} if self.units else {}
+        return {**units, "long_name": self.long_name, **self.attrs}
 
     def itemsize(self, sizes: Mapping[str, int]) -> int:
         """Bytes per cell, uncompressed."""

@@ -6,9 +6,10 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from pipeline.layout.vocabulary import FREQUENCY, axis_name, grid_dim, is_grid_dim, model_of, parameter_name
+from pipeline.layout.vocabulary import axis_name, grid_dim, is_grid_dim, model_of, parameter_name
 from pipeline.products.product import Options
 from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.spec.tables import FREQUENCY
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -2,52 +2,70 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline.layout.plan import make_plan
 from pipeline.spec.parsing import parse_spec
-from pipeline.store import directory as store
+from pipeline.store.commits import Verification, verify, withdraw
+from pipeline.store.files import writer_lock
+from pipeline.store.runfile import read_run
+from pipeline.store.setup import rebuild_skeleton
 
 
-def verify_run(directory: str | Path, *, repair: bool = False) -> store.Verification:
-    """Compare every committed file with its marker.
+def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
+    """Compare every committed file with its commit record, and the set-up's with ``run.json``.
 
     Parameters
     ----------
     directory
         Run directory.
     repair
-        Withdraw the markers of damaged tasks: they are pending from then on.
+        Rebuild damaged metadata and coordinates, and withdraw the records of damaged tasks: these are
+        pending from then on.
 
     Raises
     ------
-    store.RefusedError
+    RefusedError
         If there is no run in `directory`.
-    store.LockedError
+    DamagedError
+        If ``run.json`` is not what was written.
+    UnreadableError
+        If a file is there and cannot be read; nothing is changed.
+    LockedError
         With `repair`, if a run is writing there.
     """
-    info = store.read_run(Path(directory))
-    plan = make_plan(parse_spec(info.spec))
+    info = read_run(directory)
+    spec = parse_spec(info.spec)
+    plan = make_plan(spec)
     if not repair:
-        return store.verify(info, plan)
-    with store.writer_lock(info.directory):
-        found = store.verify(info, plan)
-        store.withdraw(info, found.damaged)
-    return found
+        return verify(info, plan)
+    with writer_lock(info.directory):
+        found = verify(info, plan)
+        rest = rebuild_skeleton(info, spec, plan)
+        withdraw(info, found.damaged)
+    rebuilt = [problem for problem in found.skeleton if problem not in rest]
+    return replace(found, skeleton=rest, rebuilt=rebuilt)
 
 
-def describe(found: store.Verification, directory: str | Path, *, repaired: bool) -> list[str]:
+def describe(found: Verification, directory: str | Path, *, repaired: bool) -> list[str]:
     """Return the lines to print."""
     lines = [f"{directory}: {found.n_committed} of {found.n_tasks} tasks committed and intact"]
-    lines += [f"  damaged: {text}" for text in found.damaged.values()]
-    lines += [f"  damaged: {text}" for text in found.skeleton]
+    lines += [f"  damaged: {text}" for text in (*found.damaged.values(), *found.skeleton)]
+    lines += [f"  rebuilt: {text}" for text in found.rebuilt]
     if found.leftovers:
         lines.append(f"  {len(found.leftovers)} uncommitted files, read by nobody; the next run removes them")
-    if found.skeleton:
-        lines.append("Metadata or coordinates are damaged: remove the directory and run again.")
-    elif found.damaged and repaired:
+    if found.skeleton and repaired:
         lines.append(
-            f"{len(found.damaged)} markers withdrawn: run the specification again to compute these tasks."
+            "Metadata or coordinates come out otherwise here than they were written: another version of "
+            "magpend or zarr made them (run.json names it). Repair with that one, or run "
+            "the specification again."
+        )
+    elif found.skeleton:
+        lines.append("Metadata and coordinates follow from the specification: rebuild them with --repair.")
+    if found.damaged and repaired:
+        lines.append(
+            f"{len(found.damaged)} records withdrawn: run the specification again to compute these tasks."
         )
     elif found.damaged:
         lines.append("Withdraw them with --repair, then run the specification again to compute these tasks.")

@@ -71,11 +71,12 @@ def read_source(path: str | Path) -> Source:
     SpecError, store.RefusedError
         If there is none, or it is not valid.
     """
-    from pipeline.runs.run import find_spec
-    from pipeline.store import directory as store
+    from pipeline.runs.workflows import find_spec
+    from pipeline.store.files import local_path
+    from pipeline.store.runfile import read_run
 
-    if Path(path).is_dir():
-        info = store.read_run(Path(path))
+    if local_path(path).is_dir():
+        info = read_run(path)
         return Source(parse_spec(info.spec), f"run {info.directory.resolve().name}, digest {info.digest}")
     found = find_spec(path)
     return Source(load_spec(found), f"specification {found.name}")

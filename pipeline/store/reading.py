@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
-from pipeline.layout.plan import Plan, make_plan
-from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.spec.parsing import Spec, parse_spec
-from pipeline.store import directory as store
+from pipeline.store.run import Run
+from pipeline.store.view import committed_view
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
+def open_run(path: str | Path | Run, *, chunks: Any = None) -> xr.Dataset:
     """Open a run directory; nothing but coordinates is read until it is used.
 
     Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. What is committed
@@ -35,75 +33,66 @@ def open_run(path: str | Path, *, chunks: Any = None) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        With the specification's TOML text, the settings of the integration by name, those of the
-        exponents as ``lyapunov_<name>``, and the versions that made it in the attributes.
+        With the model's name, the specification's TOML text, the settings of the integration by name,
+        those of products as ``<product>_<name>`` (such as ``lyapunov_n_periods``), and what made it
+        (``source``, ``created``, ``host``, ``git_commit``) in the attributes. It can be written as NetCDF.
 
     Raises
     ------
-    store.RefusedError
+    RefusedError
         If there is no run in `path`.
+    DamagedError
+        If ``run.json``, metadata or coordinates are not what was written.
 
     Examples
     --------
     >>> ds = open_run("runs/quickstart")                                    # doctest: +SKIP
     >>> ds.section.sel(state="psi1").sel(frequency=2.2, method="nearest")   # doctest: +SKIP
     """
-    info = store.read_run(Path(path))
-    return open_committed(info, make_plan(parse_spec(info.spec)), chunks=chunks)
+    return Run.open(path).cube(chunks)
 
 
-def open_committed(
-    info: store.RunInfo,
-    plan: Plan,
-    commits: Mapping[int, store.Commit] | None = None,
-    *,
-    chunks: Any = None,
-) -> xr.Dataset:
-    """As `open_run`, showing what `commits` vouch for; by default all that is committed now."""
+def cube_of(run: Run, *, chunks: Any = None) -> xr.Dataset:
+    """The cube of an opened run, showing what its commits vouch for."""
     import xarray as xr
 
-    view: Any = store.committed_view(info, plan, commits)
+    view: Any = committed_view(run.info, run.commits)
     ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
-    names = [v.name for v in plan.variables]
-    ds = ds.set_coords([name for name in ds.data_vars if name not in names])
-    spec = parse_spec(info.spec)
-    ds = ds[names].assign_coords(_labels(spec))
+    ds = ds[[v.name for v in run.plan.variables]]
+    words = {str(name): _texts(ds[name]) for name in ds.coords if ds[name].dtype.kind not in "biuf"}
+    ds = ds.assign_coords(words)
     if "direction" in ds.coords:
-        ds = ds.assign_coords(direction=_words(ds.coords["direction"]))
-    version = info.versions.get("magpend", "(not installed)")
+        ds = ds.assign_coords(direction=_directions(ds.coords["direction"]))
+    return netcdf_safe(ds.assign_attrs(_attributes(run)))
+
+
+def _attributes(run: Run) -> dict[str, Any]:
+    """What an opened cube says of itself."""
+    info = run.info
     attrs: dict[str, Any] = {
         "title": info.title,
-        "source": f"magpend {version}, kernel {info.identity['kernel_version']}",
-        "kind": plan.kind,
-        "model": spec.model_name,
+        "source": f"magpend {info.versions.get('magpend', '(not installed)')}, "
+        f"kernel {info.identity['kernel_version']}",
+        **info.provenance,
+        "kind": run.plan.kind,
+        "model": run.spec.model_name,
         "spec": info.spec_text,
         "digest": info.digest,
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
-        # numbers only: netCDF knows no truth values
-        **{name: int(v) if isinstance(v, bool) else v for name, v in spec.integration.model_dump().items()},
-        **{f"{name}_{k}": v for name, o in spec.products.items() for k, v in o.plain().items()},
+        **run.spec.integration.model_dump(),
+        **{f"{name}_{k}": v for name, o in run.spec.products.items() for k, v in o.plain().items()},
     }
-    if plan.path is not None:
-        attrs["path"] = plan.dims[plan.path]
-    return ds.assign_attrs(attrs)
+    if run.plan.path is not None:
+        attrs["path"] = run.plan.dims[run.plan.path]
+    return attrs
 
 
-def _labels(spec: Spec) -> dict[str, Any]:
-    """Return the names along the dims that are not cell dims."""
-    model = spec.model
-    labels: dict[str, Any] = {
-        "state": ("state", list(model.state_names), {"long_name": "component of the state"}),
-        "state_units": ("state", list(model.state_units), {"long_name": "unit of the component"}),
-    }
-    if model.angles:
-        labels[model.angle_dim] = (model.angle_dim, list(model.angles), {"long_name": "by its angle"})
-    for name, options in spec.products.items():
-        for dim, values in CELL_PRODUCTS[name].coordinates(options, model).items():
-            labels[dim] = (dim, list(values))
-    return labels
+def _texts(labels: xr.DataArray) -> Any:
+    """Words in a dtype of numpy that every writer takes."""
+    return (labels.dims, np.array(labels.values.tolist(), dtype=str), labels.attrs)
 
 
-def _words(direction: xr.DataArray) -> Any:
+def _directions(direction: xr.DataArray) -> Any:
     words = {code: word for word, code in DIRECTION_CODES.items()}
     values = np.array([words[int(code)] for code in direction.values])
     return ("branch", values, {"long_name": direction.attrs["long_name"]})

@@ -10,43 +10,91 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.spec.parsing import Spec, parse_spec
-from pipeline.store import directory as store
+from pipeline.store.commits import Commit, cube_digest, read_commits
+from pipeline.store.runfile import RunInfo, read_run
+from pipeline.store.skeleton import check_skeleton
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magpend_core.models.model import Model
+    from magpend_core.models.parameters import Parameters
+
 
 @dataclass(frozen=True)
 class Run:
-    """A run directory with what was committed at one moment, so that all results speak of the same cells."""
+    """A run directory with what was committed at one moment, so that all results speak of the same cells.
 
-    info: store.RunInfo
+    Attributes
+    ----------
+    info : RunInfo
+        What ``run.json`` holds.
+    spec : Spec
+    plan : Plan
+    commits : dict
+        Valid commit records by task.
+    """
+
+    info: RunInfo
     spec: Spec
     plan: Plan
-    commits: Mapping[int, store.Commit]
+    commits: Mapping[int, Commit]
 
     @classmethod
     def open(cls, source: str | Path | Run) -> Run:
-        """Return what stands in a run directory now; an opened run is returned as it is."""
+        """Return what stands in a run directory now; an opened run is returned as it is.
+
+        Metadata and coordinates are compared with the digests in ``run.json``; no cell is read.
+
+        Raises
+        ------
+        RefusedError
+            If there is no run in `source`.
+        DamagedError
+            If ``run.json``, metadata or coordinates are not what was written.
+        UnreadableError
+            If something is there and cannot be read.
+
+        Examples
+        --------
+        >>> run = Run.open("runs/quickstart")                                # doctest: +SKIP
+        >>> run.cube().section.sel(frequency=2.2, method="nearest")          # doctest: +SKIP
+        """
         if isinstance(source, Run):
             return source
-        info = store.read_run(Path(source))
+        info = read_run(source)
+        check_skeleton(info)
         spec = parse_spec(info.spec)
         plan = make_plan(spec)
-        return cls(info, spec, plan, store.read_commits(info, plan))
+        return cls(info, spec, plan, read_commits(info, plan))
 
     @property
     def directory(self) -> Path:
         """Where it is."""
         return self.info.directory
 
+    @property
+    def model(self) -> Model:
+        """What was integrated."""
+        return self.spec.model
+
+    @property
+    def parameters(self) -> Parameters:
+        """The model's parameters, but for those that are swept."""
+        return self.spec.values
+
+    @property
+    def complete(self) -> bool:
+        """Whether every task is committed."""
+        return len(self.commits) == self.plan.n_tasks
+
     @cached_property
     def digest(self) -> str:
         """Digest of the committed cells."""
-        return store.cube_digest(self.info, self.commits)
+        return cube_digest(self.info, self.commits)
 
     def cube(self, chunks: Any = None) -> xr.Dataset:
         """Open the cube, as `pipeline.open_run` does."""
-        from pipeline.store.reading import open_committed
+        from pipeline.store.reading import cube_of
 
-        return open_committed(self.info, self.plan, self.commits, chunks=chunks)
+        return cube_of(self, chunks=chunks)

@@ -25,7 +25,7 @@ def attractors(run: Any, options: AttractorOptions) -> xr.Dataset:
     from pipeline.analysis.attractors.attractors import match
 
     found = run.derive("identified", **options.part(IdentifyOptions))
-    return match(found, threshold=options.threshold, look_back=options.look_back)
+    return match(found, threshold=options.threshold, look_back=options.look_back, connect=options.connect)
 
 
 def attractors_table(ds: xr.Dataset) -> Table:

@@ -133,7 +133,7 @@ def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> l
                 targets = [] if point is None else _targets(one, line, way, found)
                 if point is not None and targets:
                     walks.append((found, one, way, _follow(one, point, targets, way, settings)))
-    answers = run_together([steps for *_, steps in walks])
+    answers = run_together([steps for *_, steps in walks], "connecting orbits")
     for (found, one, way, _), (outcome, link) in zip(walks, answers, strict=True):
         (found.up if way > 0 else found.down)[one.number] = outcome
         if link is not None:

@@ -25,6 +25,8 @@ from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
 SAME = 1e-6
 """Scaled distance within which two orbits at one parameter value are the same."""
 
+FOLLOWING = "following branches"
+
 GUESS = 0.05
 """Scaled distance from the chord of a branch within which an orbit may lie on it."""
 
@@ -105,7 +107,8 @@ def _both_ways(starts: Sequence[Start], scope: Scope) -> list[Branch | None]:
             half_branch(family, way, scope.low, scope.high, scope.settings)
             for family, point in pairs
             for way in (opposite(point), point)
-        ]
+        ],
+        FOLLOWING,
     )
     found = iter(joined(family, *halves[2 * i : 2 * i + 2]) for i, (family, _) in enumerate(pairs))
     return [None if p is None else next(found) for p in firsts]
@@ -252,7 +255,8 @@ def _switch(branches: list[Branch], scope: Scope) -> None:
                 True,
             )
             for b, _, start in ready
-        ]
+        ],
+        FOLLOWING,
     )
     for (parent, one, _), half in zip(ready, halves, strict=True):
         if len(half.walk.points) < 5 or one.child is not None:
@@ -277,7 +281,8 @@ def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch],
             [
                 crossing_half(parent.family, one, way, scope.low, scope.high, scope.settings)
                 for way in (-1.0, 1.0)
-            ]
+            ],
+            FOLLOWING,
         )
         child = joined(parent.family, *halves)
         if len(child.points) > 2:

@@ -8,8 +8,8 @@
     magpend.figure("runs/quickstart", "bifurcation")         # what the command line draws
     magpend.sections(magpend.load_preset(q=1.6), [2.2], [[0.2, 0.2, 0, 0]], n_transient=300, n_keep=50)
 
-Every name is imported when it is first used; ``dir(magpend)`` lists them. Analyses take a run directory, or an
-opened `Run`, and the options of ``magpend analyse``; ``plot_`` functions take datasets.
+Every name is imported when it is first used; ``dir(magpend)`` lists them. Analyses take a run directory, or
+an opened `Run`, and the options of ``magpend analyse``; ``plot_`` functions take datasets.
 """
 
 from __future__ import annotations
@@ -56,8 +56,10 @@ def _analysis(name: str) -> Callable[..., Any]:
         return derive(source, name, options, echo=echo)
 
     analysis = ANALYSES[name]
-    fields = analysis.options.model_fields
-    lines = [f"    {key} = {default_of(analysis.options, key)!r}: {fields[key].description}" for key in fields]
+    model = analysis.options
+    lines = [
+        f"    {k} = {default_of(model, k)!r}: {info.description}" for k, info in model.model_fields.items()
+    ]
     found.__name__ = found.__qualname__ = name
     found.__doc__ = "\n".join([analysis.help, "", "Options:", *lines])
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
@@ -11,10 +12,20 @@ from magpend_core import load_preset, run_branches
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import sincos
+from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance
-from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
+from pipeline.analysis.branches import (
+    Scope,
+    Start,
+    attracting,
+    dataset_of,
+    explore,
+    orbits_near,
+    table_of,
+    windows_of,
+)
 from pipeline.analysis.branches.arclength import Point, Settings
 from pipeline.analysis.branches.bifurcations import Bifurcation, multipliers_of, n_unstable, tell_apart
 from pipeline.analysis.branches.curves import continue_curves
@@ -28,6 +39,7 @@ from pipeline.analysis.branches.problems import (
     fold_test,
     torus_test,
 )
+from pipeline.analysis.branches.table import branches_table
 
 
 @inline
@@ -206,14 +218,74 @@ def test_dataset_of__resonance(resonance):
     """Three stable segments' worth of tables: numbers as on the branch."""
     _, branch = resonance
     ds = dataset_of([branch], "frequency", None)
-    upper, lower = sorted(table_of(ds), key=lambda row: -row["value"])
+    upper, lower = sorted(table_of(ds), key=lambda row: -row["frequency_hz"])
     assert [upper["type"], lower["type"]] == ["fold", "fold"]
     assert (upper["unstable_below"], upper["unstable_above"]) == ("0|1", "none")
     assert (lower["unstable_below"], lower["unstable_above"]) == ("none", "0|1")
     first, second = windows_of(ds)
     assert (first["begins"], first["ends"]) == ("bound", "fold")
     assert (second["begins"], second["ends"]) == ("fold", "bound")
-    assert (first["to"], second["from"]) == (upper["value"], lower["value"])
+    assert (first["to"], second["from"]) == (upper["frequency_hz"], lower["frequency_hz"])
+
+
+def test_dataset_of__no_branch():
+    """Of no branch a dataset of the same variables, and a sentence."""
+    parameters = load_preset()
+    ds = dataset_of([], "frequency", parameters, ["attractor 0: a bounded set"])
+    assert (ds.sizes["branch"], ds.sizes["bifurcation"], ds.sizes["state"]) == (0, 0, 4)
+    assert {"parameter", "side", "rotation", "frequency", "bifurcation_section"} <= set(ds)
+    rows, lines = branches_table(ds).rows, branches_table(ds).lines
+    assert rows == []
+    assert lines[0].startswith("no branch")
+    assert "  attractor 0: a bounded set" in lines
+    assert dataset_of([], "amplitude").sizes["branch"] == 0
+
+
+def test_table_of__one_name_per_axis(resonance, cascade):
+    """The frequency stands in one column, under its unit; of another parameter, beside it."""
+    _, branch = resonance
+    (row, *_) = table_of(dataset_of([branch], "frequency"))
+    assert [n for n in row if "frequency" in n] == ["frequency_hz"]
+    assert np.isfinite(row["frequency_hz"])
+    assert "side" not in row
+    orbits, branches = cascade
+    (row, *_) = table_of(dataset_of(branches, "amplitude"))
+    assert row["amplitude"] == orbits.values(branches[0].bifurcations[0].point.u)[0]
+    assert row["frequency_hz"] == orbits.frequency_hz
+    assert "value" not in row
+
+
+def run_of(*periods, kinds=None):
+    """Attractors of a Duffing run at two frequencies, of given periods, 0 for a bounded set."""
+    parameters = load_model("duffing").load()
+    n, dims = len(periods), ("frequency", "attractor")
+    period = np.array([periods, periods])
+    return parameters, xr.Dataset(
+        {
+            "status": (("frequency", "initial_condition"), np.ones((2, 1), np.int8)),
+            "kind": (dims, np.where(period > 0, 1, 2)),
+            "orbit_period": (dims, period),
+            "is_polished": (dims, (period > 0).astype(np.int8)),
+            "attractor_points": ((*dims, "point", "state"), np.zeros((2, n, max(periods), 2))),
+        },
+        coords={"frequency": [0.15, 0.2]},
+    )
+
+
+def test_attracting__all_periods_or_a_line_for_what_is_left_out():
+    parameters, found = run_of(1, 5, 7, 0)
+    starts, left_out = attracting(found, parameters, "frequency", (0.1, 0.3))
+    assert sorted(s.family.period for s in starts) == [1, 1, 5, 5, 7, 7]
+    (line,) = left_out
+    assert line.startswith("attractor 3 at frequency 0.15 to 0.2 (2 points): a bounded set")
+    assert "--recurrences" in line
+    starts, left_out = attracting(found, parameters, "frequency", (0.1, 0.17), 5)
+    assert sorted(s.family.period for s in starts) == [1, 5]
+    assert (
+        "attractor 2 at frequency 0.15 to 0.2 (2 points): its period is 7; take it with --period 7"
+        in left_out
+    )
+    assert any(line.startswith("attractor 0 at frequency 0.2: outside of the interval") for line in left_out)
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ import pytest
 
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
-from pipeline.runs import run as runs
-from pipeline.runs.run import first_figure
+from pipeline.runs import preview, workflows
+from pipeline.runs.preview import first_figure
 from pipeline.spec.parsing import parse_spec
 
 BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
@@ -33,7 +33,7 @@ def test_help__is_light(environment):
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert found.stdout.splitlines()[-1] == "[]"
-    for command in ("run", "status", "verify", "analyse", "plot", "simulate", "presets"):
+    for command in ("run", "status", "verify", "analyse", "plot", "simulate", "models", "presets"):
         assert command in found.stdout
 
 
@@ -68,8 +68,10 @@ def test_run__bad_spec_creates_nothing(magpend, write_spec, tmp_path, option):
         ["run", "spec.toml", "--smoke"],
         ["status", "."],
         ["verify", "."],
+        ["analyse", "attractors", "."],
+        ["analyse", "basins", ".", "--box", "x"],
         ["analyse", ".", "attractors"],
-        ["analyse", ".", "basins", "--box", "x"],
+        ["branches", "."],
         ["analyse", ".", "nonsense"],
         ["plot", "bifurcation", "."],
         ["plot", "bifurcation", ".", "--state", "psi3"],
@@ -213,12 +215,12 @@ def test_presets__values_units_and_source(main):
 
 
 def test_find_spec__shipped_workflows():
-    shipped = runs.shipped_workflows()
+    shipped = workflows.shipped_workflows()
     assert "quickstart" in shipped
-    assert runs.find_spec("quickstart") == shipped["quickstart"]
+    assert workflows.find_spec("quickstart") == shipped["quickstart"]
     for path in shipped.values():
-        assert runs.describe_plan(path, os.devnull + "-absent")
-        assert runs.describe_plan(path, os.devnull + "-absent", smoke=True)
+        assert preview.describe_plan(path, os.devnull + "-absent")
+        assert preview.describe_plan(path, os.devnull + "-absent", smoke=True)
 
 
 def test_modules__each_library_has_one_room():

@@ -23,7 +23,8 @@ from pipeline.layout.cells import CellMap
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.schema import REFINEMENT, base_variables
-from pipeline.runs.run import run, state
+from pipeline.runs.run import run
+from pipeline.runs.status import state
 from pipeline.spec.parsing import parse_spec
 from pipeline.spec.problems import SpecError
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from magpend_core.models import load_model
+from pipeline.layout import identity
 from pipeline.layout import plan as planning
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
@@ -58,6 +61,18 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
                 assert s.stop % c == 0 or s.stop == n
         size = np.dtype(variable.dtype).itemsize * np.prod(chunks)
         assert size <= planning.CHUNK_BYTES or chunks[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("n_points", "n_branches", "n_keep"), [(266, 16, 290), (400, 70, 300), (7, 3, 60_000)]
+)
+def test_chunks__ceil_of_a_ceil_stays_within_the_bound(n_points, n_branches, n_keep):
+    shape = (n_points, n_branches)
+    block = planning._block(shape, 0, 16)
+    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, VARIABLES, sizes(n_keep), 1.0)
+    for variable in VARIABLES:
+        chunks = plan.chunks(variable)
+        assert np.dtype(variable.dtype).itemsize * np.prod(chunks) <= planning.CHUNK_BYTES or chunks[0] == 1
 
 
 def test_make_plan__multiples_of_lanes_and_sizes():
@@ -124,9 +139,75 @@ def test_identity__what_counts(sweep_text):
         assert digest(sweep_text.replace(old, new)) != same
 
 
+def test_digest_of__numbers_without_loss():
+    assert digest_of({"seed": 2**53 + 1}) != digest_of({"seed": 2**53})
+    assert digest_of({"seed": 2**200 + 1}) != digest_of({"seed": 2**200})
+    assert digest_of({"a": 2, "b": [1.0]}) == digest_of({"a": 2.0, "b": [1]})
+    assert digest_of({"a": 0.0}) == digest_of({"a": 0}) != digest_of({"a": -0.0})
+    assert digest_of({"a": 1}) != digest_of({"a": True})
+    assert differences({"seed": 2**53 + 1}, {"seed": 2**53})
+    assert not differences({"a": 2.0}, {"a": 2})
+
+
+def test_identity__seeds_beyond_the_floats(walk_text):
+    def digest(seed):
+        spec = parse_spec(tomllib.loads(walk_text.replace("seed = 3", f"seed = {seed}")))
+        return digest_of(identity_of(spec, make_plan(spec), "k"))
+
+    assert digest(2**53) != digest(2**53 + 1)
+
+
+def test_identity__other_starts_under_the_same_specification(sweep_text, monkeypatch):
+    """Another version of what makes numbers of a specification is another run."""
+    spec = parse_spec(tomllib.loads(sweep_text))
+    before = identity_of(spec, make_plan(spec), "k")
+    original = identity.coordinates
+
+    def moved(spec):
+        found = list(original(spec))
+        i = next(i for i, c in enumerate(found) if c.name == "psi1_0")
+        found[i] = replace(found[i], values=found[i].values + 1e-15)
+        return tuple(found)
+
+    monkeypatch.setattr(identity, "coordinates", moved)
+    lines = differences(before, identity_of(spec, make_plan(spec), "k"))
+    assert [line.split(":")[0] for line in lines] == ["coordinates"]
+
+
+def test_code_version__changes_with_its_meaning(monkeypatch, tmp_path):
+    folder = tmp_path / "pipeline"
+    (folder / "layout").mkdir(parents=True)
+    shutil.copy(ROOT / "pipeline/layout/cells.py", folder / "layout")
+    monkeypatch.setattr(identity, "_PIPELINE", folder)
+
+    def version():
+        identity.code_version.cache_clear()
+        return identity.code_version("layout.cells")
+
+    before = version()
+    cells = folder / "layout/cells.py"
+    text = cells.read_text()
+    cells.write_text('"""Another first sentence."""\n# a comment\n' + text)
+    assert version() == before
+    assert "math.pi / 180" in text
+    cells.write_text(text.replace("math.pi / 180", "math.pi / 181"))
+    assert version() != before
+    identity.code_version.cache_clear()
+
+
+def test_identity__code_of_what_is_computed(sweep_text):
+    """A product that a run does not ask for bars nobody from completing it."""
+    plain = parse_spec(tomllib.loads(sweep_text))
+    spectra = parse_spec(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
+    assert identity.code_of(plain) == ["layout.cells", "compute.task"]
+    assert identity.code_of(spectra) == ["layout.cells", "compute.task", "compute.exponents"]
+    lines = differences(*(identity_of(s, make_plan(s), "k") for s in (plain, spectra)))
+    assert any(line.startswith("code.compute.exponents: (absent)") for line in lines)
+
+
 def test_differences__key_by_key():
     old = {"a": {"b": 1, "c": [1, 2]}, "d": "x"}
     new = {"a": {"b": 1.0, "c": [1, 3]}, "e": 5}
     lines = differences(old, new)
     assert [line.split(":")[0] for line in lines] == ["a.c", "d", "e"]
-    assert lines[0] == "a.c: [1.0, 2.0] in the directory, [1.0, 3.0] now"
+    assert lines[0] == "a.c: [1, 2] in the directory, [1, 3] now"

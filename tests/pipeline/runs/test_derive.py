@@ -125,7 +125,7 @@ def test_derive__other_options_and_further_cells_compute_again(made, compute):
     assert compute.calls == 3
     assert not after["mean"].equals(before["mean"])
     assert len(products(made)) == 3
-    store.withdraw(made.info, [1])
+    store.withdraw(made.info, ["000001.json"])
     xr.testing.assert_identical(derive(directory, "mean", {"a": 1}), before)
     assert compute.calls == 3
 

@@ -14,7 +14,9 @@ from magpend_core import load_preset, run_branches
 from pipeline import open_run
 from pipeline.compute import task
 from pipeline.compute.execute import TaskFailedError
-from pipeline.runs.run import InterruptedRunError, describe_plan, run, state
+from pipeline.runs.preview import describe_plan
+from pipeline.runs.run import InterruptedRunError, run
+from pipeline.runs.status import state
 from pipeline.spec.parsing import parse_spec
 from pipeline.store import directory as store
 
@@ -150,7 +152,7 @@ def test_run__changed_spec_is_refused(write_spec, sweep_text, tmp_path, bytes_of
     changed = write_spec(sweep_text.replace("rtol = 1e-6", "rtol = 1e-5"), "changed.toml")
     for function in (
         lambda: run(changed, tmp_path / "run", workers=0),
-        lambda: describe_plan(changed, tmp_path / "run"),
+        lambda: list(describe_plan(changed, tmp_path / "run")),
     ):
         with pytest.raises(
             store.RefusedError, match=r"spec\.integration\.rtol: 1e-06 in the directory, 1e-05 now"

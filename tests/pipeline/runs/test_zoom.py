@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 
 from pipeline.cli.exits import Exit
 from pipeline.layout.cells import coordinates
-from pipeline.runs.run import describe_plan, run, shipped_workflows
+from pipeline.runs.preview import describe_plan
+from pipeline.runs.run import run
+from pipeline.runs.workflows import shipped_workflows
 from pipeline.runs.zoom import Changes, read_source, to_toml, write_zoom, zoom
 from pipeline.spec.parsing import load_spec, parse_spec
 from pipeline.spec.problems import SpecError
-from pipeline.store.directory import read_run
+from pipeline.store.runfile import read_run
 
 
 @pytest.fixture

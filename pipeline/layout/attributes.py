@@ -1,0 +1,46 @@
+"""Attributes that every format takes: numbers, lists of numbers, and texts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def netcdf_safe(ds: xr.Dataset) -> xr.Dataset:
+    """Return a dataset whose attributes can be written as NetCDF: see `safe_attributes`."""
+    safe = ds.copy(deep=False)
+    safe.attrs = safe_attributes(ds.attrs)
+    for variable in safe.variables.values():
+        variable.attrs = safe_attributes(variable.attrs)
+    return safe
+
+
+def safe_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return attributes as NetCDF has them.
+
+    Truth values become 0 and 1, lists of words one text with spaces between, other lists and tables JSON;
+    what is None is left out.
+    """
+    return {str(name): _safe(value) for name, value in attrs.items() if value is not None}
+
+
+def _safe(value: Any) -> Any:
+    if isinstance(value, (bool, np.bool_)):
+        return int(value)
+    if isinstance(value, Mapping):
+        return json.dumps(value, sort_keys=True)
+    if isinstance(value, (list, tuple, np.ndarray)):
+        items = np.asarray(value).tolist() if isinstance(value, np.ndarray) else list(value)
+        if isinstance(items, list) and items and all(isinstance(item, str) for item in items):
+            return " ".join(items)
+        numbers = isinstance(items, list) and all(
+            isinstance(item, (int, float)) and not isinstance(item, bool) for item in items
+        )
+        return value if numbers else json.dumps(items)
+    return value

@@ -1,0 +1,174 @@
+"""What a run will take here: some of its own cells are integrated for a moment and the time is taken.
+
+The rule of thumb in `pipeline.layout.plan` knows how the time goes with the frequency and the tolerance.
+What it cannot know is measured: how fast this processor goes through this system's steps, and how long
+cells take to close where the run stops at that.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.layout.cells import CellMap, Inputs
+from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell, seconds_per_period
+from pipeline.spec.parsing import Spec
+
+BRANCHES, POINTS = 32, 4
+"""Size of the sample: two groups of lanes, and of a continuation some points of each branch."""
+
+SPEED_S = 0.25
+"""Time for each of the two stretches in which the speed is measured, by the rule of thumb [s]."""
+
+CLOSING_S = 0.8
+"""Most time for finding out when cells close, by the rule of thumb [s]."""
+
+LEAST_PERIODS = 8
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a run takes.
+
+    Attributes
+    ----------
+    core_seconds : float
+        Time of all cells on one core [s].
+    how : str
+        What it rests on.
+    compiled_s : float
+        Time that was taken by compiling [s].
+    """
+
+    core_seconds: float
+    how: str
+    compiled_s: float
+
+
+def estimate(spec: Spec, plan: Plan) -> Estimate:
+    """Measure what a run takes on one core of this machine; a second or two, and compiling before.
+
+    The time of products (exponents) is taken from their number of periods, in units of the measured time
+    of one.
+    """
+    from pipeline.compute.task import warm_up
+
+    compiled_s = warm_up(spec)
+    most, products = periods_per_cell(spec)
+    spec = replace(spec, products={})
+    inputs = _sample(spec, plan, np.random.default_rng(0), pairs=False)
+    ratio, measured, seconds = _speed(spec, inputs, most)
+    how = f"measured: {inputs.frequency_hz.size} of its cells over {measured} periods, {seconds:.1f} s"
+    periods = most
+    if spec.integration.stop_when_closed:
+        periods = _periods_until_closed(spec, plan, most)
+        how += f"; a cell takes {periods:.0f} of at most {most:.0f} periods until it has closed"
+    per_cell = ratio * mean_seconds_per_period(spec) * (periods + products)
+    return Estimate(per_cell * plan.n_cells, how, compiled_s)
+
+
+def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, *, pairs: bool) -> Inputs:
+    """Inputs of cells drawn from all over the run.
+
+    With `pairs` the points of a continuation's branch are neighbours two by two: where the second one
+    starts is where it would start in the run.
+    """
+    cells = CellMap(spec)
+    n_points = 1 if plan.path is None else plan.shape[plan.path]
+    in_task = math.prod(plan.block) // n_points
+    branches = [n for i, n in enumerate(plan.shape) if i != plan.path]
+    chosen = rng.choice(math.prod(branches), min(BRANCHES, in_task, math.prod(branches)), replace=False)
+    parts = []
+    for flat in np.sort(chosen):
+        place = list(np.unravel_index(flat, branches)) if branches else []
+        block = [slice(int(i), int(i) + 1) for i in place]
+        if plan.path is not None:
+            block.insert(plan.path, slice(0, n_points))
+        parts.append(cells.inputs(tuple(block)))
+    points = _points(n_points, rng, pairs=pairs)
+    return Inputs(
+        np.concatenate([p.parameters[:, points] for p in parts]),
+        np.concatenate([p.frequency_hz[:, points] for p in parts]),
+        np.concatenate([p.initial_states for p in parts]),
+    )
+
+
+def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarray:
+    """Indices of points along a path, one or two from each part of it."""
+    n_parts = min(POINTS, n_points // 2 if pairs and n_points > 1 else n_points)
+    edges = np.linspace(0, n_points, n_parts + 1)
+    first = np.array([rng.integers(math.ceil(a), math.ceil(b)) for a, b in itertools.pairwise(edges)])
+    if not pairs or n_points == 1:
+        return first
+    first = np.minimum(first, n_points - 2)
+    return np.stack([first, first + 1], axis=1).ravel()
+
+
+def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
+    """Measured time over that of the rule of thumb; periods per cell and seconds that it was measured in.
+
+    Two stretches: from the initial states, and from where the first one ended, which stands for the rest
+    of the cell.
+    """
+    by_rule = float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).sum())
+    n_periods = int(min(max(SPEED_S / by_rule, LEAST_PERIODS), most))
+    _, first_s = _integrate(spec, inputs, n_periods)
+    if first_s > 4 * SPEED_S:  # far slower than the rule says: one stretch has to do
+        return first_s / (by_rule * n_periods), n_periods, first_s
+    values, first_s = _integrate(spec, inputs, n_periods)
+    ends = values["section"][:, -1, -1]
+    later = replace(inputs, initial_states=np.where(np.isfinite(ends), ends, inputs.initial_states))
+    _, later_s = _integrate(spec, later, n_periods)
+    share = n_periods / most
+    return (share * first_s + (1 - share) * later_s) / (by_rule * n_periods), 2 * n_periods, first_s + later_s
+
+
+def _integrate(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[dict[str, np.ndarray], float]:
+    """Integrate the sample for some periods without stopping; the variables, and the processor's time [s]."""
+    from pipeline.compute.task import integrate
+
+    integration = spec.integration.model_copy(
+        update={"n_transient": n_periods - 1, "n_keep": 1, "stop_when_closed": False}
+    )
+    started = time.process_time()
+    values = integrate(replace(spec, integration=integration), inputs)
+    return values, time.process_time() - started
+
+
+def _periods_until_closed(spec: Spec, plan: Plan, most: float) -> float:
+    """Mean periods of a cell in a run that stops when orbits have closed."""
+    from pipeline.compute.task import integrate
+
+    rng, counts = np.random.default_rng(1), []
+    left = CLOSING_S
+    while left > 0:
+        inputs = _sample(spec, plan, rng, pairs=True)
+        by_rule = float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).sum())
+        cap = int(min(most, max(CLOSING_S / by_rule, LEAST_PERIODS + spec.integration.n_keep)))
+        integration = spec.integration.model_copy(update={"n_transient": cap - spec.integration.n_keep})
+        started = time.process_time()
+        values = integrate(replace(spec, integration=integration), inputs)
+        left -= time.process_time() - started
+        periods = values["n_periods"]
+        counts.append(periods[:, 1::2] if periods.shape[1] > 1 else periods)
+        if plan.n_cells <= BRANCHES:
+            break
+    return mean_with_tail(np.concatenate([c.ravel() for c in counts]).astype(float), cap, most)
+
+
+def mean_with_tail(periods: np.ndarray, cap: float, most: float) -> float:
+    """Mean number of periods if those that reached `cap` had gone on, at most to `most`.
+
+    They are taken to end at the rate at which cells ended in the second half of what was seen.
+    """
+    open_half, still_open = int((periods > cap / 2).sum()), int((periods >= cap).sum())
+    if not still_open or most <= cap:
+        return float(periods.mean())
+    rate = math.log(open_half / still_open) / (cap / 2)
+    more = most - cap
+    extra = more if rate == 0 else -math.expm1(-rate * more) / rate
+    return float(periods.mean() + extra * still_open / len(periods))

@@ -1,0 +1,96 @@
+"""What a run would do: ``magpend run --dry-run``, and the figure that shows it best."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
+from pipeline.runs.estimate import estimate
+from pipeline.runs.progress import duration, size
+from pipeline.runs.run import identity_here
+from pipeline.runs.workflows import default_directory, find_spec
+from pipeline.spec.parsing import Spec, load_spec
+from pipeline.spec.problems import SpecError
+from pipeline.store.commits import read_commits
+from pipeline.store.files import local_path
+from pipeline.store.setup import check
+
+
+def first_figure(plan: Plan) -> str:
+    """Name of the figure of ``magpend plot`` that shows a run as a whole."""
+    swept = [d for d in plan.dims if not is_start_dim(d)]
+    long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
+    n_swept, n_grid = sum(d in swept for d in long), sum(is_grid_dim(d) for d in long)
+    if n_swept >= 2:
+        return "regimes"
+    if n_swept == 0 and n_grid >= 2:
+        return "basins"
+    return "bifurcation" if swept else "gallery"
+
+
+def check_diagram(spec: str | Path, *, smoke: bool = False) -> None:
+    """Refuse a specification whose run is not drawn as a bifurcation diagram.
+
+    Raises
+    ------
+    SpecError
+        Naming the figure that is.
+    """
+    figure = first_figure(make_plan(load_spec(find_spec(spec), smoke=smoke)))
+    if figure != "bifurcation":
+        raise SpecError(
+            [
+                "--plot: a bifurcation diagram is drawn over one parameter; drop it, "
+                f"and use: magpend plot {figure} DIR"
+            ]
+        )
+
+
+def describe_plan(
+    spec: str | Path, out: str | Path | None, *, workers: int | None = None, smoke: bool = False
+) -> Iterator[str]:
+    """Yield the lines of a dry run; creates nothing but compiled code in the compile cache.
+
+    The time is measured on some of the run's own cells, after the lines that cost nothing.
+
+    Raises
+    ------
+    SpecError, RefusedError
+        As `run` would.
+    """
+    path = find_spec(spec)
+    parsed = load_spec(path, smoke=smoke)
+    directory = local_path(out) if out is not None else default_directory(path, smoke)
+    plan = make_plan(parsed)
+    info = check(directory, identity_here(parsed, plan))
+    done = read_commits(info, plan) if info else {}
+    if parsed.title:
+        yield parsed.title
+    dims = ", ".join(f"{d} {n}" for d, n in zip(plan.dims, plan.shape, strict=True))
+    yield f"{parsed.kind}: {plan.n_cells} cells ({dims or 'one cell'})"
+    yield f"tasks: {plan.n_tasks} of {' x '.join(map(str, plan.block)) or '1'} cells, {len(done)} done"
+    yield f"cube: {size(plan.n_bytes)} before compression"
+    yield f"directory: {directory}" + ("" if info else " (not created)")
+    yield _time_line(parsed, plan, set(range(plan.n_tasks)) - set(done), workers)
+
+
+def _time_line(spec: Spec, plan: Plan, missing: set[int], workers: int | None) -> str:
+    """What the missing tasks will take, as measured on a few of the run's cells."""
+    from pipeline.compute.execute import default_workers
+
+    if not missing:
+        return "time: nothing is left to compute"
+    share = sum(plan.cells_in(i) for i in missing) / plan.n_cells
+    found = estimate(spec, plan)
+    seconds = share * found.core_seconds
+    cores = max(1, min(default_workers() if workers is None else workers, len(missing)))
+    bound = "about" if spec.refine is None else "at most"
+    compiled = (
+        f"; the kernel was compiled for it in {duration(found.compiled_s)}" if found.compiled_s > 1 else ""
+    )
+    return (
+        f"time: {bound} {duration(seconds)} of one core, {duration(seconds / cores)} on {cores} "
+        f"({found.how}{compiled})"
+    )

@@ -1,0 +1,82 @@
+"""How far a run is: ``magpend status``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.layout.plan import Plan
+from pipeline.store.run import Run
+
+
+@dataclass(frozen=True)
+class State:
+    """How far a run is.
+
+    Attributes
+    ----------
+    directory : Path
+    title : str
+    plan : Plan
+    done : frozenset of int
+        Committed tasks.
+    cells : dict
+        Committed cells by status name.
+    """
+
+    directory: Path
+    title: str
+    plan: Plan
+    done: frozenset[int]
+    cells: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def n_committed(self) -> int:
+        """Committed cells."""
+        return sum(self.cells.values())
+
+    @property
+    def complete(self) -> bool:
+        """Whether every task is committed."""
+        return len(self.done) == self.plan.n_tasks
+
+
+def state(source: str | Path | Run) -> State:
+    """Say how far a run is, from its commit records alone.
+
+    Raises
+    ------
+    RefusedError, DamagedError, UnreadableError
+        As `Run.open`.
+    """
+    run = Run.open(source)
+    cells: Counter[str] = Counter()
+    for commit in run.commits.values():
+        cells.update(commit.status)
+    return State(run.directory, run.info.title, run.plan, frozenset(run.commits), dict(cells))
+
+
+def describe_state(found: State) -> list[str]:
+    """Return the lines of ``magpend status``."""
+    plan = found.plan
+    share = 100 * found.n_committed / plan.n_cells
+    lines = [found.title] if found.title else []
+    lines += [
+        f"{found.directory}: {'complete' if found.complete else 'incomplete'}",
+        f"committed: {found.n_committed} of {plan.n_cells} cells ({share:.1f} %), "
+        f"{len(found.done)} of {plan.n_tasks} tasks",
+    ]
+    return lines + _status_lines(found.cells, plan.n_cells - found.n_committed)
+
+
+def _status_lines(cells: Mapping[str, int], pending: int) -> list[str]:
+    from magpend_core.status import Status
+
+    numbers = {**cells, "pending": pending}
+    return [
+        f"  {s.name.lower():15s} {numbers[s.name.lower()]:>10d}  {s.sentence}"
+        for s in Status
+        if numbers.get(s.name.lower())
+    ]

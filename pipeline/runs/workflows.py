@@ -1,0 +1,40 @@
+"""Find what is to be run: a file, or a workflow that ships."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from pipeline.spec.problems import SpecError
+
+
+def find_spec(name: str | Path) -> Path:
+    """Return the path of a specification: a file, or the bare name of a shipped workflow.
+
+    Raises
+    ------
+    SpecError
+        If there is neither.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    shipped = shipped_workflows()
+    if str(name) in shipped:
+        return shipped[str(name)]
+    known = f"shipped workflows: {', '.join(shipped)}" if shipped else "no workflows are shipped"
+    raise SpecError([f"{name}: no such file, and no shipped workflow of that name ({known})."])
+
+
+def shipped_workflows() -> dict[str, Path]:
+    """Paths of the workflows that ship with magpend, by name."""
+    try:
+        folder = Path(str(resources.files("workflows")))
+    except ModuleNotFoundError:
+        return {}
+    return {p.stem: p for p in sorted(folder.glob("*.toml"))}
+
+
+def default_directory(spec_path: Path, smoke: bool) -> Path:
+    """Where a run goes unless told otherwise."""
+    return Path("runs") / (spec_path.stem + ("-smoke" if smoke else ""))

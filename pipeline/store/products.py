@@ -1,0 +1,236 @@
+"""Analysis products on disk: whole or absent, sealed by a digest of their content.
+
+Each is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. Words (``state``, ``direction``, names of
+sides) are stored as codes, which the attribute ``words`` lists.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+from zarr.storage import LocalStore
+
+from pipeline.layout.attributes import netcdf_safe
+from pipeline.store.arrays import create_array
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import (
+    TEMPORARY,
+    files_below,
+    object_entry,
+    refuse_links,
+    remove_tree,
+    sync,
+    sync_folder,
+    temporary_beside,
+)
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SEAL = "content_sha256"
+"""Attribute of a product: digest of its other attributes and of all its files but the one that holds it."""
+
+_WORDS = "words"
+_PRODUCT_CHUNK_BYTES = 16_000_000
+
+
+def write_product(path: Path, ds: xr.Dataset) -> None:
+    """Write a dataset so that it is at `path` whole or not at all.
+
+    Words are stored as codes (the attribute ``words`` lists them), since zarr format 3 has no strings
+    of fixed length. If another process puts a sound product of the same attributes there first, that
+    one stays.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written to.
+    RefusedError
+        If the folder is a link.
+    """
+    refuse_links(path.parent)
+    path.parent.mkdir(exist_ok=True)
+    temporary = temporary_beside(path)
+    try:
+        attrs = _write_group(temporary, ds)
+        sync(files_below(temporary), temporary)
+        _put_in_place(temporary, path, attrs)
+        sync_folder(path.parent)
+    finally:
+        remove_tree(temporary)
+
+
+def open_product(path: Path) -> xr.Dataset:
+    """Read a product into memory.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is none.
+    DamagedError
+        If it is not what was written.
+    """
+    import xarray as xr
+
+    read_product_attrs(path)
+    try:
+        with xr.open_zarr(LocalStore(path, read_only=True), consolidated=False, chunks=None) as ds:
+            loaded = ds.load().assign(_with_words(ds))
+    except (ValueError, KeyError, OSError) as error:
+        raise DamagedError(f"{path}: {error}") from None
+    variables = {name: loaded.variables[name] for name in sorted(map(str, loaded.data_vars))}
+    return netcdf_safe(xr.Dataset(variables, loaded.coords, _own(loaded.attrs)))
+
+
+def read_product_attrs(path: Path) -> dict[str, Any]:
+    """Attributes of a product, once its seal has been found to fit.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is none.
+    DamagedError
+        If it is not what was written.
+    """
+    if path.is_symlink() or path.parent.is_symlink():
+        raise DamagedError(f"{path}: is, or lies behind, a link")
+    if not path.exists():
+        raise FileNotFoundError(path)
+    try:
+        attrs: dict[str, Any] = json.loads((path / "zarr.json").read_text("utf-8"))["attributes"]
+        if attrs[SEAL] == _seal(path, attrs):
+            return attrs
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DamagedError(f"{path}: {error!r}") from None
+    raise DamagedError(f"{path}: its content has changed")
+
+
+def remove_product(path: Path) -> None:
+    """Remove a product; one that is gone already is no error, of a link what it leads to stays.
+
+    Raises
+    ------
+    RefusedError
+        If the folder that holds it is a link.
+    """
+    refuse_links(path.parent)
+    aside = temporary_beside(path)
+    with contextlib.suppress(FileNotFoundError):
+        path.rename(aside)
+        remove_tree(aside)
+
+
+def leftover_products(folder: Path, older_than: float) -> list[Path]:
+    """Temporary folders of products that nothing has changed for some seconds."""
+    limit = time.time() - older_than
+    return [p for p in sorted(folder.glob(f".*.zarr.*{TEMPORARY}")) if p.lstat().st_mtime < limit]
+
+
+def product_paths(folder: Path) -> list[Path]:
+    """Products in a folder, sound or not.
+
+    Raises
+    ------
+    RefusedError
+        If the folder is a link.
+    """
+    refuse_links(folder)
+    return sorted(folder.glob("*.zarr"))
+
+
+def _own(attrs: Mapping[Any, Any]) -> dict[str, Any]:
+    return {str(k): v for k, v in attrs.items() if k != SEAL}
+
+
+def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None:
+    """Rename a finished product; a damaged or another one at its place makes way."""
+    while True:
+        try:
+            temporary.rename(path)
+            return
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+        with contextlib.suppress(FileNotFoundError, DamagedError):
+            if _own(read_product_attrs(path)) == attrs:
+                return
+        remove_product(path)
+
+
+def _write_group(folder: Path, ds: xr.Dataset) -> dict[str, Any]:
+    """Write all variables, then the attributes with the seal; returns the attributes without it."""
+    group = zarr.create_group(LocalStore(folder), zarr_format=3)
+    for name in sorted(map(str, ds.variables)):
+        values, attrs = _coded(name, ds.variables[name])
+        fill = np.nan if values.dtype.kind == "f" else 0
+        dims = tuple(map(str, ds.variables[name].dims))
+        chunks = _product_chunks(values)
+        array = create_array(group, name, dims, values.shape, chunks, str(values.dtype), fill, attrs)
+        if values.size:
+            array[...] = values
+    attrs = _plain(ds.attrs)
+    others = sorted(str(name) for name in ds.coords if name not in ds.dims)
+    stored = {**attrs, "coordinates": " ".join(others)} if others else attrs
+    group.update_attributes({**stored, SEAL: _seal(folder, stored)})
+    return stored
+
+
+def _seal(folder: Path, attrs: Mapping[str, Any]) -> str:
+    """Digest of a product's attributes and files."""
+    digest = hashlib.sha256(json.dumps(_own(attrs), sort_keys=True).encode())
+    for file in sorted(f for f in files_below(folder) if f != folder / "zarr.json"):
+        digest.update(f"\n{file.relative_to(folder).as_posix()} {object_entry(file)['sha256']}".encode())
+    return digest.hexdigest()
+
+
+def _product_chunks(values: np.ndarray) -> tuple[int, ...]:
+    """Whole arrays, or parts of some megabytes cut along the first dims."""
+    chunks = [max(n, 1) for n in values.shape]
+    for i, n in enumerate(chunks):
+        rest = values.itemsize * int(np.prod(chunks[i + 1 :]))
+        chunks[i] = min(n, max(1, _PRODUCT_CHUNK_BYTES // rest))
+        if chunks[i] > 1:
+            break
+    return tuple(chunks)
+
+
+def _coded(name: str, variable: xr.Variable) -> tuple[np.ndarray, dict[str, Any]]:
+    """Values and attributes as they are stored: words as codes."""
+    values = np.asarray(variable.values)
+    attrs: dict[str, Any] = _plain(variable.attrs)
+    if values.dtype.kind not in "UO":
+        return values, attrs
+    if not all(isinstance(word, str) for word in values.flat):
+        raise TypeError(f"{name}: objects other than words cannot be stored.")
+    words = {word: code for code, word in enumerate(dict.fromkeys(values.ravel().tolist()))}
+    codes = np.array([words[word] for word in values.flat], np.int32).reshape(values.shape)
+    return codes, {**attrs, _WORDS: list(words)}
+
+
+def _with_words(ds: xr.Dataset) -> dict[str, Any]:
+    """Variables that were words, as words again."""
+    found = {}
+    for name, variable in ds.variables.items():
+        if _WORDS in variable.attrs:
+            attrs = {k: v for k, v in variable.attrs.items() if k != _WORDS}
+            words = np.array(variable.attrs[_WORDS], dtype=str)
+            found[str(name)] = (variable.dims, words[variable.values], attrs)
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """Attributes as JSON has them."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

@@ -1,0 +1,62 @@
+"""Where and when something was made, with what: no part of what a run is, nor of its digest."""
+
+from __future__ import annotations
+
+import contextlib
+import platform
+import subprocess
+from datetime import UTC, datetime
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+
+_ROOT = Path(__file__).parents[2]
+_GIT_SECONDS = 5.0
+_PACKAGES = ("magpend", "numpy", "numba", "zarr", "numcodecs", "xarray")
+
+
+def provenance() -> dict[str, str]:
+    """Time, host and, if magpend runs from a git repository, its commit.
+
+    Returns
+    -------
+    dict
+        ``created`` (UTC, ISO 8601), ``host``, and ``git_commit``: 40 hexadecimal digits, followed by
+        ``+changes`` where files differ from the commit.
+    """
+    commit = git_commit()
+    return {
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "host": platform.node(),
+        **({"git_commit": commit} if commit else {}),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, of magpend and of the packages that its numbers and files go through."""
+    found = {"python": platform.python_version(), "machine": platform.machine()}
+    for name in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
+
+
+@lru_cache
+def git_commit() -> str:
+    """Commit of the repository that magpend's sources are part of; empty if there is none."""
+    # a package installed below somebody's repository is no part of it
+    if _git("ls-files", "--error-unmatch", str(Path(__file__).relative_to(_ROOT))) is None:
+        return ""
+    return _git("describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+changes") or ""
+
+
+def _git(*arguments: str) -> str | None:
+    """Output of a git command at magpend's sources; None if it fails."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(_ROOT), *arguments],
+            capture_output=True, text=True, check=True, timeout=_GIT_SECONDS,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

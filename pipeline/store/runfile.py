@@ -1,0 +1,119 @@
+"""``run.json``: what is run, under which digest, and which files the set-up wrote."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.layout.identity import canonical, digest_of
+from pipeline.layout.schema import FORMAT
+from pipeline.spec.parsing import Spec
+from pipeline.store.errors import DamagedError, RefusedError
+from pipeline.store.files import RUN_FILE, is_there, local_path, unreadable, write_atomically
+from pipeline.store.provenance import provenance, versions
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """What ``run.json`` holds.
+
+    Attributes
+    ----------
+    directory : Path
+    digest : str
+        Of `identity`.
+    identity : dict
+        What decides the numbers and the layout.
+    title : str
+    spec : dict
+        Plain data for `parse_spec`.
+    spec_text : str
+        The TOML file as it was.
+    versions : dict
+        Of the packages that made it.
+    provenance : dict
+        See `pipeline.store.provenance`.
+    skeleton : dict
+        Size and sha256 of the files written by the set-up.
+    """
+
+    directory: Path
+    digest: str
+    identity: dict[str, Any]
+    title: str
+    spec: dict[str, Any]
+    spec_text: str
+    versions: dict[str, str]
+    provenance: dict[str, str]
+    skeleton: dict[str, dict[str, Any]]
+
+
+def is_run(directory: Path) -> bool:
+    """Whether a run has been set up there."""
+    return is_there(directory / RUN_FILE)
+
+
+def read_run(directory: str | Path) -> RunInfo:
+    """Read ``run.json``.
+
+    Raises
+    ------
+    RefusedError
+        If there is none, or one of another format.
+    DamagedError
+        If it is not what was written.
+    """
+    directory = local_path(directory)
+    path = directory / RUN_FILE
+    if not is_run(directory):
+        raise RefusedError(f"{directory}: no run directory (it has no {RUN_FILE}).")
+    with unreadable(path):
+        content = path.read_bytes()
+    try:
+        data = json.loads(content)
+        found = data["identity"]["format"]
+        if isinstance(found, (int, float)) and found != FORMAT:
+            raise RefusedError(
+                f"{path}: format {found:g}, and this magpend reads {FORMAT}; read it with the version that "
+                f"made it ({data['versions'].get('magpend', 'not named')}), or run its specification "
+                "into another directory."
+            )
+        info = RunInfo(directory=directory, **data)
+        fits = digest_of(info.identity) == info.digest
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DamagedError(f"{path}: damaged ({error}); {_remedy(directory)}") from None
+    if not fits:
+        raise DamagedError(f"{path}: damaged (its digest does not fit); {_remedy(directory)}")
+    return info
+
+
+def _remedy(directory: Path) -> str:
+    return (
+        f"give the command that made it again (magpend run SPEC --out {directory}): "
+        "it is rebuilt, and what is committed stays."
+    )
+
+
+def write_run(
+    directory: Path,
+    spec: Spec,
+    identity: Mapping[str, Any],
+    spec_text: str,
+    skeleton: Mapping[str, Mapping[str, Any]],
+) -> RunInfo:
+    """Write ``run.json`` and return what it holds."""
+    content = {
+        "digest": digest_of(identity),
+        "identity": identity,
+        "title": spec.title,
+        "spec": spec.as_dict(),
+        "spec_text": spec_text,
+        "versions": versions(),
+        "provenance": provenance(),
+        "skeleton": skeleton,
+    }
+    write_atomically(directory / RUN_FILE, canonical(content))
+    return read_run(directory)

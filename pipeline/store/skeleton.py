@@ -1,0 +1,127 @@
+"""The files that a run's set-up writes: metadata of all variables, and the coordinates.
+
+They follow from the specification, the plan, the identity and the text alone, byte for byte, so that a
+damaged one can be made again.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.storage import MemoryStore
+
+from pipeline.layout.cells import Coordinate, coordinates
+from pipeline.layout.identity import digest_of
+from pipeline.layout.plan import Plan
+from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.spec.parsing import Spec
+from pipeline.store.arrays import create_array, write_whole
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import CUBE, entry_of, problems_of, refuse_links, sync, write_atomically
+from pipeline.store.runfile import RunInfo
+
+GROUP_KEY = "zarr.json"
+
+
+def skeleton_files(
+    spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str
+) -> dict[str, bytes]:
+    """Content by key of all files of an empty cube; the group's own metadata come first."""
+    attrs = {
+        "kind": plan.kind,
+        "model": spec.model_name,
+        "Conventions": "CF-1.11",
+        "title": title,
+        "spec": spec_text,
+        "digest": digest_of(identity),
+    }
+    found = [*coordinates(spec), *_labels(spec)]
+    data: dict[str, Any] = {}
+    store = MemoryStore(data)
+    names = " ".join(sorted(c.name for c in found if c.dims != (c.name,)))
+    group = zarr.create_group(store, zarr_format=3, attributes={**attrs, "coordinates": names})
+    for variable in plan.variables:
+        create_array(
+            group, variable.name, (*plan.dims, *variable.own_dims),
+            (*plan.shape, *plan.chunks(variable)[len(plan.shape) :]),
+            plan.chunks(variable), variable.dtype, variable.fill, variable.attributes(),
+        )  # fmt: skip
+    for coordinate in found:
+        write_whole(group, coordinate.name, coordinate.dims, np.asarray(coordinate.values), coordinate.attrs)
+    with warnings.catch_warnings():
+        # readers without this key ignore it; with it xarray opens the cube without a warning
+        warnings.filterwarnings("ignore", message="Consolidated metadata")
+        zarr.consolidate_metadata(store)
+    keys = sorted(data, key=lambda key: (key != GROUP_KEY, key))
+    return {key: data[key].to_bytes() for key in keys}
+
+
+def _labels(spec: Spec) -> list[Coordinate]:
+    """Names along the dims that are not cell dims."""
+    model = spec.model
+    found = [
+        Coordinate("state", ("state",), _values(model.state_names), {"long_name": "component of the state"}),
+        Coordinate(
+            "state_units", ("state",), _values(model.state_units), {"long_name": "unit of the component"}
+        ),
+    ]
+    if model.angles:
+        dim = model.angle_dim
+        found.append(Coordinate(dim, (dim,), _values(model.angles), {"long_name": "by its angle"}))
+    for name, options in spec.products.items():
+        for dim, values in CELL_PRODUCTS[name].coordinates(options, model).items():
+            found.append(Coordinate(dim, (dim,), _values(values)))
+    return found
+
+
+def _values(labels: Iterable[Any]) -> np.ndarray:
+    """Words, or whole numbers."""
+    values = list(labels)
+    return np.array(values, dtype=object if isinstance(values[0], str) else np.int32)
+
+
+def entries_of(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
+    """Size and sha256 by key, for ``run.json``."""
+    return {key: entry_of(content) for key, content in files.items()}
+
+
+def write_skeleton(directory: Path, files: Mapping[str, bytes], keys: Iterable[str]) -> None:
+    """Write some of the skeleton's files, each whole or not at all, in the order given."""
+    cube = directory / CUBE
+    cube.mkdir(parents=True, exist_ok=True)
+    written = []
+    for key in keys:
+        path = cube / key
+        path.parent.mkdir(exist_ok=True)
+        write_atomically(path, files[key])
+        written.append(path)
+    sync(written, directory)
+
+
+def skeleton_problems(info: RunInfo) -> list[str]:
+    """A line per file of the set-up that is not what was written."""
+    cube = info.directory / CUBE
+    refuse_links(cube, *(cube / folder for folder in {key.partition("/")[0] for key in info.skeleton}))
+    return problems_of(cube, info.skeleton)
+
+
+def check_skeleton(info: RunInfo) -> None:
+    """Compare metadata and coordinates with the digests in ``run.json``; reads no cell.
+
+    Raises
+    ------
+    DamagedError
+        Naming the files and the remedy.
+    """
+    problems = skeleton_problems(info)
+    if problems:
+        more = f" (and {len(problems) - 3} more)" if len(problems) > 3 else ""
+        raise DamagedError(
+            f"{info.directory / CUBE}: {'; '.join(problems[:3])}{more}. These files follow from the "
+            f"specification: rebuild them with: magpend verify --repair {info.directory}"
+        )
