@@ -15,13 +15,9 @@ if TYPE_CHECKING:
 
 def identified(run: Run, options: IdentifyOptions) -> xr.Dataset:
     """Attractors of each parameter point by itself: all that integrates."""
-    from pipeline.analysis.attractors.attractors import Rule, identify
+    from pipeline.analysis.attractors.attractors import identify
 
-    plain = options.plain()
-    rule = {name.removeprefix("rule_"): plain.pop(name) for name in list(plain) if name.startswith("rule_")}
-    if not plain["tolerance"]:
-        del plain["tolerance"]
-    return identify(run.cube(), rule=Rule(**rule), **plain)
+    return identify(run.cube(), options)
 
 
 def attractors(run: Any, options: AttractorOptions) -> xr.Dataset:
@@ -67,11 +63,7 @@ def settling(run: Any, options: SettlingOptions) -> xr.Dataset:
     from pipeline.analysis.attractors.lifetimes import lifetimes
 
     found = run.derive("attractors", **options.part(AttractorOptions))
-    return lifetimes(
-        run.cube(), found, n_sample=options.n_sample, n_periods=options.n_periods,
-        confidence=options.confidence, max_orbit_period=options.max_orbit_period, residual=options.residual,
-        rtol=options.rtol, atol=options.atol,
-    )  # fmt: skip
+    return lifetimes(run.cube(), found, options)
 
 
 def settling_table(ds: xr.Dataset) -> Table:
