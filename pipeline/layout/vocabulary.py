@@ -12,6 +12,7 @@ from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from magpend_core.status import Status
+from magpend_core.status import Status
 from pipeline.spec.tables import FREQUENCY
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ BRANCH, START = "branch", "initial_condition"
 ABSENT, CLOSED_ORBIT, BOUNDED_SET = range(3)
 """Values of `kind`, see `pipeline.analysis.attractors`."""
 
-PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = map(int, Status)
+PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = Status
 
 FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED)
 """What became of cells that could not be integrated to the end."""
