@@ -191,7 +191,7 @@ def plot_dimension(ds: xr.Dataset) -> style.DataFigure:
     Parameters
     ----------
     ds
-        Result of `pipeline.analysis.chaos.indicators.correlation_dimension` for one set of points, or of
+        Result of `pipeline.analysis.chaos.dimensions.correlation_dimension` for one set of points, or of
         `pipeline.analysis.chaos.chaos.section_dimension` for one parameter point.
 
     Returns
