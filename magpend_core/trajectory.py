@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from magpend_core.engine.checks import check_system
 from magpend_core.engine.entry import check_tolerances, slack_of
-from magpend_core.engine.jit import OPTIONS, kernel, specialise
+from magpend_core.engine.jit import OPTIONS, is_covered, kernel, specialise
 from magpend_core.engine.lanes import (
     DIVERGED,
     FIRST_STEP,
@@ -118,7 +119,7 @@ def _follower(system: System) -> Callable[..., int]:
     bindings = engine_bindings(system, RECORD_LAST)
     for template in (prepare, fill):
         bindings[template.__name__] = njit(**OPTIONS)(specialise(template, system.label, **bindings))
-    return kernel(specialise(follow, system.label, **bindings))
+    return kernel(specialise(follow, system.label, **bindings), is_covered(*system.functions))
 
 
 def trajectory(
@@ -170,11 +171,11 @@ def trajectory(
         raise ValueError("times must start at 0 or later and rise from entry to entry.")
     rtol, atol = check_tolerances(rtol, atol)
     attempts = check_count("max_steps_per_period", max_steps_per_period, 1)
+    packed = parameters.pack()
+    check_system(system, packed[None], np.array([frequency]), state[None])
     out = np.empty((len(grid), system.n_states))
     slack = slack_of(rtol, atol)
-    code = _follower(system)(
-        frequency, parameters.pack(), state, grid, rtol, atol, slack, float(attempts), out
-    )
+    code = _follower(system)(frequency, packed, state, grid, rtol, atol, slack, float(attempts), out)
     if code:
         raise ArithmeticError(f"The trajectory ended early: {Status(code).sentence}.")
     return out

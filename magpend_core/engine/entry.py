@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.engine.checks import check_system
 from magpend_core.engine.lanes import Cells, engine_of
 from magpend_core.engine.observers import Observer
 from magpend_core.engine.system import System
@@ -94,6 +95,8 @@ def integrate(
     ------
     ValueError
         If an argument has the wrong shape or is out of bounds.
+    SystemCheckError
+        If the system is not what it says (see `check_system`).
     """
     rtol, atol = check_tolerances(rtol, atol)
     attempts = float(check_count("max_steps_per_period", max_steps_per_period, 1))
@@ -112,6 +115,7 @@ def integrate(
     for name, array in (("initial_states", initial), ("step_size", first_step)):
         if len(array) != n_branches:
             raise ValueError(f"{name} has {len(array)} rows; frequency_hz has {n_branches} branches.")
+    check_system(system, packed, frequency, initial)
     per_cell = frequency.shape
     cells = Cells(
         frequency=frequency,

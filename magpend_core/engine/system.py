@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import namedtuple
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 
@@ -38,85 +39,139 @@ def positions(names: Iterable[str]) -> Any:
     return namedtuple("Positions", ordered)(*range(len(ordered)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class System:
     """A periodically forced system of ordinary differential equations, as compiled functions.
 
-    The functions of the hot path (`forcing`, `rhs`, `layers`) are decorated with `jit.inline` and
-    use arithmetic, `simd` and `vecmath` only: they are compiled for groups of lanes. `constants`
-    and `edges` run once per trajectory on plain numbers.
+    The functions of the hot path (`forcing`, `rhs`, `layers`, `jacobian`, `quantities`) are decorated with
+    `jit.inline` and use arithmetic, `simd` and `vecmath` only: they are compiled for groups of lanes, so that
+    a choice is `simd.where_less`, never an ``if``, and powers are products. They return tuples of fixed
+    length, of which each entry is a number per lane: what does not depend on the state is ``0.0 * x + 1.0``,
+    say. `constants` and `edges` run once per cell on plain numbers, where anything goes that numba compiles.
+
+    Before its first run a system is checked on plain numbers (see `checks.check_system`), so that what is
+    declared wrongly is an error by name and not a wrong number.
 
     Attributes
     ----------
     name : str
         One name, one set of functions: it names the compiled code.
     state_names : tuple of str
-    is_angle : tuple of bool
-        Which states live on a circle of 2 pi. They are brought back to (-pi, pi] at every section,
-        their full turns counted apart; `rhs` must not change under such a shift.
-    scales : tuple of float
-        Size of each state that counts as 1 when sections are compared.
     parameter_names : tuple of str
         Order of the packed parameter vector.
     n_constants : int
         Length of the vector that `constants` fills.
     constants : callable
         ``constants(frequency, p, out)``: from the drive frequency [Hz] and the packed parameters
-        `p` to what `forcing`, `rhs` and `layers` use.
+        `p` to what `forcing`, `rhs` and `layers` use; fills all of `out` with finite numbers.
     forcing : callable
         ``forcing(t, c)``: the explicit time dependence, a number, at time `t` [s] since the last
-        section; `c` is the tuple of constants.
+        section; `c` is the tuple of constants. It has the period 1/frequency. None for none: the system is
+        autonomous, and the period is the time between two looks at it.
     rhs : callable
         ``rhs(y, u, c)``: time derivatives as a tuple, from the states `y` and the forcing `u`.
+    jacobian : callable
+        ``jacobian(y, u, c)``: derivatives of `rhs` by the states, as one flat tuple, row by row. None if
+        neither exponents nor multipliers nor orbits are asked for.
+    is_angle : tuple of bool
+        Which states live on a circle of 2 pi; empty for none. They are brought back to (-pi, pi] at every
+        section, their full turns counted apart; `rhs` must not change under such a shift.
+    scales : tuple of float
+        Size of each state that counts as 1 when sections are compared; empty for 1.
+    escape : tuple of float
+        Bound on the absolute value of each state at a section; beyond it a trajectory has diverged. Empty
+        for none.
     n_edges : int
         Number of known instants per period at which the forcing switches.
     edges : callable
         ``edges(frequency, p, times, half_widths, jumps)``: fills the instants [s] in
         [0, 1/frequency), in rising order; for each the distance in time of the forcing's nearest
-        complex singularity [s]; and the change of the right-hand side across the edge.
+        complex singularity [s], above 0; and the change of the right-hand side across the edge.
     layers : callable
         ``layers(y, dy, c)``: a tuple of ``(value, rate, half_width, per_strength)``. Where `value`,
         which moves at `rate`, passes zero, the right-hand side changes quickly, and has its nearest
-        complex singularity at an imaginary part `half_width` of `value`. `per_strength` is
-        1/(half_width * jump), with the change of the right-hand side across the layer.
-    jacobian : callable
-        ``jacobian(y, u, c)``: derivatives of `rhs` by the states, as one flat tuple, row by row.
-    escape : tuple of float
-        Bound on the absolute value of each state at a section; beyond it a trajectory has diverged.
-    n_controlled : int or None
-        How many of the states, from the first, enter the error control; None for all.
+        complex singularity at an imaginary part `half_width` of `value`, above 0. `per_strength` is
+        1/(half_width * jump), with the change of the right-hand side across the layer. None for none.
     has_layers : bool
         False if there are none; then `layers` is never called.
+    n_controlled : int or None
+        How many of the states, from the first, enter the error control; None for all.
     quantity_names : tuple of str
     quantities : callable or None
         ``quantities(t, y, dy, u, c)``: a tuple of the named quantities at time `t` [s] since the last
         section, from the states, their rates, the forcing and the constants.
+    tangents_of : System or None
+        The system whose tangent vectors this one carries along (see `variational.with_tangents`).
+
+    Examples
+    --------
+    A damped oscillator, x'' + damping x' + x = cos(2 pi f t):
+
+    >>> from magpend_core.engine.jit import inline
+    >>> from magpend_core.engine.vecmath import TWO_PI, sincos
+    >>> @inline
+    ... def constants(frequency, p, out):
+    ...     out[0] = p[0]
+    ...     out[1] = TWO_PI * frequency
+    >>> @inline
+    ... def forcing(t, c):
+    ...     return sincos(c[1] * t)[1]
+    >>> @inline
+    ... def rhs(y, u, c):
+    ...     return y[1], u - c[0] * y[1] - y[0]
+    >>> system = System(
+    ...     name="oscillator", state_names=("x", "v"), parameter_names=("damping",),
+    ...     n_constants=2, constants=constants, forcing=forcing, rhs=rhs,
+    ... )
+    >>> system.n_states
+    2
     """
 
     name: str
     state_names: tuple[str, ...]
-    is_angle: tuple[bool, ...]
-    scales: tuple[float, ...]
     parameter_names: tuple[str, ...]
     n_constants: int
     constants: Callable[..., Any]
-    forcing: Callable[..., Any]
     rhs: Callable[..., Any]
-    n_edges: int
-    edges: Callable[..., Any]
-    layers: Callable[..., Any]
-    jacobian: Callable[..., Any]
-    escape: tuple[float, ...]
-    n_controlled: int | None = None
+    # None stands for a function that does nothing, put in place below: what is read is never None
+    forcing: Callable[..., Any] = None  # type: ignore[assignment]
+    jacobian: Callable[..., Any] | None = None
+    is_angle: tuple[bool, ...] = ()
+    scales: tuple[float, ...] = ()
+    escape: tuple[float, ...] = ()
+    n_edges: int = 0
+    edges: Callable[..., Any] = None  # type: ignore[assignment]
+    layers: Callable[..., Any] = None  # type: ignore[assignment]
     has_layers: bool = True
+    n_controlled: int | None = None
     quantity_names: tuple[str, ...] = ()
     quantities: Callable[..., Any] | None = None
+    tangents_of: System | None = field(default=None, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        from magpend_core.engine.absent import no_edges, no_forcing, no_layers  # brings the compiler
+
+        n = self.n_states
+        absent = {
+            "is_angle": (False,) * n, "scales": (1.0,) * n, "escape": (math.inf,) * n,
+            "forcing": no_forcing, "edges": no_edges, "layers": no_layers,
+        }  # fmt: skip
+        kinds = {
+            "state_names": str, "parameter_names": str, "quantity_names": str,
+            "is_angle": bool, "scales": float, "escape": float,
+        }  # fmt: skip
+        for name, kind in kinds.items():  # lists cannot be hashed, integers among numbers not be looped over
+            object.__setattr__(self, name, tuple(kind(value) for value in getattr(self, name)))
+        object.__setattr__(self, "has_layers", self.has_layers and self.layers is not None)
+        for name, value in absent.items():
+            if not getattr(self, name):
+                object.__setattr__(self, name, value)
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
         """All compiled functions."""
-        own = self.constants, self.forcing, self.rhs, self.edges, self.layers, self.jacobian
-        return own if self.quantities is None else (*own, self.quantities)
+        always = self.constants, self.forcing, self.rhs, self.edges, self.layers
+        return (*always, *(f for f in (self.jacobian, self.quantities) if f is not None))
 
     @property
     def label(self) -> str:

@@ -102,4 +102,7 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> S
         n_controlled=system.controlled,
         rhs=rhs,
         layers=layers,
+        quantity_names=(),
+        quantities=None,
+        tangents_of=system,
     )

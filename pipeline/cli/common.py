@@ -1,35 +1,35 @@
-"""What the commands share: options, the list of exit codes, and how bad input is reported."""
+"""What the commands share: arguments, the list of exit codes, tables for programs."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pipeline.cli.exits import Exit
 
+if TYPE_CHECKING:
+    from pipeline.products.product import Table
+
+UsageError: Any = typer.BadParameter.__base__
+"""What the command line raises for words that it does not know; typer brings its own copy of click."""
+
+CommandError: Any = UsageError.__base__
+
 EXIT_HELP = "Exit codes: " + "; ".join(f"{int(code)} {code.sentence}" for code in Exit) + "."
 
 Directory = Annotated[Path, typer.Argument(metavar="DIR", help="Run directory.")]
-
-
-@contextlib.contextmanager
-def refusals(directory: Path) -> Iterator[None]:
-    """Say what is wrong with a cube or an option instead of failing with a trace."""
-    from pipeline.spec.problems import SpecError
-    from pipeline.store.errors import DamagedError
-
-    try:
-        yield
-    except ValueError as error:
-        if "checksum" in str(error).lower():
-            raise DamagedError(
-                f"{directory}: a chunk is damaged; look with: magpend verify {directory}"
-            ) from None
-        raise SpecError([f"{directory}: {error}"]) from None
+Csv = Annotated[
+    str | None,
+    typer.Option("--csv", metavar="FILE", help="Write the table as CSV; - writes it to the standard output."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Write the table as JSON to the standard output.")]
 
 
 def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
@@ -46,3 +46,45 @@ def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
     if problems:
         raise SpecError(problems)
     return found
+
+
+def check_csv(path: str | None) -> None:
+    """Refuse a table that cannot be written, before anything is computed."""
+    from pipeline.spec.problems import SpecError
+
+    if path not in (None, "-") and (Path(str(path)).is_dir() or not Path(str(path)).parent.is_dir()):
+        raise SpecError([f"--csv {path}: must be a file in a folder that exists."])
+
+
+def tell(table: Table, csv: str | None, as_json: bool) -> None:
+    """Print a table: its lines for people, or its rows for programs alone."""
+    from pipeline.cli import console
+
+    if as_json:
+        rows = [{name: _json(value) for name, value in row.items()} for row in table.rows]
+        console.result(json.dumps(rows, indent=1))
+    elif csv == "-":
+        text = io.StringIO()
+        write_csv(table.rows, text)
+        console.result(text.getvalue().rstrip("\n"))
+    else:
+        for line in table.lines:
+            console.result(line)
+    if csv not in (None, "-"):
+        with Path(str(csv)).open("w", newline="", encoding="utf-8") as file:
+            write_csv(table.rows, file)
+        console.note(f"table: {csv}")
+
+
+def write_csv(rows: Sequence[Mapping[str, Any]], file: Any) -> None:
+    """Write rows as CSV, NaN as empty fields."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    writer = csv.DictWriter(file, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in rows)
+
+
+def _json(value: Any) -> Any:
+    """NaN and infinity are no JSON; numbers of numpy are numbers."""
+    plain = value.item() if hasattr(value, "item") else value
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain

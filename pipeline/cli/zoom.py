@@ -8,81 +8,76 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cli.common import read_pairs
+from pipeline.cli.simulate import read_named
 
-
-def _range(what: str) -> Any:
-    return typer.Option(metavar="LOW HIGH", help=f"New range: {what}.")
-
-
-def _number(what: str) -> Any:
-    return typer.Option(min=2, help=f"Points of {what} alone.")
-
-
-Pair = tuple[float, float] | None
+_NUM = "num_"
 
 
 def zoom(
+    context: typer.Context,
     source: Annotated[
         str,
         typer.Argument(metavar="DIR|SPEC", help="A run directory, a TOML file, or a shipped workflow."),
     ],
     out: Annotated[Path, typer.Option(help="TOML file to write; an existing one is not overwritten.")],
-    psi1: Annotated[Pair, _range("initial angle of link 1 \\[rad]")] = None,
-    psi1_deg: Annotated[Pair, _range("the same in degrees")] = None,
-    psi2: Annotated[Pair, _range("initial angle of link 2 \\[rad]")] = None,
-    psi2_deg: Annotated[Pair, _range("the same in degrees")] = None,
-    psi1_dot: Annotated[Pair, _range("initial rate of link 1 \\[rad/s]")] = None,
-    psi1_dot_deg: Annotated[Pair, _range("the same in degrees/s")] = None,
-    psi2_dot: Annotated[Pair, _range("initial rate of link 2 \\[rad/s]")] = None,
-    psi2_dot_deg: Annotated[Pair, _range("the same in degrees/s")] = None,
-    frequency_hz: Annotated[Pair, _range("drive frequency \\[Hz]")] = None,
     axis: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=LOW:HIGH[:NUM]", help="New range of a parameter, by name, SI units."),
+        typer.Option(metavar="NAME=LOW:HIGH[:NUM]", help="New range of a parameter or state, by name."),
     ] = None,
     at: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="One value of a parameter, frequency_hz or a state's key."),
+        typer.Option(metavar="NAME=VALUE", help="One value of a parameter, the frequency or a state."),
     ] = None,
     num: Annotated[
         int | None,
         typer.Option(min=2, help="Points of every new range; by default as many as before."),
     ] = None,
-    num_psi1: Annotated[int | None, _number("psi1")] = None,
-    num_psi2: Annotated[int | None, _number("psi2")] = None,
-    num_psi1_dot: Annotated[int | None, _number("psi1_dot")] = None,
-    num_psi2_dot: Annotated[int | None, _number("psi2_dot")] = None,
-    num_frequency_hz: Annotated[int | None, _number("frequency_hz")] = None,
     samples: Annotated[int | None, typer.Option(min=1, help="Number of random initial states.")] = None,
 ) -> None:
     """Write a new specification with narrower ranges; everything else stays as it was.
 
-    It is validated before it is written. Run it with: magpend run OUT
+    New ranges are given by name, with two numbers: --frequency 2.1 2.3 [Hz], --NAME LOW HIGH of a state or
+    a parameter, --NAME-deg LOW HIGH of an angle; --num-NAME N gives a range its own number of points. The
+    new specification is validated before it is written. Run it with: magpend run OUT
     """
+    from pipeline.cli import console
+    from pipeline.layout.vocabulary import parameter_name
     from pipeline.runs.zoom import Changes, read_source, write_zoom
 
-    ranges = {
-        "psi1": psi1, "psi1_deg": psi1_deg, "psi2": psi2, "psi2_deg": psi2_deg, "psi1_dot": psi1_dot,
-        "psi1_dot_deg": psi1_dot_deg, "psi2_dot": psi2_dot, "psi2_dot_deg": psi2_dot_deg,
-        "frequency_hz": frequency_hz,
-    }  # fmt: skip
-    nums = {
-        "psi1": num_psi1, "psi2": num_psi2, "psi1_dot": num_psi1_dot, "psi2_dot": num_psi2_dot,
-        "frequency_hz": num_frequency_hz,
-    }  # fmt: skip
-    given = {key: pair for key, pair in ranges.items() if pair is not None}
-    points = {key: n for key, n in nums.items() if n is not None}
-    more, more_points = _axes(axis or [])
+    ranges, nums = _named(context.args)
+    more, more_nums = _axes(axis or [])
+    pins = read_pairs("--at", at or [], "frequency=2.2")
     changes = Changes(
-        {**given, **more},
-        read_pairs("--at", at or [], "frequency_hz=2.2"),
+        {parameter_name(name): pair for name, pair in {**ranges, **more}.items()},
+        {parameter_name(name): value for name, value in pins.items()},
         num,
-        {**points, **more_points},
+        {parameter_name(name): n for name, n in {**nums, **more_nums}.items()},
         samples,
     )
-    for note in write_zoom(read_source(source), changes, out):
-        typer.echo(f"note: {note}")
-    typer.echo(f"specification: {out}")
+    for line in write_zoom(read_source(source), changes, out):
+        console.note(f"note: {line}")
+    console.result(f"specification: {out}")
+
+
+def _named(words: list[str]) -> tuple[dict[str, Any], dict[str, int]]:
+    """Read ``--NAME LOW HIGH`` and ``--num-NAME N``."""
+    from pipeline.spec.problems import SpecError
+
+    numbered: list[str] = []
+    ranged: list[str] = []
+    into = ranged
+    for word in words:
+        if word.startswith("--"):
+            into = numbered if word.startswith("--num-") else ranged
+        into.append(word)
+    problems, nums = [], {}
+    for name, (n,) in read_named(numbered, 1).items():
+        if n != int(n) or n < 2:
+            problems.append(f"--{name.replace('_', '-')} {n:g}: must be a whole number, 2 or more.")
+        nums[name.removeprefix(_NUM)] = int(n)
+    if problems:
+        raise SpecError(problems)
+    return read_named(ranged, 2), nums
 
 
 def _axes(texts: list[str]) -> tuple[dict[str, tuple[float, float]], dict[str, int]]:

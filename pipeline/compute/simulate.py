@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from magpend_core.models import load_model
-from pipeline.spec.problems import SpecError
+from magpend_core.models import DEFAULT, load_model
+from magpend_core.models.model import Model
+from pipeline.spec.problems import SpecError, unknown_name
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magpend_core.models.parameters import Parameters
+
 SUFFIXES = (".csv", ".nc")
-STATES, STATE_UNITS = load_model().state_names, load_model().state_units
 MAX_SAMPLES = 100_000_000
-_NAMES = ("angle of link 1", "angle of link 2", "rate of link 1", "rate of link 2")
+DEGREES = "_deg"
 
 
 def simulate(
     frequency_hz: float,
     initial_state: Sequence[float],
     *,
-    preset: str = "wojna2018",
+    model: str = DEFAULT,
+    preset: str | None = None,
     overrides: Mapping[str, float] | None = None,
     n_transient: int = 0,
     n_periods: int = 10,
@@ -33,16 +37,18 @@ def simulate(
     rtol: float = 1e-8,
     atol: float = 1e-8,
 ) -> xr.Dataset:
-    """Integrate one trajectory from a rising edge of the drive.
+    """Integrate one trajectory from the instant of a section.
 
     Parameters
     ----------
     frequency_hz
         Drive frequency [Hz].
     initial_state
-        psi1, psi2 [rad], psi1_dot, psi2_dot [rad/s] at time 0.
+        The model's states at time 0, in their units.
+    model
+        Name of a model, see `magpend_core.load_model`.
     preset, overrides
-        Parameters by name, see `magpend_core.load_preset`.
+        Parameters by name, see `magpend_core.models.model.Model.load`.
     n_transient
         Drive periods before the series begins.
     n_periods, samples_per_period
@@ -53,8 +59,8 @@ def simulate(
     Returns
     -------
     xarray.Dataset
-        The states and the drive's ``torque`` over ``time`` [s since the first rising edge]; angles are
-        not wrapped.
+        The states and the model's quantities over ``time`` [s since the first section]; angles are not
+        wrapped.
 
     Raises
     ------
@@ -63,13 +69,14 @@ def simulate(
     ArithmeticError
         If the trajectory diverges or meets the step limit.
     """
-    import xarray as xr
+    from magpend_core import trajectory
+    from magpend_core.models.parameters import ParameterError
 
-    from magpend_core import ParameterError, load_preset, torques, trajectory
-
-    problems = _problems(frequency_hz, initial_state, n_transient, n_periods, samples_per_period, rtol, atol)
+    chosen = load_model(model)
+    problems = _problems(frequency_hz, n_transient, n_periods, samples_per_period, rtol, atol)
+    problems += _state_problems(chosen, initial_state)
     try:
-        parameters = load_preset(preset, **(overrides or {}))
+        parameters = chosen.load(preset, **(overrides or {}))
     except ParameterError as error:
         problems += error.problems
     if problems:
@@ -78,29 +85,82 @@ def simulate(
     time = (n_transient + np.arange(count) / samples_per_period) / frequency_hz
     state = np.array(initial_state, dtype=np.float64)
     series = trajectory(parameters, frequency_hz, state, time, rtol=rtol, atol=atol)
-    drive = torques(time, series, parameters, frequency_hz).drive
+    ds = _labelled(parameters, frequency_hz, time, series)
+    return ds.assign_attrs(initial_state=state, n_transient=n_transient, rtol=rtol, atol=atol)
+
+
+def _labelled(
+    parameters: Parameters, frequency_hz: float, time: np.ndarray, series: np.ndarray
+) -> xr.Dataset:
+    """States and quantities of a series, with names, units and what was integrated."""
+    import xarray as xr
+
+    from magpend_core import evaluate
+
+    model = parameters.model
     variables: dict[str, Any] = {
-        name: ("time", series[:, i], {"units": STATE_UNITS[i], "long_name": _NAMES[i]})
-        for i, name in enumerate(STATES)
+        s.name: ("time", series[:, i], {"units": s.unit, "long_name": s.meaning})
+        for i, s in enumerate(model.states)
     }
-    variables["torque"] = ("time", np.asarray(drive), {"units": "N m", "long_name": "driving torque"})
-    axis = ("time", time, {"units": "s", "long_name": "time since the first rising edge of the drive"})
+    if model.quantities:
+        names = [q.name for q in model.quantities]
+        values = evaluate(names, time, series, parameters, frequency_hz)
+        for i, q in enumerate(model.quantities):
+            variables[q.name] = ("time", values[:, i], {"units": q.unit, "long_name": q.meaning})
+    axis = ("time", time, {"units": "s", "long_name": f"time since {model.section}"})
     attrs = {
-        "title": "trajectory of the forced double pendulum",
+        "title": f"trajectory of the {model.title}",
+        "model": model.name,
+        "parameters": "\n".join(f"{name} = {value!r}" for name, value in parameters.as_dict().items()),
         "frequency_hz": float(frequency_hz),
-        "initial_state": state,
-        "n_transient": n_transient,
-        "rtol": rtol,
-        "atol": atol,
-        "preset": preset,
-        **{f"parameter_{name}": value for name, value in parameters.as_dict().items()},
     }
     return xr.Dataset(variables, coords={"time": axis}, attrs=attrs)
 
 
+def start_of(model: str, given: Mapping[str, float]) -> tuple[float, ...]:
+    """Initial state of a model from values by name: a state's, or an angle's or rate's in degrees.
+
+    Parameters
+    ----------
+    model
+        Its name.
+    given
+        By name: ``x``, or ``x_deg`` of a state in rad or rad/s; the others are 0.
+
+    Raises
+    ------
+    SpecError
+        If a name is unknown, or a state is given twice.
+    """
+    found = load_model(model)
+    in_degrees = [f"{s.name}{DEGREES}" for s in found.states if s.unit.startswith("rad")]
+    problems, values = [], dict.fromkeys(found.state_names, 0.0)
+    for name, value in given.items():
+        plain = name.removesuffix(DEGREES) if name in in_degrees else name
+        if plain not in values:
+            problems.append(unknown_name(f"state of {model}", name, (*found.state_names, *in_degrees)))
+        elif plain != name and plain in given:
+            problems.append(f"{plain} and {name} are both given; keep one.")
+        else:
+            values[plain] = math.radians(value) if plain != name else value
+    if problems:
+        raise SpecError(problems)
+    return tuple(values.values())
+
+
+def _state_problems(model: Model, state: Sequence[float]) -> list[str]:
+    names = model.state_names
+    if len(state) != len(names):
+        return [f"initial_state has {len(state)} numbers: {model.name} has the states {', '.join(names)}."]
+    return [
+        f"{name} = {value!r}: must be a finite number."
+        for name, value in zip(names, state, strict=True)
+        if not math.isfinite(value)
+    ]
+
+
 def _problems(
     frequency_hz: float,
-    state: Sequence[float],
     n_transient: int,
     n_periods: int,
     samples: int,
@@ -113,11 +173,6 @@ def _problems(
             found.append(f"{name} = {value!r}: must be a finite number greater than 0.")
     if 0 < rtol < 1e-13:
         found.append(f"rtol = {rtol!r}: must be at least 1e-13.")
-    found += [
-        f"{n} = {v!r}: must be a finite number."
-        for n, v in zip(STATES, state, strict=True)
-        if not math.isfinite(v)
-    ]
     for name, number, least in (
         ("n_transient", n_transient, 0), ("n_periods", n_periods, 1), ("samples_per_period", samples, 1),
     ):  # fmt: skip
@@ -144,8 +199,8 @@ def write_series(ds: xr.Dataset, path: Path) -> Path:
     if path.suffix.lower() == ".nc":
         ds.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
         return path
-    names = ["time", *STATES, "torque"]
-    units = [ds[name].attrs["units"].replace("/", "_per_").replace(" ", "_") for name in names]
+    names = ["time", *map(str, ds.data_vars)]
+    units = [re.sub(r"\W+", "_", ds[name].attrs["units"].replace("/", "_per_")) for name in names]
     table = np.column_stack([ds[name].values for name in names])
     header = ",".join(f"{name}_{unit}" for name, unit in zip(names, units, strict=True))
     np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.17g")

@@ -7,8 +7,8 @@ from pipeline.products.product import Analysis, Options, option
 _ROOM = "pipeline.analysis.attractors.product"
 
 
-class AttractorOptions(Options):
-    """How attractors are found, and how their ids are carried along the axes."""
+class IdentifyOptions(Options):
+    """How attractors are found."""
 
     tolerance: float = option(
         0.0,
@@ -30,8 +30,17 @@ class AttractorOptions(Options):
     )
     rule_n_anchors: int = option(192, "Bounded sets: cells compared with each other in a round.", ge=1)
     rule_n_rounds: int = option(4, "Bounded sets: rounds.", ge=1)
+
+
+class AttractorOptions(IdentifyOptions):
+    """How attractors are found, and how their ids are carried along the axes."""
+
     threshold: float = option(0.3, "Matching: largest distance between appearances of one id.", gt=0.0)
     look_back: int = option(3, "Matching: steps over which an id is remembered.", ge=1)
+    connect: bool = option(
+        True,
+        "Matching: follow closed orbits along the axes, which integrates; without it, ids rest on distance.",
+    )
 
 
 class SettlingOptions(AttractorOptions):
@@ -44,6 +53,13 @@ class SettlingOptions(AttractorOptions):
     atol: float = option(0.0, "Absolute tolerance; 0 takes that of the run.", ge=0.0)
 
 
+IDENTIFIED = Analysis(
+    "identified",
+    "Attractors of each parameter point by itself.",
+    IdentifyOptions,
+    compute=f"{_ROOM}:identified",
+)
+
 ATTRACTORS = Analysis(
     "attractors",
     """Find the attractors at every parameter point, and follow them along the axes.
@@ -53,6 +69,7 @@ ATTRACTORS = Analysis(
     AttractorOptions,
     compute=f"{_ROOM}:attractors",
     table=f"{_ROOM}:attractors_table",
+    builds_on=("identified",),
     figure="attractors",
 )
 

@@ -10,10 +10,17 @@ _ROOM = "pipeline.analysis.branches.product"
 class BranchOptions(Options):
     """Which orbits are followed, and how far."""
 
-    parameter: str = option("frequency_hz", "What is varied: frequency_hz, or a parameter's name.")
+    parameter: str = option("frequency_hz", "What is varied: frequency, or a parameter's name.")
     low: float | None = option(None, "Least value; by default what the run spans.", unit="SI", flag="--from")
     high: float | None = option(None, "Largest value; by default what the run spans.", unit="SI", flag="--to")
-    max_period: int = option(4, "Longest period of a branch.", unit="drive periods", ge=1, flag="--period")
+    max_period: int = option(
+        0,
+        "Longest period of a branch; 0 takes all orbits that attract cells, and doublings up to the longest "
+        "of them, at least up to 4.",
+        unit="drive periods",
+        ge=0,
+        flag="--period",
+    )
     generations: int = option(3, "How often branches that spring from branches are followed.", ge=0)
     recurrences: int = option(
         0, "Start also from orbits, up to this period, near close recurrences of bounded cells.", ge=0
@@ -23,7 +30,7 @@ class BranchOptions(Options):
 class CurveOptions(BranchOptions):
     """Which bifurcations are continued, in which plane."""
 
-    second: str = option(..., "Second parameter's name, such as q, or frequency_hz.")
+    second: str = option(..., "Second parameter's name, such as q, or frequency.")
     second_low: float = option(..., "Its least value.", unit="SI", flag="--second-from")
     second_high: float = option(..., "Its largest value.", unit="SI", flag="--second-to")
     curve_period: int = option(1, "Longest period of the orbits.", unit="drive periods", ge=1)
@@ -33,10 +40,11 @@ BRANCHES = Analysis(
     "branches",
     """Follow periodic orbits along a parameter, stable or not; locate and name their bifurcations.
 
-    Starts from the closed orbits that attract cells of the run.""",
+    Starts from the closed orbits that attract cells of the run. What was left out is listed, with how to
+    get it.""",
     BranchOptions,
     compute=f"{_ROOM}:branches",
-    table=f"{_ROOM}:branches_table",
+    table="pipeline.analysis.branches.table:branches_table",
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
@@ -49,7 +57,7 @@ CURVES = Analysis(
     Takes the points that `branches` locates.""",
     CurveOptions,
     compute=f"{_ROOM}:curves",
-    table=f"{_ROOM}:curves_table",
+    table="pipeline.analysis.branches.table:curves_table",
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",

@@ -61,6 +61,10 @@ class Options(BaseModel):
             if type(self).model_fields[name].is_required() or value != default_of(type(self), name)
         }
 
+    def part(self, model: type[Options]) -> dict[str, Any]:
+        """Options that another model has too, for the analysis that takes these."""
+        return {name: getattr(self, name) for name in model.model_fields}
+
 
 def default_of(model: type[Options], name: str) -> Any:
     """Default of an option as a JSON value, ``None`` if it is a required one."""
@@ -148,7 +152,8 @@ class Analysis:
         ``"module:function"``: ``compute(run, options)`` gives a Dataset. ``run.cube()`` is the cube,
         ``run.derive(name, **options)`` another analysis of the same cells.
     table : str
-        ``"module:function"``: ``table(ds)`` gives a `Table`.
+        ``"module:function"``: ``table(ds)`` gives a `Table`. Empty: a result that others build on, without
+        a command.
     needs : str
         ``"module:function"`` or empty: ``needs(run, options)`` raises ValueError with a sentence if the
         run does not have what the analysis takes; called before anything is computed.
@@ -168,7 +173,7 @@ class Analysis:
     help: str
     options: type[Options]
     compute: str
-    table: str
+    table: str = ""
     needs: str = ""
     settle: str = ""
     builds_on: tuple[str, ...] = ()
@@ -179,8 +184,10 @@ class Analysis:
 class FigureOptions(Options):
     """Options that every figure has."""
 
-    at: dict[str, float] = option(
-        {}, "Value of an axis that the figure has no room for; the nearest stored one is drawn and stated."
+    at: dict[str, float] = option({}, "Value of an axis that the figure has no room for.")
+    nearest: bool = option(
+        False,
+        "Take the nearest values that the axes have for --at, and say which; otherwise others are refused.",
     )
     degrees: bool = option(False, "Degrees instead of radians.")
     width: float = option(
@@ -194,7 +201,9 @@ class FigureOptions(Options):
     def label(self) -> str:
         """What the file's name says beside the figure's: options that are not as by default."""
         given = {name: value for name, value in self.changed().items() if name not in ("out", "format")}
-        return "".join(f"_{_words(name, value)}" for name, value in given.items())
+        first = [name for name in _SPEAKS_FOR_ITSELF if name in given]
+        order = [*first, *(name for name in given if name not in first)]
+        return "".join(f"_{_words(name, given[name])}" for name in order)
 
 
 class StateOptions(FigureOptions):
@@ -210,14 +219,15 @@ def _words(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return name if value else f"no_{name}"
     if isinstance(value, dict):
-        return "_".join(f"{key}_{number:g}" for key, number in value.items())
+        return "_".join(f"{key}_{_word(number)}" for key, number in value.items())
     if isinstance(value, list):
         return "_".join([name, *(_word(part) for part in value)])
     return _word(value) if name in _SPEAKS_FOR_ITSELF else f"{name}_{_word(value)}"
 
 
 def _word(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value).replace("/", "-")
+    # all digits: values that differ are other pictures
+    return f"{value:.15g}" if isinstance(value, float) else str(value).replace("/", "-")
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,7 @@ CELL_PRODUCTS: Registry[CellProduct] = Registry(
 ANALYSES: Registry[Analysis] = Registry(
     "analysis",
     {
+        "identified": "pipeline.products.attractors:IDENTIFIED",
         "attractors": "pipeline.products.attractors:ATTRACTORS",
         "basins": "pipeline.products.basins:BASINS",
         "hysteresis": "pipeline.products.attractors:HYSTERESIS",
@@ -58,12 +59,15 @@ ANALYSES: Registry[Analysis] = Registry(
     },
 )
 
+COMMANDS = tuple(name for name in ANALYSES if name != "identified")
+"""Analyses that have a table, and so a command."""
+
 FIGURES: Registry[Figure] = Registry(
     "figure",
     {
         name: f"pipeline.products.figures:{name.upper()}"
         for name in (
-            "bifurcation", "attractors", "gallery", "basins", "fractions", "regimes", "lyapunov",
+            "bifurcation", "section", "attractors", "gallery", "basins", "fractions", "regimes", "lyapunov",
             "convergence", "dimension", "branches", "multipliers", "curves",
         )
     },

@@ -7,7 +7,10 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
 
+from pipeline.products.reporting import is_heard, report
+
 LINE_EVERY_S = 10.0
+WORK = "computing cells"
 
 
 def duration(seconds: float) -> str:
@@ -31,7 +34,7 @@ def size(n_bytes: float) -> str:
 
 
 class Progress:
-    """Counts cells; use as a context manager.
+    """Counts cells; use as a context manager. Reports them to whoever listens, else shows them itself.
 
     Parameters
     ----------
@@ -59,11 +62,12 @@ class Progress:
         self._total, self._before, self._done = total, done, done
         self._echo, self._clock = echo, clock
         self._started = self._last_line = clock()
-        self._bar: Any = _bar(total, done) if terminal else None
+        self._bar: Any = _bar(total, done) if terminal and not is_heard() else None
 
     def __enter__(self) -> Self:
         if self._bar is not None:
             self._bar.start()
+        report(WORK, self._done, self._total)
         return self
 
     def __exit__(
@@ -75,7 +79,9 @@ class Progress:
     def add(self, cells: int) -> None:
         """Count finished cells."""
         self._done += cells
-        if self._bar is not None:
+        if is_heard():
+            report(WORK, self._done, self._total)
+        elif self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=self._done, rate=f"{self.rate():.0f} cells/s")
         elif self._clock() - self._last_line >= LINE_EVERY_S or self._done == self._total:
             self._last_line = self._clock()

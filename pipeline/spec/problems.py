@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
+
+M = TypeVar("M", bound=BaseModel)
 
 _TAG = "("
 """First character of the union tags in pydantic's locations, which are no part of the key path."""
@@ -39,6 +41,47 @@ def unknown_choice(path: str, value: Any, choices: Sequence[str]) -> str:
     near = difflib.get_close_matches(str(value), choices, n=1, cutoff=0.5)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return f"{path} = {value!r}: must be {' or '.join(repr(c) for c in choices)}.{hint}"
+
+
+def unknown_name(what: str, name: str, known: Iterable[str]) -> str:
+    """Sentence for a name that nothing has, with the nearest known ones."""
+    names = list(known)
+    near = difflib.get_close_matches(name, names, n=2, cutoff=0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(names)}."
+    return f"unknown {what} {name!r}; {hint}"
+
+
+def validated(model: type[M], values: Mapping[str, Any], prefix: str = "") -> M:
+    """Return a table of options, checked.
+
+    Parameters
+    ----------
+    model
+        What is to be validated.
+    values
+        By name, as people or programs give them: a whole number may stand as ``64.0``, a list for a tuple.
+    prefix
+        Dotted path of the table, for the messages.
+
+    Raises
+    ------
+    SpecError
+        Naming all that is wrong.
+    """
+    try:
+        return model.model_validate({name: _exact(model, name, value) for name, value in values.items()})
+    except ValidationError as error:
+        raise SpecError(problems_of(error, model, prefix)) from None
+
+
+def _exact(model: type[BaseModel], name: str, value: Any) -> Any:
+    """Spell a value as strict validation takes it."""
+    kind = model.model_fields[name].annotation if name in model.model_fields else None
+    if kind is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if isinstance(value, list) and "tuple" in str(kind):
+        return tuple(value)
+    return dict(value) if isinstance(value, Mapping) else value
 
 
 def problems_of(error: ValidationError, model: type[BaseModel], prefix: str) -> list[str]:

@@ -108,7 +108,9 @@ class GridStarts(_PerState):
     nested_model: ClassVar[type[BaseModel] | None] = Range
 
     kind: Literal["grid"]
-    refine: Annotated[int, AfterValidator(_power_of_two)] | None = None
+    refine: Annotated[int, AfterValidator(_power_of_two)] | None = Field(
+        None, description=f"Compute every so many-th cell first: one of {', '.join(map(str, STRIDES))}."
+    )
 
     @property
     def ranges(self) -> dict[str, Range]:
@@ -125,8 +127,8 @@ class ListStarts(Table):
     system: ClassVar[Model]
 
     kind: Literal["list"]
-    points: Rows | None = None
-    points_deg: Rows | None = None
+    points: Rows | None = Field(None, description="Rows of states in their units.")
+    points_deg: Rows | None = Field(None, description="Rows in degrees and degrees/s.")
 
     @model_validator(mode="after")
     def _rows(self) -> ListStarts:
@@ -159,8 +161,8 @@ class RandomStarts(_PerState):
     """``[initial_conditions] kind = "random"``: seeded uniform samples of a box ``[low, high]`` per state."""
 
     kind: Literal["random"]
-    n: Annotated[int, Field(ge=1, le=MAX_POINTS)]
-    seed: Annotated[int, Field(ge=0)] = 0
+    n: int = Field(ge=1, le=MAX_POINTS, description="Number of samples.")
+    seed: int = Field(0, ge=0, description="Seed of the samples.")
 
     @model_validator(mode="after")
     def _boxes(self) -> RandomStarts:

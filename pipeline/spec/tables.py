@@ -25,11 +25,15 @@ class Table(BaseModel):
 class Range(Table):
     """Values in rising order: ``start, stop, num``, or ``start, stop, step``, or ``values``."""
 
-    start: float | None = None
-    stop: float | None = None
-    num: Annotated[int, Field(ge=2, le=MAX_POINTS)] | None = None
-    step: Annotated[float, Field(gt=0)] | None = None
-    values: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] | None = None
+    start: float | None = Field(None, description="First value.")
+    stop: float | None = Field(None, description="Last value; with step, not passed.")
+    num: Annotated[int, Field(ge=2, le=MAX_POINTS)] | None = Field(
+        None, description="Number of evenly spaced values, both ends included."
+    )
+    step: Annotated[float, Field(gt=0)] | None = Field(None, description="Spacing, instead of num.")
+    values: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] | None = Field(
+        None, description="All values, instead of the others."
+    )
 
     @model_validator(mode="after")
     def _one_form(self) -> Range:
@@ -69,16 +73,18 @@ class Range(Table):
 class ParametersTable(Table):
     """``[parameters]``: the preset, what differs from it, and the frequency unless it is an axis."""
 
-    preset: str | None = None
-    overrides: dict[str, float] = {}
-    frequency_hz: Annotated[float, Field(gt=0)] | None = None
+    preset: str | None = Field(None, description="Preset of the model; by default its first.")
+    overrides: dict[str, float] = Field({}, description="Values by parameter name, SI units.")
+    frequency_hz: Annotated[float, Field(gt=0)] | None = Field(
+        None, description="Drive frequency [Hz], unless it is an axis."
+    )
 
 
 class Continuation(Table):
     """``[continuation]``: which axis the branches walk, and which way."""
 
-    path: str = FREQUENCY
-    direction: Literal["up", "down", "both"] = "up"
+    path: str = Field(FREQUENCY, description="Axis along which the branches walk.")
+    direction: Literal["up", "down", "both"] = Field("up", description="Which way they walk.")
 
     @property
     def directions(self) -> tuple[str, ...]:
@@ -89,17 +95,27 @@ class Continuation(Table):
 class Integration(Table):
     """``[integration]``: tolerances, and what is discarded and kept of each cell."""
 
-    rtol: Annotated[float, Field(ge=1e-13, lt=1)] = 1e-8
-    atol: Annotated[float, Field(gt=0, lt=1)] = 1e-8
-    n_transient: Annotated[int, Field(ge=0, le=100_000_000)] = 300
-    n_keep: Annotated[int, Field(ge=1, le=1_000_000)] = 60
-    max_steps_per_period: Annotated[int, Field(ge=1, le=1_000_000_000)] = 20_000
-    stop_when_closed: bool = False
-    closure_tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-6
-    max_orbit_period: Annotated[int, Field(ge=1, le=32_000)] = 16
+    rtol: float = Field(1e-8, ge=1e-13, lt=1, description="Relative tolerance of a step.")
+    atol: float = Field(1e-8, gt=0, lt=1, description="Absolute tolerance of a step, in the states' units.")
+    n_transient: int = Field(300, ge=0, le=100_000_000, description="Drive periods before sections are kept.")
+    n_keep: int = Field(60, ge=1, le=1_000_000, description="Sections kept, one per drive period.")
+    max_steps_per_period: int = Field(
+        20_000, ge=1, le=1_000_000_000, description="Attempted steps after which a cell is given up."
+    )
+    stop_when_closed: bool = Field(
+        False, description="Keep sections as soon as the orbit has closed, without waiting for n_transient."
+    )
+    closure_tolerance: float = Field(
+        1e-6, gt=0, lt=1, description="Scaled distance to a closed orbit below which a cell counts as closed."
+    )
+    max_orbit_period: int = Field(
+        16, ge=1, le=32_000, description="Longest period that is looked for [drive periods]."
+    )
 
 
 class Execution(Table):
     """``[execution]``: sizes of tasks. They decide the layout of the store, never the numbers."""
 
-    trajectories_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = None
+    trajectories_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
+        None, description="Cells or branches that a task takes; by default as fits its chunks and its time."
+    )

@@ -1,10 +1,26 @@
 """Ids that follow attractors along the swept parameters.
 
-A pass over what `identify` stored: it integrates nothing and can be repeated with other options.
+What an id is
+-------------
+An id is an attractor that varies continuously with the parameters: a branch of closed orbits over the
+parameters, stable wherever it is listed and perhaps unstable between, together with the orbits of twice the
+period that spring from it where a period doubling hands stability on. So
+
+* orbits that continuation connects have one id, however long the unstable part between them is (the chaotic
+  band inside of a branch, say); at a fold a branch turns back, and what lies beyond is another attractor;
+* an orbit of twice the period keeps the id of the one that it springs from, unless both attract at one
+  parameter point: attractors that coexist anywhere have different ids;
+* what no branch connects is held against each other by distance, like with like only: a bounded set never
+  takes the id of an orbit, nor an orbit that of another whose period no doubling relates, that moves on
+  another side, or that was followed to an end without meeting it.
+
+`match_basis` says for every appearance what its id rests on, nearest evidence first: a branch that was
+followed, a doubling, or distance alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,101 +28,236 @@ import numpy as np
 import xarray as xr
 from scipy.optimize import linear_sum_assignment
 
-from magpend_core.models.pendulum.systems import PENDULUM_FITTED
-from pipeline.analysis.sets import Geometry, hausdorff_distance, mean_distance, order_by_points
+from magpend_core.engine.system import System
+from magpend_core.models.parameters import Parameters
+from pipeline.analysis.attractors.connections import Connections, Place, connections, followable
+from pipeline.analysis.sets import Geometry, mean_distance, order_by_points
+from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of, parameters_of
 
 _PER_ATTRACTOR = "attractor"
 
-OTHER_FAMILY = 3.0
-"""Weight of the distance between orbits whose periods no doubling connects, or an orbit and a bounded set."""
+BASES = ("absent", "first_appearance", "branch", "doubling", "distance")
+"""Meanings of `match_basis`."""
+
+_, _FIRST, _BRANCH, _DOUBLING, _DISTANCE = range(len(BASES))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Seen:
-    """An attractor where it was last seen: one row of the stored features."""
+    """An attractor where it was seen: one row of the stored features."""
 
+    number: int
+    kind: int
+    period: int
+    side: int
     points: np.ndarray
     rotation: np.ndarray
-    family: int
+
+    @property
+    def family(self) -> int:
+        """Odd part of the period: 1, 2, 4 ... belong to one cascade; 0 for bounded sets."""
+        return self.period // (self.period & -self.period) if self.period else 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Rule:
+    """When distance may decide, and by how much."""
+
+    threshold: float
+    geometry: Geometry
+    neutral: frozenset[int]
+    known: Connections
+
+    def distance(self, axis: int, before: _Seen, here: _Seen) -> float:
+        """Distance of an appearance from an earlier one along an axis; infinite between unlike things."""
+        ends = (before.number, before.period), (here.number, here.period)
+        if not self._alike(before, here) or not self.known.may_be_one(axis, *ends):
+            return np.inf
+        turned = float(np.nan_to_num(np.abs(before.rotation - here.rotation)).max(initial=0.0))
+        return mean_distance(before.points, here.points, self.geometry) + turned
+
+    def _alike(self, a: _Seen, b: _Seen) -> bool:
+        sides = {a.side, b.side} - self.neutral
+        return a.kind == b.kind and a.family == b.family and len(sides) <= 1
 
 
 def match(
-    attractors: xr.Dataset, *, threshold: float = 0.3, look_back: int = 3, geometry: Geometry | None = None
+    attractors: xr.Dataset,
+    *,
+    threshold: float = 0.3,
+    look_back: int = 3,
+    connect: bool = True,
+    parameters: Parameters | np.ndarray | None = None,
+    system: System | None = None,
 ) -> xr.Dataset:
-    """Give attractors ids that follow them along the sweep.
+    """Give attractors ids that follow them along the sweep; the text of this module says what an id is.
 
-    The parameter points are taken in the order of their axes. At each, the attractors are assigned to
-    the ids seen at the neighbours: up to `look_back` steps back along each axis, each id by its nearest
-    such appearance. The assignment minimises the sum of the distances, a distance beyond the threshold
-    (and no partner at all) costing the threshold (Hungarian algorithm). The distance is the mean
-    distance of the stored points from those of the other set, the larger of both directions, plus the
-    difference of the mean rotations in turns per drive period. Between a closed orbit and a bounded set,
-    and between orbits whose periods no doubling connects (3 and 7, but not 3 and 6), it is three times
-    the largest distance instead of the mean one: narrow bands of chaos keep the id of the orbit that they
-    sprang from, an orbit inside of wide chaos does not get that of the chaos. What is not assigned within
-    the threshold gets the next new id; new ids at one point come in lexicographic order of the
-    attractors' least section points. So ids depend on the attractors alone.
+    Closed orbits are first connected by continuation (`pipeline.analysis.branches.connecting`). Then the
+    parameter points are taken in the order of their axes. At each, what is connected with nothing seen
+    before is assigned to the ids seen at the neighbours: up to `look_back` steps back along each axis, each
+    id by its nearest such appearance. The assignment minimises the sum of the distances, a distance beyond
+    the threshold (and no partner at all) costing the threshold (Hungarian algorithm). The distance is the
+    mean distance of the stored points from those of the other set, the larger of both directions, plus the
+    difference of the mean rotations in turns per drive period; unlike things are infinitely far apart. What
+    is not assigned within the threshold gets the next new id; new ids at one point come in lexicographic
+    order of the attractors' least section points. So ids depend on the attractors alone.
 
     Parameters
     ----------
     attractors
         Result of `identify`, or of `match`.
     threshold
-        Largest distance between two appearances of one id.
+        Largest distance between two appearances of one id that nothing but distance connects.
     look_back
-        Steps of each axis over which an id may be absent, plus one.
-    geometry
-        Of the states; by default the pendulum's.
+        Steps of each axis over which such an id may be absent, plus one.
+    connect
+        Whether to follow polished orbits along the axes, which integrates; without it, ids rest on distance.
+    parameters, system
+        What was integrated, as for `identify`; by default as the attributes say.
 
     Returns
     -------
     Dataset
-        As `attractors`; the dim `attractor` runs over the ids.
+        As `attractors`; the dim `attractor` runs over the ids. Besides, `match_basis`.
 
     Raises
     ------
     ValueError
-        If an option is out of bounds.
+        If an option is out of bounds, or orbits are to be followed and the parameters are missing.
     """
     if not threshold > 0.0:
         raise ValueError(f"threshold = {threshold!r} is out of bounds: it must be greater than 0.")
     if look_back < 1:
         raise ValueError(f"look_back = {look_back!r} is out of bounds: it must be 1 or more.")
-    geometry = geometry or Geometry.of(PENDULUM_FITTED)
     dims = tuple(str(d) for d in attractors["kind"].dims if d != _PER_ATTRACTOR)
     shape = tuple(attractors.sizes[d] for d in dims)
-    ids = np.full((*shape, attractors.sizes[_PER_ATTRACTOR]), -1, np.int64)
+    kinds = attractors["kind"].transpose(*dims, _PER_ATTRACTOR).values
+    places = [(index, int(row)) for index in np.ndindex(*shape) for row in np.flatnonzero(kinds[index] > 0)]
+    links = Connections.none(len(places))
+    if connect:
+        links = _connections(attractors, places, dims, parameters, system)
+    rule = _Rule(threshold, _geometry(attractors, system), _neutral(attractors), links)
+    ids = _Ids(shape, attractors.sizes[_PER_ATTRACTOR], places, rule)
     seen: dict[tuple[int, ...], dict[int, _Seen]] = {}
-    n_ids = 0
+    numbers: dict[tuple[int, ...], list[int]] = {}
+    for n, (index, _) in enumerate(places):
+        numbers.setdefault(index, []).append(n)
     for index in np.ndindex(*shape):
-        rows = np.flatnonzero(attractors["kind"].values[index] > 0)
-        here = [_seen(attractors, (*index, row)) for row in rows]
-        known = _known(seen, index, look_back)
-        given = _assign(here, known, threshold, geometry)
-        new = [i for i, given_id in enumerate(given) if given_id < 0]
-        for i in order_by_points([here[i].points for i in new], geometry):
-            given[new[i]] = n_ids
-            n_ids += 1
-        seen[index] = dict(zip(given, here, strict=True))
-        ids[(*index, rows)] = given
-    attrs = {**attractors.attrs, "matched": 1, "match_threshold": threshold, "match_look_back": look_back}
-    return _renumbered(attractors, ids, n_ids, dims).assign_attrs(attrs)
+        here = [_seen(attractors, n, places[n]) for n in numbers.get(index, [])]
+        seen[index] = ids.at(here, _known(seen, index, look_back))
+    attrs = {
+        **attractors.attrs, "matched": 1, "match_threshold": threshold, "match_look_back": look_back,
+        "match_connect": int(connect),
+    }  # fmt: skip
+    flags = {"flag_values": np.arange(len(BASES), dtype=np.int8), "flag_meanings": " ".join(BASES)}
+    about = {"units": "1", "long_name": "what the id rests on", **flags}
+    rows = attractors.assign(match_basis=((*dims, _PER_ATTRACTOR), ids.basis, about))
+    return _renumbered(rows, ids.ids, len(ids.taken), dims).assign_attrs(attrs)
 
 
-def _seen(attractors: xr.Dataset, at: tuple[Any, ...]) -> _Seen:
+def _connections(
+    attractors: xr.Dataset, places: Sequence[Place], dims: Sequence[str],
+    parameters: Parameters | np.ndarray | None, system: System | None,
+) -> Connections:  # fmt: skip
+    """Follow the closed orbits, if there are any that can be."""
+    if not dims or sum(followable(attractors, place) for place in places) < 2:
+        return Connections.none(len(places))
+    base = parameters_of(attractors) if parameters is None else parameters
+    if isinstance(base, Parameters):
+        system, packed = system or base.model.system, base.pack()
+    else:
+        packed = np.array(base, np.float64)
+    assert system is not None
+    frequency = attractors.coords.get(FREQUENCY_DIM)
+    fixed = float(frequency) if frequency is not None and not frequency.ndim else np.nan
+    return connections(attractors, places, dims, packed, fixed, system)
+
+
+def _geometry(attractors: xr.Dataset, system: System | None) -> Geometry:
+    """Of the given system's states, else the model's."""
+    told: Any = system or model_of(attractors)
+    return Geometry(told.is_angle, told.scales)
+
+
+def _neutral(attractors: xr.Dataset) -> frozenset[int]:
+    """Codes of `side` that say nothing of a motion."""
+    classifier = model_of(attractors).classifier
+    return frozenset(classifier.neutral if classifier else ())
+
+
+class _Ids:
+    """Ids as they are given, parameter point by parameter point.
+
+    Attributes
+    ----------
+    ids, basis : ndarray, (*parameter dims, row)
+        Of each appearance; -1 and 0 where there is none.
+    taken : list of set
+        Of each id the parameter points at which it is, or will be, listed.
+    """
+
+    def __init__(self, shape: tuple[int, ...], n_rows: int, places: Sequence[Place], rule: _Rule) -> None:
+        self.ids = np.full((*shape, n_rows), -1, np.int64)
+        self.basis = np.zeros(self.ids.shape, np.int8)
+        self.taken: list[set[tuple[int, ...]]] = []
+        self._places, self._rule = places, rule
+        self._group = [int(g) for g in rule.known.group]
+        self._branch = [int(b) for b in rule.known.branch]
+        self._where: dict[int, set[tuple[int, ...]]] = {}
+        for group, (index, _) in zip(self._group, places, strict=True):
+            self._where.setdefault(group, set()).add(index)
+        self._by_group: dict[int, int] = {}
+        self._met: set[int] = set()
+
+    def at(self, here: Sequence[_Seen], known: Mapping[int, list[tuple[int, _Seen]]]) -> dict[int, _Seen]:
+        """Give ids to the appearances at one point, the next one in order; returns them by id."""
+        free = [one for one in here if self._group[one.number] not in self._by_group]
+        for one in here:
+            if one not in free:
+                self._settle(one, _BRANCH if self._branch[one.number] in self._met else _DOUBLING)
+        for one, identity in zip(free, _assign(free, known, self._rule, self._has_room), strict=True):
+            if identity is not None:
+                self._give(one, identity)
+                self._settle(one, _DISTANCE)
+        new = [one for one in free if self._group[one.number] not in self._by_group]
+        for i in order_by_points([one.points for one in new], self._rule.geometry):
+            self.taken.append(set())
+            self._give(new[i], len(self.taken) - 1)
+            self._settle(new[i], _FIRST)
+        self._met |= {self._branch[one.number] for one in here}
+        return {self._by_group[self._group[one.number]]: one for one in here}
+
+    def _has_room(self, one: _Seen, identity: int) -> bool:
+        """Whether an id is listed nowhere where what is connected with an appearance is."""
+        return not self._where[self._group[one.number]] & self.taken[identity]
+
+    def _give(self, one: _Seen, identity: int) -> None:
+        group = self._group[one.number]
+        self._by_group[group] = identity
+        self.taken[identity] |= self._where[group]
+
+    def _settle(self, one: _Seen, basis: int) -> None:
+        index, row = self._places[one.number]
+        self.ids[(*index, row)] = self._by_group[self._group[one.number]]
+        self.basis[(*index, row)] = basis
+
+
+def _seen(attractors: xr.Dataset, number: int, place: Place) -> _Seen:
+    index, row = place
+    at = (*index, row)
     points = attractors["attractor_points"].values[at]
     points = points[np.isfinite(points).all(axis=-1)]
-    period = int(attractors["orbit_period"].values[at])
-    # periods p, 2p, 4p ... belong to one cascade: the odd part tells; 0 for bounded sets
-    family = period // (period & -period) if period else 0
-    return _Seen(points, attractors["rotation"].values[at], family)
+    side = int(attractors["side"].values[at]) if "side" in attractors else 0
+    rotation = attractors["rotation"].values[at] if "rotation" in attractors else np.zeros(0)
+    kind, period = (int(attractors[name].values[at]) for name in ("kind", "orbit_period"))
+    return _Seen(number, kind, period, side, points, rotation)
 
 
 def _known(
     seen: dict[tuple[int, ...], dict[int, _Seen]], index: tuple[int, ...], look_back: int
-) -> dict[int, list[_Seen]]:
-    """Appearances to hold against: of each id the nearest along each axis."""
-    known: dict[int, list[_Seen]] = {}
+) -> dict[int, list[tuple[int, _Seen]]]:
+    """Appearances to hold against: of each id the nearest along each axis, with the axis."""
+    known: dict[int, list[tuple[int, _Seen]]] = {}
     for axis in range(len(index)):
         along: dict[int, _Seen] = {}
         for step in range(1, min(look_back, index[axis]) + 1):
@@ -114,33 +265,33 @@ def _known(
             for identity, appearance in seen[back].items():
                 along.setdefault(identity, appearance)
         for identity, appearance in along.items():
-            known.setdefault(identity, []).append(appearance)
+            known.setdefault(identity, []).append((axis, appearance))
     return known
 
 
 def _assign(
-    here: list[_Seen], known: dict[int, list[_Seen]], threshold: float, geometry: Geometry
-) -> list[int]:
-    """Id of each attractor, -1 for a new one."""
-    given = [-1] * len(here)
+    here: Sequence[_Seen],
+    known: Mapping[int, list[tuple[int, _Seen]]],
+    rule: _Rule,
+    is_free: Callable[[_Seen, int], bool],
+) -> list[int | None]:
+    """Id of each attractor by distance, None for a new one."""
+    given: list[int | None] = [None] * len(here)
     if not here or not known:
         return given
     identities = sorted(known)
-    cost = np.array(
-        [[min(_distance(a, b, geometry) for b in known[identity]) for identity in identities] for a in here]
-    )
+
+    def cost_of(a: _Seen, identity: int) -> float:
+        if not is_free(a, identity):
+            return np.inf
+        return min(rule.distance(axis, b, a) for axis, b in known[identity])
+
+    cost = np.array([[cost_of(a, identity) for identity in identities] for a in here])
     # clipped, so that an assignment beyond the threshold is as good as none
-    for row, column in zip(*linear_sum_assignment(np.minimum(cost, threshold)), strict=True):
-        if cost[row, column] < threshold:
+    for row, column in zip(*linear_sum_assignment(np.minimum(cost, rule.threshold)), strict=True):
+        if cost[row, column] < rule.threshold:
             given[row] = identities[column]
     return given
-
-
-def _distance(a: _Seen, b: _Seen, geometry: Geometry) -> float:
-    turned = float(np.nan_to_num(np.abs(a.rotation - b.rotation)).max(initial=0.0))
-    if a.family == b.family:
-        return mean_distance(a.points, b.points, geometry) + turned
-    return OTHER_FAMILY * hausdorff_distance(a.points, b.points, geometry) + turned
 
 
 def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple[str, ...]) -> xr.Dataset:

@@ -1,14 +1,15 @@
 """Periodic orbits as branches along a parameter, and their bifurcations.
 
-    starts = attracting(attractors, parameters, "frequency_hz", 1.0, max_period=4)
+    starts, left_out = attracting(attractors, parameters, "frequency", (2.0, 3.0))
     branches = explore(starts, Scope(2.0, 3.0))
-    ds = dataset_of(branches, "frequency_hz", parameters)
+    ds = dataset_of(branches, "frequency", parameters, left_out)
 
 An orbit of period p is a fixed point of the p-fold stroboscopic map; its branch is followed by
 pseudo-arclength continuation, whether it is stable or not. `problems` has the equations, `lockstep`
 evaluates many of them in one call of the engine, `arclength` walks, `bifurcations` notices and locates,
 `following` makes one branch, `exploring` all that hang together, `curves` continues located points in two
-parameters. Everything but `starts` and the sides takes any `magpend_core.engine.system.System`.
+parameters. `connecting` says which orbits found along an axis lie on one branch. Any
+`magpend_core.engine.system.System` will do; names, units and the class of a motion are the model's.
 
 What is located
 ---------------
@@ -39,32 +40,28 @@ derivative jumps. What that means here:
   So the theory of smooth maps applies there, criticality included. Where orbits graze (more reversals at
   lower frequencies), test functions stay continuous, but may have a corner; a located point is then right
   and its criticality not to be trusted beyond what the doubled branch shows.
-* The integration does feel it. Tangent vectors meet a corner in the Jacobian inside a step, which leaves an
-  error in the multipliers that falls with the steps' squares only and that the error control does not see:
-  at 2.2 Hz 2e-7 to 8e-7 for tolerances from 1e-11 to 1e-13, against 1e-8 to 5e-10 with c0 = 0, which takes
-  the corner away. States agree to 4e-11 in either case. Differences of the map instead of tangents would
-  not help: they have the same error. By it the six doublings of period 1 between 2 and 2.6 Hz move by 2.2e-7
-  Hz or less as the tolerance goes from 1e-11 to 1e-13. That is their accuracy, not the bracket's width; a
-  point at which the critical multiplier changes slowly is less accurate in proportion. scipy's DOP853, with
-  differences of its own map, finds the critical multiplier of the six within 5e-7 of -1 there, and the
-  orbits closed to 5e-11.
+* The integration does feel it. Tangent vectors meet a corner in the Jacobian inside a step. So they are held
+  to the tolerance with the states; without that, doublings of period 1 were off by up to 2e-7 Hz.
 
 The dataset
 -----------
 Dims ``branch``, ``point`` (in the order along a branch), ``phase`` (section points of an orbit in the order
-of time), ``state``, ``multiplier`` (by falling modulus), ``bifurcation``, ``link``. Beyond a branch's own
-points and phases values are NaN, counts -1. Attributes ``parameter`` and ``parameter_units``.
+of time), ``state``, ``multiplier`` (by falling modulus), ``bifurcation``, and the model's dim of angles.
+Beyond a branch's own points and phases values are NaN, counts -1. ``side`` is there if the model has words
+for motions; parameters in which the branches differ are variables of their own name. Attributes
+``parameter``, ``parameter_units``, ``model``, and ``left_out``: a line for each attractor that was not
+followed.
 
 ================================= ======================== ===================================================
 variable                          dims                     meaning
 ================================= ======================== ===================================================
 ``parameter``                     branch, point            value of the parameter
-``section``                       branch, point, phase,    section points, angles wrapped [rad, rad/s]
+``section``                       branch, point, phase,    section points, angles wrapped
                                   state
 ``multiplier_real``, ``_imag``    branch, point,           Floquet multipliers over the orbit's period
                                   multiplier
 ``n_unstable``                    branch, point            multipliers outside the unit circle
-``side``                          branch, point            side of the magnet, from the whole orbit
+``side``                          branch, point            class of the motion, from the whole orbit
 ``residual``                      branch, point            scaled distance of the point from its image
 ``orbit_period``, ``n_points``    branch                   drive periods; points
 ``origin``                        branch                   bifurcation that it sprang from, -1 none
@@ -72,8 +69,8 @@ variable                          dims                     meaning
                                                            itself, on the orbit of half the period, after too
                                                            many points, stuck (Newton's method fails for the
                                                            shortest step), start (it sprang off there)
-``frequency_hz``                  branch                   drive frequency, NaN if that is the parameter
-``rotation``                      branch, link             mean turns per drive period
+``frequency``                     branch                   drive frequency, NaN if that is the parameter
+``rotation``                      branch, angle            mean turns per drive period
 ``kind``, ``value``, ``bracket``  bifurcation              what, where, between parameter values how far apart
 ``of_branch``, ``after``          bifurcation              its branch, and the point after which it comes
 ``to_branch``                     bifurcation              the other branch through it, -1 none or unknown
@@ -90,9 +87,10 @@ variable                          dims                     meaning
 """
 
 from pipeline.analysis.branches.curves import curves_dataset, curves_from
-from pipeline.analysis.branches.dataset import dataset_of, table_of, windows_of
+from pipeline.analysis.branches.dataset import dataset_of
 from pipeline.analysis.branches.exploring import Scope, Start, explore
 from pipeline.analysis.branches.starts import attracting, orbits_near, recurrent
+from pipeline.analysis.branches.table import table_of, windows_of
 
 __all__ = [
     "Scope",

@@ -9,13 +9,14 @@ from itertools import pairwise
 import numpy as np
 import xarray as xr
 
+from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Walk, correct, kernel_of, walk
 from pipeline.analysis.branches.bifurcations import KINDS, TORUS, multipliers_of
 from pipeline.analysis.branches.following import opposite
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, BifurcationProblem, Family
-from pipeline.analysis.branches.units import STATE_UNITS, units_of
+from pipeline.analysis.branches.units import parameter_units, state_units
 
 CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-8, max_iterations=8)
 """Steps are longer than on a branch, since nothing is looked for between; the residual, with that of the
@@ -88,7 +89,10 @@ def continue_curves(
         [_first(problem, u, settings) for problem, (_, _, _, u) in zip(problems, starts, strict=True)]
     )
     found = [(s, p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
-    walks = run_together([_follow(p, way, bounds, settings) for _, p, f in found for way in (opposite(f), f)])
+    walks = run_together(
+        [_follow(p, way, bounds, settings) for _, p, f in found for way in (opposite(f), f)],
+        "following curves",
+    )
     curves: list[Curve] = []
     for i, ((number, family, kind, _), _, first) in enumerate(found):
         back, ahead = walks[2 * i : 2 * i + 2]
@@ -114,16 +118,17 @@ def _starts(
         period, kind = int(ds["orbit_period"][branch]), KINDS[int(ds["kind"][k])]
         if period > max_period or kind not in TESTS:
             continue
-        frequency = float(ds["frequency_hz"][branch])
+        own = parameters.replace(**{n: float(ds[n][branch]) for n in parameters.names if n in ds})
+        frequency = float(ds[FREQUENCY][branch])
         family = Family(
             parameters.model.system,
             period,
             frequency,
-            parameters.pack(),
+            own.pack(),
             (first, second),
             (scales[0], scales[1]),
         )
-        here = frequency if second == FREQUENCY else parameters.as_dict()[second]
+        here = frequency if second == FREQUENCY else own[second]
         state = np.asarray(ds["bifurcation_section"].values[k, 0])
         found.append((k, family, kind, family.unknowns(state, [float(ds["value"][k]), here])))
     return found
@@ -191,11 +196,24 @@ def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
     return False
 
 
-def curves_dataset(curves: Sequence[Curve], first: str, second: str) -> xr.Dataset:
-    """Return curves as a dataset: dims ``curve``, ``point`` (NaN beyond a curve's own) and ``state``."""
+def curves_dataset(
+    curves: Sequence[Curve], first: str, second: str, model: Model | None = None
+) -> xr.Dataset:
+    """Return curves as a dataset: dims ``curve``, ``point`` (NaN beyond a curve's own) and ``state``.
+
+    Parameters
+    ----------
+    curves
+        From `curves_from`; if there are none, so are the dataset's.
+    first, second
+        Names of the two parameters.
+    model
+        Tells names and units.
+    """
+    names = curves[0].family.system.state_names if curves else (model.state_names if model else ())
     n = max((len(c.points) for c in curves), default=0)
     values = np.full((len(curves), n, 2), np.nan)
-    section = np.full((len(curves), n, curves[0].family.system.n_states if curves else 4), np.nan)
+    section = np.full((len(curves), n, len(names)), np.nan)
     residual = np.full((len(curves), n), np.nan)
     for i, curve in enumerate(curves):
         values[i, : len(curve.points)] = curve.values
@@ -204,7 +222,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str) -> xr.Datas
     kinds = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
     ends = {"flag_values": np.arange(len(CURVE_ENDS), dtype=np.int8), "flag_meanings": " ".join(CURVE_ENDS)}
     dims = ("curve", "point")
-    one = {"units": "1"}
+    one, units = {"units": "1"}, state_units(model)
 
     def codes(i: int) -> np.ndarray:
         return np.array([CURVE_ENDS.index(c.ends[i]) for c in curves], np.int8)
@@ -214,9 +232,9 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str) -> xr.Datas
 
     return xr.Dataset(
         {
-            "first": (dims, values[..., 0], {"units": units_of(first), "long_name": first}),
-            "second": (dims, values[..., 1], {"units": units_of(second), "long_name": second}),
-            "section": ((*dims, "state"), section, {"units": STATE_UNITS, "long_name": "a section point"}),
+            "first": (dims, values[..., 0], {"units": parameter_units(first, model), "long_name": first}),
+            "second": (dims, values[..., 1], {"units": parameter_units(second, model), "long_name": second}),
+            "section": ((*dims, "state"), section, {"units": units, "long_name": "a section point"}),
             "residual": (dims, residual, {**one, "long_name": "largest residual, test function included"}),
             "kind": ("curve", np.array([KINDS.index(c.kind) for c in curves], np.int8), {**one, **kinds}),
             "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
@@ -225,5 +243,6 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str) -> xr.Datas
             "first_end": ("curve", codes(0), {**one, **ends}),
             "last_end": ("curve", codes(1), {**one, **ends}),
         },
+        coords={"state": list(names)},
         attrs={"first_parameter": first, "second_parameter": second},
     )  # fmt: skip

@@ -15,14 +15,18 @@ from pipeline.analysis.branches.following import (
     doubled_start,
     first_point,
     half_branch,
+    half_orbit,
     joined,
     opposite,
 )
 from pipeline.analysis.branches.lockstep import Steps, run_together
-from pipeline.analysis.branches.problems import Family, OrbitProblem
+from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
 
 SAME = 1e-6
 """Scaled distance within which two orbits at one parameter value are the same."""
+
+FOLLOWING = "following branches"
+"""Name of the work in reports."""
 
 GUESS = 0.05
 """Scaled distance from the chord of a branch within which an orbit may lie on it."""
@@ -104,7 +108,8 @@ def _both_ways(starts: Sequence[Start], scope: Scope) -> list[Branch | None]:
             half_branch(family, way, scope.low, scope.high, scope.settings)
             for family, point in pairs
             for way in (opposite(point), point)
-        ]
+        ],
+        FOLLOWING,
     )
     found = iter(joined(family, *halves[2 * i : 2 * i + 2]) for i, (family, _) in enumerate(pairs))
     return [None if p is None else next(found) for p in firsts]
@@ -160,7 +165,7 @@ def _same_others(a: Family, b: Family) -> bool:
 
 def _fixed(family: Family) -> np.ndarray:
     values = np.append(family.parameters, family.frequency_hz)
-    names = (*family.system.parameter_names, "frequency_hz")
+    names = (*family.system.parameter_names, FREQUENCY)
     return np.array([v for n, v in zip(names, values, strict=True) if n not in family.free])
 
 
@@ -216,13 +221,8 @@ def _gap(family: Family, end: Point, one: Bifurcation) -> float:
 
 def _half_orbit(branch: Branch, which: int) -> Start:
     """The middle between the two halves of the orbit at the end of a branch."""
-    family, end = branch.family, branch.points[-which]
-    half = family.period // 2
-    step = family.mismatch(end.u, end.value.images[half - 1])
-    u = end.u.copy()
-    u[:-1] += 0.5 * step
-    single = replace(family, period=half)
-    return Start(single, single.state(u), float(single.values(u)[0]))
+    state, value = half_orbit(branch.family, branch.points[-which])
+    return Start(replace(branch.family, period=branch.family.period // 2), state, value)
 
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
@@ -256,7 +256,8 @@ def _switch(branches: list[Branch], scope: Scope) -> None:
                 True,
             )
             for b, _, start in ready
-        ]
+        ],
+        FOLLOWING,
     )
     for (parent, one, _), half in zip(ready, halves, strict=True):
         if len(half.walk.points) < 5 or one.child is not None:
@@ -281,7 +282,8 @@ def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch],
             [
                 crossing_half(parent.family, one, way, scope.low, scope.high, scope.settings)
                 for way in (-1.0, 1.0)
-            ]
+            ],
+            FOLLOWING,
         )
         child = joined(parent.family, *halves)
         if len(child.points) > 2:

@@ -65,7 +65,7 @@ class _Stop:
             return "bound"
         if self._is_closed(points):
             return "closed"
-        return "period_halving" if self._has_halved(points) else ""
+        return "period_halving" if len(points) > 2 and has_halved(self.family, points) else ""
 
     def _is_closed(self, points: list[Point]) -> bool:
         """Whether the last step passed the start, at any phase of the orbit."""
@@ -87,15 +87,24 @@ class _Stop:
         """Scaled unknowns of a state and parameter minus `u`."""
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
 
-    def _has_halved(self, points: list[Point]) -> bool:
-        """Whether the two halves of the orbit changed places: it passed the orbit of half the period."""
-        if self.family.period % 2 or len(points) < 3:
-            return False
-        before, here = (self._half_way(p) for p in points[-2:])
-        return bool(float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < 0.2)
 
-    def _half_way(self, point: Point) -> np.ndarray:
-        return self.family.mismatch(point.u, point.value.images[self.family.period // 2 - 1])
+def has_halved(family: Family, points: list[Point]) -> bool:
+    """Whether the two halves of the orbit changed places: it passed the orbit of half the period."""
+    if family.period % 2 or len(points) < 2:
+        return False
+    before, here = (_half_way(family, p) for p in points[-2:])
+    return bool(float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < 0.2)
+
+
+def _half_way(family: Family, point: Point) -> np.ndarray:
+    return family.mismatch(point.u, point.value.images[family.period // 2 - 1])
+
+
+def half_orbit(family: Family, point: Point) -> tuple[np.ndarray, float]:
+    """The middle between the two halves of an orbit: a state near the orbit of half the period; the value."""
+    u = point.u.copy()
+    u[:-1] += 0.5 * _half_way(family, point)
+    return family.state(u), float(family.values(u)[0])
 
 
 def first_point(problem: OrbitProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:

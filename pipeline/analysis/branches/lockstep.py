@@ -7,7 +7,8 @@ for little more than the price of one. The numbers of each are those that it wou
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+import dataclasses
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -18,6 +19,7 @@ from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.problems import RTOL, Ends, Problem, Rows, Value
+from pipeline.products.reporting import report
 
 T = TypeVar("T")
 
@@ -34,10 +36,15 @@ Steps = Generator[Query, Value, T]
 """A computation that returns a `T`."""
 
 
-def run_together(computations: Sequence[Steps[T]]) -> list[T]:
-    """Run computations to their ends and return their results, in their order."""
+def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
+    """Run computations to their ends and return their results, in their order.
+
+    With a name for the work it is reported how far it is. A walk's length is not known before its end: it
+    counts by the part of the parameter's interval that it has seen, up to nine tenths.
+    """
     results: list[T | None] = [None] * len(computations)
     waiting: dict[int, Query] = {}
+    seen: dict[int, tuple[float, float]] = {}
 
     def advance(i: int, value: Value | None) -> None:
         try:
@@ -51,7 +58,25 @@ def run_together(computations: Sequence[Steps[T]]) -> list[T]:
         queries, waiting = waiting, {}
         for i, value in zip(queries, _evaluate(list(queries.values())), strict=True):
             advance(i, value)
+        if what:
+            _report(what, queries, waiting, seen, len(computations))
     return results  # type: ignore[return-value]
+
+
+def _report(
+    what: str,
+    queries: Mapping[int, Query],
+    waiting: Iterable[int],
+    seen: dict[int, tuple[float, float]],
+    n: int,
+) -> None:
+    """Say how far computations are; `seen` has the range of the last unknown of those that go on."""
+    for i, query in queries.items():
+        last = float(query.u[-1])
+        low, high = seen.get(i, (last, last))
+        seen[i] = min(low, last), max(high, last)
+    going = [min(seen[i][1] - seen[i][0], 0.9) for i in waiting]
+    report(what, round(n - len(going) + sum(going), 1), n)
 
 
 def run_alone(computation: Steps[T]) -> T:
@@ -91,6 +116,9 @@ def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
     states = np.concatenate([r.states for r in rows])
     finite = np.isfinite(states).all(axis=1)
     identity = np.broadcast_to(np.eye(n).ravel(), (len(states), n * n))
+    # tangents in the error control: else a corner in the Jacobian leaves an error in the multipliers that
+    # the tolerance does not bound
+    extended = dataclasses.replace(with_tangents(system, n), n_controlled=None)
     result = run_branches(
         np.concatenate([r.parameters for r in rows])[:, None],
         np.concatenate([r.frequency_hz for r in rows])[:, None],
@@ -99,7 +127,7 @@ def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
         n_keep=max(r.period for r in rows),
         rtol=RTOL,
         atol=RTOL,
-        system=with_tangents(system, n),
+        system=extended,
     )
     section = result.section[:, 0]
     found, first = [], 0

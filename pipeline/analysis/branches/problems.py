@@ -16,8 +16,10 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import wrap_angles
+from pipeline.layout.vocabulary import FREQUENCY_DIM
 
-FREQUENCY = "frequency_hz"
+FREQUENCY = FREQUENCY_DIM
+"""Name of the drive frequency as a free parameter: that of its axis in a cube."""
 
 RTOL = 1e-12
 """Tolerance of the integrations."""

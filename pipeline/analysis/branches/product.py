@@ -1,91 +1,94 @@
-"""Branches of periodic orbits as a product of a run (see `pipeline.products.derived`)."""
+"""Branches and curves as analyses of a run (`pipeline.products.branches`)."""
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
-from pipeline.products.derived import Echo, Source, attractors, derive
-from pipeline.spec.problems import SpecError
-from pipeline.store.run import Run
+import xarray as xr
+
+from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, parameters_of
+from pipeline.products.branches import BranchOptions, CurveOptions
 
 if TYPE_CHECKING:
-    import xarray as xr
+    from pipeline.store.run import Run
+
+LEAST_PERIOD = 4
+"""Branches of twice the period are followed up to this one, however short the orbits of the run are."""
 
 
-def branches(
-    directory: Source,
-    *,
-    parameter: str = "frequency_hz",
-    low: float | None = None,
-    high: float | None = None,
-    max_period: int = 4,
-    generations: int = 3,
-    recurrences: int = 0,
-    echo: Echo | None = None,
-) -> xr.Dataset:
-    """Branches of periodic orbits along a parameter, from the orbits that attract a run's cells.
+def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
+    """Complete the interval from the run's axis; refuse an empty one."""
+    low, high = _interval(run, options.parameter, options.low, options.high)
+    return options.model_copy(update={"low": low, "high": high})
 
-    Parameters
-    ----------
-    directory
-        Run directory, or a `Run`.
-    parameter
-        ``frequency_hz`` or a parameter's name.
-    low, high
-        Interval of the parameter [SI]; by default what the run spans.
-    max_period
-        Longest period of a branch [drive periods].
-    generations
-        How often branches that spring from branches are followed.
-    recurrences
-        Longest period of the orbits looked for near close recurrences of bounded cells; 0 looks for none.
-    echo
-        Prints a line.
 
-    Returns
-    -------
-    Dataset
-        As `pipeline.analysis.branches` says.
+def branches(run: Any, options: BranchOptions) -> xr.Dataset:
+    """Branches of periodic orbits along a parameter, from the orbits that attract a run's cells."""
+    from pipeline.analysis.branches import Scope, attracting, dataset_of, explore, recurrent
 
-    Raises
-    ------
-    SpecError
-        If an option is out of bounds.
-    ParameterError
-        If an end of the interval is.
-    """
-    snapshot = Run.open(directory)
-    interval = _interval(snapshot, parameter, low, high)
-    problems = [
-        f"{name} = {value}: must be {least} or more."
-        for name, value, least in (
-            ("max_period", max_period, 1),
-            ("generations", generations, 0),
-            ("recurrences", recurrences, 0),
+    cube, parameter = run.cube(), axis_name(options.parameter)
+    interval = low, high = _ends(options)
+    base = parameters_of(cube)
+    starts, left_out = attracting(run.derive("attractors"), base, parameter, interval, options.max_period)
+    longest = options.max_period or max([LEAST_PERIOD, *(s.family.period for s in starts)])
+    if options.recurrences:
+        found = recurrent(cube, base, parameter, high - low, min(options.recurrences, longest))
+        starts += [s for s in found if low <= s.value <= high]
+    run.echo(f"branches: {len(starts)} starting orbits, periods up to {longest}")
+    scope = Scope(low, high, longest, options.generations)
+    return dataset_of(explore(starts, scope), parameter, base, left_out)
+
+
+def _ends(options: BranchOptions) -> tuple[float, float]:
+    assert options.low is not None
+    assert options.high is not None
+    return options.low, options.high
+
+
+def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
+    """Complete the branches' interval; refuse a plane that is none."""
+    from pipeline.spec.problems import SpecError
+
+    settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
+    second = options.second
+    if axis_name(second) == axis_name(options.parameter):
+        raise SpecError([f"{second} is the branches' own parameter; give another one."])
+    if _axis(run, second) is not None:
+        raise SpecError(
+            [f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."]
         )
-        if value < least
-    ]
-    if problems:
-        raise SpecError(problems)
-    options: dict[str, Any] = {
-        "parameter": parameter, "low": interval[0], "high": interval[1], "max_period": max_period,
-        "generations": generations, "recurrences": recurrences,
-    }  # fmt: skip
-    return derive(snapshot, "branches", options, lambda s: _branches(s, echo, **options), echo)
+    _interval(run, second, options.second_low, options.second_high)
+    return settled
 
 
-def _interval(snapshot: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
+def curves(run: Any, options: CurveOptions) -> xr.Dataset:
+    """Curves of the bifurcations located by `branches`, in the plane of its parameter and a second one."""
+    from pipeline.analysis.branches import curves_dataset, curves_from
+
+    located = run.derive("branches", **options.part(BranchOptions))
+    bounds = (_ends(options), (options.second_low, options.second_high))
+    second = axis_name(options.second)
+    base = parameters_of(run.cube())
+    found = curves_from(located, base, second, bounds, options.curve_period)
+    return curves_dataset(found, axis_name(options.parameter), second, base.model)
+
+
+def _axis(run: Run, parameter: str) -> xr.DataArray | None:
+    """The axis of a parameter that the run sweeps."""
+    axis = run.cube().coords.get(axis_name(parameter))
+    return axis if axis is not None and axis.ndim > 0 and axis.size > 1 else None
+
+
+def _interval(run: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
     """Check the parameter and complete its interval from the run's axis."""
-    from magpend_core.models.parameters import unknown_name_problem
-    from pipeline.analysis.attractors.attractors import parameters_of
+    from pipeline.spec.problems import SpecError, unknown_name
 
-    ds = snapshot.cube()
-    names = (*parameters_of(ds).names, "frequency_hz")
-    if parameter not in names:
-        raise SpecError([unknown_name_problem(parameter, names)])
-    axis = ds.coords.get("frequency" if parameter == "frequency_hz" else parameter)
-    if axis is not None and axis.ndim > 0 and axis.size > 1:
+    base = parameters_of(run.cube())
+    is_frequency = axis_name(parameter) == FREQUENCY_DIM
+    if not is_frequency and parameter not in base.names:
+        raise SpecError([unknown_name("parameter", parameter, (*base.names, FREQUENCY_DIM))])
+    axis = _axis(run, parameter)
+    if axis is not None:
         ends = float(axis.min()), float(axis.max())
     elif low is None or high is None:
         raise SpecError([f"the run does not sweep {parameter}; give the interval with --from and --to."])
@@ -99,102 +102,8 @@ def _interval(snapshot: Run, parameter: str, low: float | None, high: float | No
                 "--from must be less than --to."
             ]
         )
-    if parameter == "frequency_hz" and chosen[0] <= 0.0:
+    if is_frequency and chosen[0] <= 0.0:
         raise SpecError([f"--from {chosen[0]}: a drive frequency must be greater than 0."])
-    for value in chosen if parameter != "frequency_hz" else ():
-        parameters_of(ds).replace(**{parameter: value})
+    for value in () if is_frequency else chosen:
+        base.replace(**{parameter: value})
     return chosen
-
-
-def _branches(
-    snapshot: Run,
-    echo: Echo | None,
-    parameter: str,
-    low: float,
-    high: float,
-    max_period: int,
-    generations: int,
-    recurrences: int,
-) -> xr.Dataset:
-    from pipeline.analysis.attractors.attractors import parameters_of
-    from pipeline.analysis.branches import Scope, attracting, dataset_of, explore, recurrent
-
-    cube = snapshot.cube()
-    base, scale = parameters_of(cube), high - low
-    found = attractors(snapshot, echo=echo)
-    starts = attracting(found, base, parameter, scale, max_period)
-    if recurrences:
-        starts += recurrent(cube, base, parameter, scale, min(recurrences, max_period))
-    starts = [s for s in starts if low <= s.value <= high]
-    if echo is not None:
-        echo(f"branches: {len(starts)} starting orbits")
-    return dataset_of(explore(starts, Scope(low, high, max_period, generations)), parameter, base)
-
-
-def curves(
-    directory: Source,
-    second: str,
-    second_low: float,
-    second_high: float,
-    *,
-    curve_period: int = 1,
-    echo: Echo | None = None,
-    **options: Any,
-) -> xr.Dataset:
-    """Curves of the bifurcations located by `branches`, in the plane of its parameter and a second one.
-
-    Parameters
-    ----------
-    directory
-        Run directory, or a `Run`.
-    second
-        ``frequency_hz`` or a parameter's name.
-    second_low, second_high
-        Interval of the second parameter [SI].
-    curve_period
-        Longest period of the orbits taken [drive periods].
-    echo
-        Prints a line.
-    options
-        Those of `branches`.
-
-    Returns
-    -------
-    Dataset
-        As `pipeline.analysis.branches.curves_dataset` says.
-
-    Raises
-    ------
-    SpecError
-        If an option is out of bounds, or the run sweeps the second parameter.
-    """
-    snapshot = Run.open(directory)
-    located = branches(snapshot, echo=echo, **options)
-    first = str(located.attrs["parameter"])
-    if second == first:
-        raise SpecError([f"{second} is the branches' own parameter; give another one."])
-    axis = snapshot.cube().coords.get("frequency" if second == "frequency_hz" else second)
-    if axis is not None and axis.ndim > 0 and axis.size > 1:
-        raise SpecError(
-            [f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."]
-        )
-    interval = _interval(snapshot, second, second_low, second_high)
-    if curve_period < 1:
-        raise SpecError([f"curve_period = {curve_period}: must be 1 or more."])
-    wanted = {
-        **json.loads(located.attrs["derived_options"]),
-        "second": second,
-        "second_low": interval[0],
-        "second_high": interval[1],
-        "curve_period": curve_period,
-    }
-
-    def compute(at: Run) -> xr.Dataset:
-        from pipeline.analysis.attractors.attractors import parameters_of
-        from pipeline.analysis.branches import curves_dataset, curves_from
-
-        base = parameters_of(at.cube())
-        bounds = ((wanted["low"], wanted["high"]), interval)
-        return curves_dataset(curves_from(located, base, second, bounds, curve_period), first, second)
-
-    return derive(snapshot, "curves", wanted, compute, echo)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -12,7 +13,7 @@ from magpend_core.models.parameters import Parameters
 from magpend_core.orbits import polish_orbits, scaled_distance, stroboscopic_map
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.layout.vocabulary import is_start_dim
+from pipeline.layout.vocabulary import BOUNDED, is_start_dim
 
 CLOSE = 0.1
 """Largest scaled distance of a recurrence that is worth a try."""
@@ -20,13 +21,19 @@ CLOSE = 0.1
 TRIES = 16
 """Recurrences tried per period."""
 
-BOUNDED = 2
+
+@dataclass(frozen=True)
+class Listed:
+    """An attractor of a run at one parameter point: its id, where it is, its period (0: bounded set)."""
+
+    identity: int
+    where: Mapping[str, float]
+    period: int
+    start: Start | None
 
 
-def attracting(
-    attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int
-) -> list[Start]:
-    """Polished closed orbits among the attractors of a run.
+def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float) -> Iterator[Listed]:
+    """All attractors of a run, those with a polished closed orbit as starts.
 
     Parameters
     ----------
@@ -38,25 +45,85 @@ def attracting(
         What is to be continued.
     scale
         Change of it that counts as 1.
+    """
+    for point in _points(attractors):
+        frequency, packed = _parameters_at(point, parameters)
+        where = {d: float(point[d]) for d in _dims(attractors)}
+        for i in np.flatnonzero(point["kind"].values > 0):
+            one = point.isel(attractor=int(i))
+            period, start = int(one["orbit_period"]), None
+            if int(one["is_polished"]) and period >= 1:
+                family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
+                state = np.asarray(one["attractor_points"].values[0])
+                start = Start(family, state, value_of(family, frequency, packed))
+            yield Listed(int(i), where, period, start)
+
+
+def attracting(
+    attractors: xr.Dataset,
+    parameters: Parameters,
+    parameter: str,
+    interval: tuple[float, float],
+    max_period: int = 0,
+) -> tuple[list[Start], list[str]]:
+    """Polished closed orbits among the attractors of a run, and what is left out.
+
+    Parameters
+    ----------
+    attractors
+        From `pipeline.analysis.attractors.attractors`.
+    parameters
+        What was integrated, axes of the cube aside.
+    parameter
+        What is to be continued.
+    interval
+        Where; its length counts as 1.
     max_period
-        Longest period taken [drive periods].
+        Longest period taken [drive periods]; 0 takes all.
 
     Returns
     -------
-    list of Start
+    starts : list of Start
         In the order of the cube's points and attractors.
+    left_out : list of str
+        A line for each attractor, and each reason, with the points where it is and how to get it.
     """
-    starts = []
-    for point in _points(attractors):
-        frequency, packed = _parameters_at(point, parameters)
-        for i in range(attractors.sizes["attractor"]):
-            one = point.isel(attractor=i)
-            period = int(one["orbit_period"])
-            if int(one["is_polished"]) and 1 <= period <= max_period:
-                family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
-                state = np.asarray(one["attractor_points"].values[0])
-                starts.append(Start(family, state, value_of(family, frequency, packed)))
-    return starts
+    low, high = interval
+    starts: list[Start] = []
+    reasons: dict[tuple[int, str], list[Mapping[str, float]]] = {}
+    for one in listed(attractors, parameters, parameter, high - low):
+        why = _why_not(one, interval, max_period)
+        if why:
+            reasons.setdefault((one.identity, why), []).append(one.where)
+        elif one.start is not None:
+            starts.append(one.start)
+    lines = [f"attractor {i}{_places(where)}: {why}" for (i, why), where in reasons.items()]
+    return starts, lines
+
+
+def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str:
+    """Why an attractor is no start, empty if it is one."""
+    if not one.period:
+        return "a bounded set, no closed orbit; --recurrences P starts from orbits that it comes near"
+    if one.start is None:
+        return f"Newton's method found no orbit of period {one.period} there"
+    if max_period and one.period > max_period:
+        return f"its period is {one.period}; take it with --period {one.period}"
+    if not interval[0] <= one.start.value <= interval[1]:
+        return f"outside of the interval {interval[0]:g} to {interval[1]:g}; widen it with --from and --to"
+    return ""
+
+
+def _places(where: Sequence[Mapping[str, float]]) -> str:
+    """Where an attractor is, in words: the range of each axis."""
+    if not where[0]:
+        return ""
+    ranges = []
+    for name in where[0]:
+        values = sorted({at[name] for at in where})
+        ranges.append(f"{name} {values[0]:g}" + (f" to {values[-1]:g}" if len(values) > 1 else ""))
+    points = f" ({len(where)} points)" if len(where) > 1 else ""
+    return f" at {', '.join(ranges)}{points}"
 
 
 def family_of(
@@ -74,12 +141,16 @@ def value_of(family: Family, frequency_hz: float, packed: np.ndarray) -> float:
     return float(packed[family.system.parameter_names.index(name)])
 
 
+def _dims(ds: xr.Dataset) -> list[str]:
+    """Parameter dims of a dataset."""
+    return [str(d) for d in ds["status"].dims if not is_start_dim(str(d))]
+
+
 def _points(ds: xr.Dataset) -> list[xr.Dataset]:
     """Parameter points of a dataset."""
-    dims = [str(d) for d in ds["status"].dims if not is_start_dim(str(d))]
-    shape = [ds.sizes[d] for d in dims]
-    indices = [dict(zip(dims, map(int, index), strict=True)) for index in np.ndindex(*shape)]
-    return [ds.isel(index) for index in indices]
+    dims = _dims(ds)
+    indices = np.ndindex(*(ds.sizes[d] for d in dims))
+    return [ds.isel(dict(zip(dims, map(int, index), strict=True))) for index in indices]
 
 
 def _parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarray]:
@@ -131,7 +202,7 @@ def orbits_near(
     Parameters
     ----------
     section
-        Sections of consecutive drive periods, shape (trajectory, period, n_states) [rad, rad/s].
+        Sections of consecutive drive periods, shape (trajectory, period, n_states) [the model's units].
     frequency_hz
         Drive frequency [Hz].
     packed

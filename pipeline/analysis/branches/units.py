@@ -1,16 +1,18 @@
-"""Units of what can be varied."""
+"""Units of what is followed and of what is varied, as the run's model names them."""
 
 from __future__ import annotations
 
-from magpend_core.models import load_model
+from magpend_core.models.model import Model
 from pipeline.analysis.branches.problems import FREQUENCY
 
 
-def units_of(parameter: str) -> str:
-    """Unit of a parameter by name, empty if it is not the pendulum's."""
+def parameter_units(parameter: str, model: Model | None) -> str:
+    """Unit of a parameter or of the drive frequency; empty if there is no model to tell."""
     if parameter == FREQUENCY:
         return "Hz"
-    return load_model().parameter(parameter).unit
+    return model.parameter(parameter).unit if model is not None else ""
 
 
-STATE_UNITS = "rad, rad, rad/s, rad/s"
+def state_units(model: Model | None) -> str:
+    """Units of the states, with commas between; 1 if there is no model to tell."""
+    return ", ".join(model.state_units) if model is not None else "1"

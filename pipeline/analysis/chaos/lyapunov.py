@@ -15,13 +15,12 @@ import numpy.typing as npt
 import xarray as xr
 
 from pipeline.layout.vocabulary import PERIODIC
+from pipeline.products.lyapunov import LyapunovFlag
 
 Floats = npt.NDArray[np.float64]
 
-GOOD = 1
-"""Value of `lyapunov_flag` without objection (see `pipeline.layout.schema.LyapunovFlag`)."""
-
-UNRESOLVED, FAILED = 3, 4
+GOOD = int(LyapunovFlag.GOOD)
+"""Value of `lyapunov_flag` without objection."""
 
 
 class Motion(IntEnum):
@@ -108,10 +107,10 @@ def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> xr.DataArray:
     motion = motion.where(~((first > 0) & ~closed), np.int8(Motion.CHAOTIC))
     if ds.sizes["exponent"] > 1:
         second = sign.isel(exponent=1, drop=True)
-        resolved = ds["lyapunov_flag"] != UNRESOLVED
+        resolved = ds["lyapunov_flag"] != LyapunovFlag.UNRESOLVED
         hyper = (first > 0) & (second > 0) & resolved & ~closed
         motion = motion.where(~hyper, np.int8(Motion.HYPERCHAOTIC))
-    known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != FAILED)
+    known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != LyapunovFlag.FAILED)
     motion = motion.where(known, np.int8(Motion.UNKNOWN))
     return motion.assign_attrs(
         units="1",

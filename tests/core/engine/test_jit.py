@@ -14,7 +14,7 @@ from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 SCRIPT = """
 from magpend_core import accelerations, load_preset
 from magpend_core.engine.jit import source_digest
-from magpend_core.models.pendulum.mechanics import _evaluator
+from magpend_core.pointwise import _evaluator
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 value = accelerations(0.1, [0.1, 0.2, 0.3, 0.4], load_preset(), 2.2)
 stats = _evaluator(PENDULUM_FITTED, "rates").stats
@@ -30,12 +30,17 @@ def edit(folder, name, old, new):
 
 
 def test_kernel__sees_an_edit_of_a_callee(run_python, copied):
-    # the cached entry point is in mechanics.py, what it calls in equations.py
+    # the cached entry point is in pointwise.py, what it calls in equations.py
     first = run_python(SCRIPT, package=copied).split()
     again = run_python(SCRIPT, package=copied).split()
     assert first[:2] == again[:2]
     assert (first[2:], again[2:]) == (["0", "1"], ["1", "0"])
-    edit(copied, "models/pendulum/equations.py", "B2 = J2 + e2 * e2 * m2", "B2 = J2 + 1.01 * e2 * e2 * m2")
+    edit(
+        copied,
+        "models/pendulum/equations.py",
+        "B2 = p[AT.J2] + e2 * e2 * m2",
+        "B2 = p[AT.J2] + 1.01 * e2 * e2 * m2",
+    )
     edited = run_python(SCRIPT, package=copied).split()
     assert edited[0] != first[0]
     assert edited[1] != first[1]
@@ -72,9 +77,7 @@ def test_source_digest__changes_with_any_source(run_python, copied):
 
 
 def test_kernel__leaves_numbas_own_setting_alone(run_python, tmp_path):
-    script = (
-        "import numba; before = numba.config.CACHE_DIR; import magpend_core.models.pendulum.mechanics as m\n"
-    )
+    script = "import numba; before = numba.config.CACHE_DIR; import magpend_core.pointwise as m\n"
     script += "from magpend_core.models.pendulum.systems import PENDULUM_FITTED\n"
     script += "m._evaluator(PENDULUM_FITTED, 'rates'); print(numba.config.CACHE_DIR == before)"
     assert run_python(script).strip() == "True"

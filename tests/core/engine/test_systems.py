@@ -1,15 +1,19 @@
 """The engine on another system: published points of linear and Duffing oscillators."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from magpend_core import run_branches
-from magpend_core.engine.jit import CACHE_FOLDER, is_covered
+from magpend_core import Status, lyapunov_exponents, polish_orbits, run_branches
+from magpend_core.engine.entry import integrate
+from magpend_core.engine.jit import CACHE_FOLDER, inline, is_covered
 from magpend_core.engine.lanes import engine_of
-from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.observers import RECORD_LAST, Observer
+from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
+from magpend_core.engine.vecmath import TWO_PI, sincos
 from magpend_core.models.pendulum.systems import PENDULUM_DIPOLE, PENDULUM_FITTED
 
 UNIT_FREQUENCY = 0.5 / np.pi  # forcing cos t
@@ -99,3 +103,142 @@ def test_engine_of__keeps_only_the_packages_own_systems(oscillator):
     kept = getattr(engine_of(PENDULUM_FITTED, RECORD_LAST)._cache, "cache_path", None)
     assert (kept is None) == (CACHE_FOLDER is None)
     assert getattr(engine_of(oscillator, RECORD_LAST)._cache, "cache_path", None) is None
+
+
+# ---- the least that a system can be: one state, neither angles, edges nor layers ------------------
+
+
+@inline
+def _relaxation_constants(frequency, p, out):
+    out[0] = p[0]
+    out[1] = TWO_PI * frequency
+
+
+@inline
+def _relaxation_forcing(t, c):
+    return sincos(c[1] * t)[1]
+
+
+@inline
+def _relaxation_rhs(y, u, c):
+    return (u - c[0] * y[0],)
+
+
+@inline
+def _relaxation_jacobian(y, u, c):
+    return (0.0 * y[0] - c[0],)
+
+
+RELAXATION = System(
+    name="relaxation",
+    state_names=("x",),
+    parameter_names=("rate",),
+    n_constants=2,
+    constants=_relaxation_constants,
+    forcing=_relaxation_forcing,
+    rhs=_relaxation_rhs,
+    jacobian=_relaxation_jacobian,
+)
+"""x' = cos(2 pi f t) - rate x"""
+
+
+def test_system__fills_in_what_is_left_out():
+    assert (RELAXATION.is_angle, RELAXATION.scales, RELAXATION.escape) == ((False,), (1.0,), (np.inf,))
+    assert (RELAXATION.n_edges, RELAXATION.has_layers, RELAXATION.n_states) == (0, False, 1)
+    assert dataclasses.replace(RELAXATION) == RELAXATION
+    assert hash(dataclasses.replace(RELAXATION)) == hash(RELAXATION)
+
+
+def test_system__takes_lists_and_whole_numbers(duffing):
+    listed = dataclasses.replace(
+        duffing, state_names=["x", "v"], is_angle=[0, np.False_], scales=np.array([1, 1]), escape=[1000, 1000]
+    )
+    assert listed == duffing
+    assert hash(listed) == hash(duffing)
+    assert listed.label == duffing.label
+
+
+def test_one_state__section_multiplier_and_exponent_are_the_closed_forms():
+    rate, omega = 0.5, 1.0
+    packed, frequency = np.array([[rate]] * 2), np.full(2, UNIT_FREQUENCY)
+    starts = np.array([[0.3], [-2.0]])
+    result = run_branches(
+        packed[:, None], frequency[:, None], starts, system=RELAXATION, n_transient=10, n_keep=1,
+        rtol=1e-11, atol=1e-11,
+    )  # fmt: skip
+    orbit = rate / (rate**2 + omega**2)
+    decayed = (starts[:, 0] - orbit) * np.exp(-rate * 11 * PERIOD)
+    assert result.section[:, 0, 0, 0] == pytest.approx(orbit + decayed, abs=1e-10)
+    assert result.turns.shape == (2, 1, 0)
+    polished = polish_orbits(packed, frequency, starts, np.array([1, 1]), system=RELAXATION)
+    assert polished.section == pytest.approx(orbit, abs=1e-10)
+    assert polished.multipliers == pytest.approx(np.exp(-rate * PERIOD), rel=1e-9)
+    found = lyapunov_exponents(packed, frequency, starts, n_periods=32, system=RELAXATION)
+    assert found.exponents == pytest.approx(-rate, abs=1e-6)
+    assert found.divergence == pytest.approx(-rate, abs=1e-12)
+
+
+@inline
+def _no_constants(frequency, p, out):
+    return
+
+
+@inline
+def _growth_rhs(y, u, c):
+    return (y[0] * (1.0 - y[0]),)
+
+
+def test_one_state__without_forcing_or_parameters():
+    # logistic growth: x(t) = 1/(1 + (1/x0 - 1) exp(-t))
+    growth = System(
+        name="growth", state_names=("x",), parameter_names=(), n_constants=0, constants=_no_constants,
+        rhs=_growth_rhs,
+    )  # fmt: skip
+    result = run_branches(
+        np.empty((1, 1, 0)), np.array([[2.0]]), np.array([[0.1]]), system=growth, n_transient=0, n_keep=4,
+        rtol=1e-11, atol=1e-11,
+    )  # fmt: skip
+    exact = 1.0 / (1.0 + 9.0 * np.exp(-0.5 * np.arange(1, 5)))
+    assert result.section.ravel() == pytest.approx(exact, abs=1e-10)
+
+
+def test_one_state__that_is_left_unbounded_fails_by_a_status():
+    # x' = cos t + 0.5 x leaves any bound
+    bounded = dataclasses.replace(RELAXATION, name="bounded_relaxation", escape=(10.0,))
+    result = run_branches(
+        np.array([[[-0.5]]]), np.array([[UNIT_FREQUENCY]]), np.array([[1.0]]), system=bounded, n_transient=50,
+        n_keep=1, rtol=1e-6, atol=1e-6,
+    )  # fmt: skip
+    assert result.status.item() == Status.DIVERGED
+
+
+# ---- an observer of one's own ------------------------------------------------------------------------
+
+
+class _Count(NamedTuple):
+    n: int
+
+
+def _count_positive(section, turns, i_period, memory, record, measures, settings):
+    measures[0] += section[0] > LEVEL  # noqa: F821
+    return BOUNDED if i_period == settings.n else PENDING  # noqa: F821
+
+
+@inline
+def _no_memory(settings, n_states):
+    return 0
+
+
+def test_observer__of_ones_own(duffing):
+    codes = {"PENDING": int(Status.PENDING), "BOUNDED": int(Status.BOUNDED), "LEVEL": 0.0}
+    observer = Observer("count_positive", _count_positive, _no_memory, codes)
+    # two wells: the attractors of the two starts lie on either side of 0
+    cells = integrate(
+        duffing, observer, _Count(7), parameters=np.tile([0.15, -1.0, 1.0, 0.2], (2, 1, 1)),
+        frequency_hz=np.full((2, 1), UNIT_FREQUENCY), initial_states=np.array([[-0.8, 0.0], [1.2, 0.0]]),
+        n_keep=0, n_measures=1, rtol=1e-7, atol=1e-7, max_steps_per_period=20_000,
+    )  # fmt: skip
+    assert cells.measures.ravel().tolist() == [0.0, 7.0]
+    assert cells.n_periods.ravel().tolist() == [7, 7]
+    assert (cells.status == Status.BOUNDED).all()
+    assert cells.section.shape == (2, 1, 0, 2)

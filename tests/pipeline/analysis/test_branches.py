@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
@@ -11,9 +12,20 @@ from magpend_core import load_preset, run_branches
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import sincos
+from magpend_core.models import load_model
+from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance
-from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
+from pipeline.analysis.branches import (
+    Scope,
+    Start,
+    attracting,
+    dataset_of,
+    explore,
+    orbits_near,
+    table_of,
+    windows_of,
+)
 from pipeline.analysis.branches.arclength import Point, Settings
 from pipeline.analysis.branches.bifurcations import Bifurcation, multipliers_of, n_unstable, tell_apart
 from pipeline.analysis.branches.curves import continue_curves
@@ -27,7 +39,7 @@ from pipeline.analysis.branches.problems import (
     fold_test,
     torus_test,
 )
-from pipeline.analysis.sides import Side
+from pipeline.analysis.branches.table import branches_table
 
 
 @inline
@@ -145,7 +157,7 @@ def only(branch, kind):
 def test_explore__linear_oscillator():
     """The exact orbit and multipliers at every frequency."""
     damping, linear, amplitude = 0.3, 4.0, 1.0
-    orbits = family(0.2, [damping, 0, linear, 0, amplitude], "frequency_hz", 0.5)
+    orbits = family(0.2, [damping, 0, linear, 0, amplitude], "frequency", 0.5)
     (branch,) = explore([Start(orbits, np.zeros(2), 0.2)], Scope(0.1, 0.6))
     assert branch.ends == ("bound", "bound")
     assert not branch.bifurcations
@@ -163,7 +175,7 @@ def test_explore__linear_oscillator():
 @pytest.fixture(scope="module")
 def resonance():
     """The bent resonance of a hardening spring: stable, unstable, stable again."""
-    orbits = family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency_hz", 0.3)
+    orbits = family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency", 0.3)
     (branch,) = explore([Start(orbits, np.array([0.3, 0.0]), 0.1)], Scope(0.1, 0.4))
     return orbits, branch
 
@@ -205,15 +217,75 @@ def test_explore__determinant(resonance):
 def test_dataset_of__resonance(resonance):
     """Three stable segments' worth of tables: numbers as on the branch."""
     _, branch = resonance
-    ds = dataset_of([branch], "frequency_hz", None)
-    upper, lower = sorted(table_of(ds), key=lambda row: -row["value"])
+    ds = dataset_of([branch], "frequency", None)
+    upper, lower = sorted(table_of(ds), key=lambda row: -row["frequency_hz"])
     assert [upper["type"], lower["type"]] == ["fold", "fold"]
     assert (upper["unstable_below"], upper["unstable_above"]) == ("0|1", "none")
     assert (lower["unstable_below"], lower["unstable_above"]) == ("none", "0|1")
     first, second = windows_of(ds)
     assert (first["begins"], first["ends"]) == ("bound", "fold")
     assert (second["begins"], second["ends"]) == ("fold", "bound")
-    assert (first["to"], second["from"]) == (upper["value"], lower["value"])
+    assert (first["to"], second["from"]) == (upper["frequency_hz"], lower["frequency_hz"])
+
+
+def test_dataset_of__no_branch():
+    """Of no branch a dataset of the same variables, and a sentence."""
+    parameters = load_preset()
+    ds = dataset_of([], "frequency", parameters, ["attractor 0: a bounded set"])
+    assert (ds.sizes["branch"], ds.sizes["bifurcation"], ds.sizes["state"]) == (0, 0, 4)
+    assert {"parameter", "side", "rotation", "frequency", "bifurcation_section"} <= set(ds)
+    rows, lines = branches_table(ds).rows, branches_table(ds).lines
+    assert rows == []
+    assert lines[0].startswith("no branch")
+    assert "  attractor 0: a bounded set" in lines
+    assert dataset_of([], "amplitude").sizes["branch"] == 0
+
+
+def test_table_of__one_name_per_axis(resonance, cascade):
+    """The frequency stands in one column, under its unit; of another parameter, beside it."""
+    _, branch = resonance
+    (row, *_) = table_of(dataset_of([branch], "frequency"))
+    assert [n for n in row if "frequency" in n] == ["frequency_hz"]
+    assert np.isfinite(row["frequency_hz"])
+    assert "side" not in row
+    orbits, branches = cascade
+    (row, *_) = table_of(dataset_of(branches, "amplitude"))
+    assert row["amplitude"] == orbits.values(branches[0].bifurcations[0].point.u)[0]
+    assert row["frequency_hz"] == orbits.frequency_hz
+    assert "value" not in row
+
+
+def run_of(*periods, kinds=None):
+    """Attractors of a Duffing run at two frequencies, of given periods, 0 for a bounded set."""
+    parameters = load_model("duffing").load()
+    n, dims = len(periods), ("frequency", "attractor")
+    period = np.array([periods, periods])
+    return parameters, xr.Dataset(
+        {
+            "status": (("frequency", "initial_condition"), np.ones((2, 1), np.int8)),
+            "kind": (dims, np.where(period > 0, 1, 2)),
+            "orbit_period": (dims, period),
+            "is_polished": (dims, (period > 0).astype(np.int8)),
+            "attractor_points": ((*dims, "point", "state"), np.zeros((2, n, max(periods), 2))),
+        },
+        coords={"frequency": [0.15, 0.2]},
+    )
+
+
+def test_attracting__all_periods_or_a_line_for_what_is_left_out():
+    parameters, found = run_of(1, 5, 7, 0)
+    starts, left_out = attracting(found, parameters, "frequency", (0.1, 0.3))
+    assert sorted(s.family.period for s in starts) == [1, 1, 5, 5, 7, 7]
+    (line,) = left_out
+    assert line.startswith("attractor 3 at frequency 0.15 to 0.2 (2 points): a bounded set")
+    assert "--recurrences" in line
+    starts, left_out = attracting(found, parameters, "frequency", (0.1, 0.17), 5)
+    assert sorted(s.family.period for s in starts) == [1, 5]
+    assert (
+        "attractor 2 at frequency 0.15 to 0.2 (2 points): its period is 7; take it with --period 7"
+        in left_out
+    )
+    assert any(line.startswith("attractor 0 at frequency 0.2: outside of the interval") for line in left_out)
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +341,7 @@ def test_explore__start_on_doubled_orbit(cascade):
 def test_explore__neimark_sacker():
     """A forced van der Pol oscillator leaves entrainment through a torus."""
     parameters = [-0.2, 0.2, 1.0, 0.0, 0.4]
-    orbits = family(0.16, parameters, "frequency_hz", 0.05)
+    orbits = family(0.16, parameters, "frequency", 0.05)
     (branch,) = explore(
         [Start(orbits, settled([1.0, 1.5], 0.16, parameters), 0.16)],
         Scope(0.15, 0.22, settings=Settings(longest_step=0.03)),
@@ -315,7 +387,7 @@ def test_explore__symmetry_breaking():
 def test_continue_curves__fold_of_duffing(resonance):
     """The fold at another amplitude, against scipy."""
     orbits, branch = resonance
-    family_2 = Family(OSCILLATOR, 1, 0.1, orbits.parameters, ("frequency_hz", "amplitude"), (0.3, 0.2))
+    family_2 = Family(OSCILLATOR, 1, 0.1, orbits.parameters, ("frequency", "amplitude"), (0.3, 0.2))
     fold = only(branch, "fold")[0]
     start = family_2.unknowns(orbits.state(fold.point.u), [orbits.values(fold.point.u)[0], 0.3])
     (curve,) = continue_curves([(0, family_2, "fold", start)], ((0.1, 0.4), (0.2, 0.4)))
@@ -402,7 +474,7 @@ def test_run_together__same_bits():
     settings = Settings()
     problems = [
         (OrbitProblem(o), o.unknowns(np.array([0.4, 0.1]), [0.1]))
-        for o in (family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency_hz", 0.3, period=p) for p in (1, 2, 3))
+        for o in (family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency", 0.3, period=p) for p in (1, 2, 3))
     ]
     alone = [run_alone(first_point(p, u, settings)) for p, u in problems]
     for count in (3, 9):
@@ -429,14 +501,14 @@ def test_explore__closed_branch():
     """A weakly forced van der Pol oscillator: the entrained orbits and their saddles form a closed curve."""
     parameters = [-0.2, 0.2, 1.0, 0.0, 0.1]
     frequency = 1.0 / (2.0 * np.pi)
-    orbits = family(frequency, parameters, "frequency_hz", 0.02)
+    orbits = family(frequency, parameters, "frequency", 0.02)
     start = Start(orbits, settled([1.0, 1.5], frequency, parameters, 200), frequency)
     (branch,) = explore([start], Scope(0.15, 0.17, max_period=1, settings=Settings(longest_step=0.05)))
     assert branch.ends == ("closed", "closed")
     assert sorted(b.kind for b in branch.bifurcations) == ["fold", "fold"]
     assert np.abs(branch.points[-1].u - branch.points[0].u).max() < 0.1
     # stable from fold to fold, across the start
-    (window,) = windows_of(dataset_of([branch], "frequency_hz", None))
+    (window,) = windows_of(dataset_of([branch], "frequency", None))
     folds = sorted(orbits.values(b.point.u)[0] for b in branch.bifurcations)
     assert [window["from"], window["to"]] == folds
     # another orbit of it is recognised
@@ -452,7 +524,7 @@ def right_family():
     """The right one-sided orbit of period 1 and what hangs on it, around the period halving near 2.5 Hz."""
     parameters = load_preset()
     state = [0.01421118, 0.19932267, -2.74881127, 3.65512389]
-    orbits = family(2.2, parameters.pack(), "frequency_hz", 1.0, system=PENDULUM_FITTED)
+    orbits = family(2.2, parameters.pack(), "frequency", 1.0, system=PENDULUM_FITTED)
     scope = Scope(2.15, 2.55, max_period=2, max_generations=1, settings=Settings(longest_step=0.02))
     return parameters, orbits, explore([Start(orbits, np.array(state), 2.2)], scope)
 
@@ -472,7 +544,7 @@ def test_explore__right_family(right_family):
 def test_explore__brute_force_agrees(right_family):
     """Inside the stable segments, sections of trajectories lie on the branch to 1e-6."""
     parameters, _, branches = right_family
-    ds = dataset_of(branches, "frequency_hz", parameters)
+    ds = dataset_of(branches, "frequency", parameters)
     chosen = [
         (i, j)
         for i, branch in enumerate(branches)

@@ -13,8 +13,8 @@ import pytest
 
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
-from pipeline.runs.preview import describe_plan, first_figure
-from pipeline.runs.workflows import find_spec, shipped_workflows
+from pipeline.runs import preview, workflows
+from pipeline.runs.preview import first_figure
 from pipeline.spec.parsing import parse_spec
 
 BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
@@ -34,7 +34,7 @@ def test_help__is_light(environment):
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert found.stdout.splitlines()[-1] == "[]"
-    for command in ("run", "status", "verify", "analyse", "plot", "simulate", "presets"):
+    for command in ("run", "status", "verify", "analyse", "plot", "simulate", "models", "presets"):
         assert command in found.stdout
 
 
@@ -69,8 +69,10 @@ def test_run__bad_spec_creates_nothing(magpend, write_spec, tmp_path, option):
         ["run", "spec.toml", "--smoke"],
         ["status", "."],
         ["verify", "."],
+        ["analyse", "attractors", "."],
+        ["analyse", "basins", ".", "--box", "x"],
         ["analyse", ".", "attractors"],
-        ["analyse", ".", "basins", "--box", "x"],
+        ["branches", "."],
         ["analyse", ".", "nonsense"],
         ["plot", "bifurcation", "."],
         ["plot", "bifurcation", ".", "--state", "psi3"],
@@ -214,13 +216,14 @@ def test_presets__values_units_and_source(main):
 
 
 def test_find_spec__shipped_workflows():
-    shipped = shipped_workflows()
+    shipped = workflows.shipped_workflows()
     assert "quickstart" in shipped
-    assert find_spec("quickstart") == shipped["quickstart"]
+    assert workflows.find_spec("quickstart") == shipped["quickstart"]
     for path in shipped.values():
-        # the lines before the one of the time, which is measured
-        assert any("cells (" in line for line in islice(describe_plan(path, os.devnull + "-absent"), 3))
-        assert list(islice(describe_plan(path, os.devnull + "-absent", smoke=True), 3))
+        for smoke in (False, True):
+            # the lines before that of the time, which is measured
+            lines = islice(preview.describe_plan(path, os.devnull + "-absent", smoke=smoke), 3)
+            assert any("cells (" in line for line in lines)
 
 
 def test_modules__each_library_has_one_room():

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from pipeline.analysis import tables as report
 from pipeline.analysis.basins.basins import basins as basins_of
-from pipeline.cli.analyse import ATTRACTOR_OPTIONS, BASIN_OPTIONS, SETTLING_OPTIONS
 from pipeline.cli.exits import Exit
-from pipeline.products import derived
-from pipeline.products import tables as report
+from pipeline.runs.derive import derive
 
 SPIRALS = """
 kind = "sweep"
@@ -44,20 +43,9 @@ def spirals(tmp_path_factory):
     return folder / "run"
 
 
-def test_options__are_those_of_the_analyses():
-    """Names and defaults on the command line are those of the functions."""
-    shown = {p.name: p.default for p in (*ATTRACTOR_OPTIONS, *BASIN_OPTIONS)}
-    assert {
-        name: str(v) if isinstance(v, str) else v for name, v in shown.items()
-    } == derived.basin_defaults()
-    settling = {p.name: p.default for p in (*ATTRACTOR_OPTIONS, *SETTLING_OPTIONS)}
-    assert settling == derived.settling_defaults()
-    assert derived.attractor_defaults().keys() == {p.name for p in ATTRACTOR_OPTIONS}
-
-
 def test_attractors__table_per_point(main, spirals, tmp_path):
-    code, out, err = main("analyse", spirals, "attractors", "--csv", tmp_path / "a.csv")
-    assert (code, err) == (0, "")
+    code, out, err = main("analyse", "attractors", spirals, "--csv", tmp_path / "a.csv")
+    assert code == 0, err
     lines = out.splitlines()
     assert "attractors at 2 parameter points" in out
     at = lines.index("frequency 2.2 Hz:")
@@ -65,8 +53,8 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
     left, right = (next(line for line in lines[at:] if f" {side} " in line) for side in ("left", "right"))
     assert re.search(r"closed orbit +1 +left +0\.000 0\.000 +0\.9[67]\d\d ", left)
     assert re.search(r"0\.\d{4} \(0\.\d{4} to 0\.\d{4}\)", right)
-    ds = derived.attractors(spirals)
-    assert lines[-1] == f"stored: {ds.encoding['source']}"
+    ds = derive(spirals, "attractors")
+    assert f"stored: {ds.encoding['source']}" in err
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))
     for row in rows:
@@ -81,14 +69,14 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
     by_side = {row["side"]: row for row in rows if row["frequency"] == "2.2"}
     assert by_side["left"]["mirror_partner"] == by_side["right"]["attractor_id"]
 
-    code, out, _ = main("analyse", spirals, "attractors")
-    assert out.startswith("attractors: taken from")
+    code, _, err = main("analyse", "attractors", spirals)
+    assert "attractors: taken from" in err
 
 
 def test_basins__fractions_and_boundaries(main, spirals, tmp_path):
-    arguments = ["analyse", spirals, "basins", "--box", "2", "--interval", "clopper-pearson"]
+    arguments = ["analyse", "basins", spirals, "--box", "2", "--interval", "clopper-pearson"]
     code, out, err = main(*arguments, "--csv", tmp_path / "b.csv")
-    assert (code, err) == (0, "")
+    assert code == 0, err
     assert "clopper-pearson, 95 %" in out
     # four boxes are too few for an error
     assert re.search(r"basin entropy: 0\.\d+ \(error not known\)", out)
@@ -99,16 +87,16 @@ def test_basins__fractions_and_boundaries(main, spirals, tmp_path):
     for frequency in ("2.2", "2.25"):
         counts = [int(row["n_cells"]) for row in rows if row["frequency"] == frequency]
         assert sum(counts) == 16
-    code, out, _ = main(*arguments, "--box", "3")
-    assert "attractors: taken from" in out
-    assert "basins: computed" in out
+    code, _, err = main(*arguments, "--box", "3")
+    assert "attractors: taken from" in err
+    assert "basins: computed" in err
 
 
 def test_settling__says_what_stays(main, spirals, tmp_path):
     arguments = ("--n-sample", "4", "--n-periods", "64", "--csv", tmp_path / "s.csv")
-    code, out, err = main("analyse", spirals, "settling", *arguments)
-    assert (code, err) == (0, "")
-    ds = derived.settling(spirals, n_sample=4, n_periods=64)
+    code, out, err = main("analyse", "settling", spirals, *arguments)
+    assert code == 0, err
+    ds = derive(spirals, "settling", {"n_sample": 4, "n_periods": 64})
     n_sets = int((ds["verdict"] > 0).sum())
     assert n_sets > 0
     assert f"bounded sets: {n_sets}; run on for 64 drive periods" in out
@@ -128,18 +116,18 @@ def test_settling__says_what_stays(main, spirals, tmp_path):
 def test_hysteresis__loops_and_jumps(main, write_spec, walk_text, tmp_path):
     write_spec(walk_text)
     assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
-    code, out, err = main("analyse", "run", "hysteresis", "--no-polish", "--csv", "h.csv")
-    assert (code, err) == (0, "")
-    ds = derived.hysteresis(tmp_path / "run", polish=False)
+    code, out, err = main("analyse", "hysteresis", "run", "--no-polish", "--csv", "h.csv")
+    assert code == 0, err
+    ds = derive(tmp_path / "run", "hysteresis", {"polish": False})
     assert f"jumps of the branches: {int(ds['jump_count'].sum()) or 'none'}" in out
     assert re.search(rf"^{ds.sizes['loop'] or 'no'} loop", out, re.MULTILINE)
     with (tmp_path / "h.csv").open() as file:
         assert sum(int(row["count"]) for row in csv.DictReader(file)) == int(ds["jump_count"].sum())
     # a continuation's branches are no sample of initial conditions
-    code, out, _ = main("analyse", "run", "attractors", "--no-polish")
+    code, out, _ = main("analyse", "attractors", "run", "--no-polish")
     assert code == 0
     assert "share" not in out
-    code, _, err = main("analyse", "run", "basins")
+    code, _, err = main("analyse", "basins", "run")
     assert code == Exit.REFUSED
     assert "independent initial conditions" in err
 
@@ -147,29 +135,33 @@ def test_hysteresis__loops_and_jumps(main, write_spec, walk_text, tmp_path):
 def test_analyse__incomplete_run_and_prune(main, made):
     directory = made.info.directory
     made.commit(0)
-    code, out, err = main("analyse", directory, "attractors", "--no-polish")
-    assert (code, err) == (0, "")
+    code, out, err = main("analyse", "attractors", directory, "--no-polish")
+    assert code == 0, err
     assert f"{made.plan.n_cells - made.plan.cells_in(0)} pending" in out
-    assert main("analyse", directory, "prune")[1] == "nothing to remove\n"
+    assert main("analyse", "prune", directory)[1] == "nothing to remove\n"
     made.commit(1)
-    _, out, _ = main("analyse", directory, "prune", "--dry-run")
+    _, out, _ = main("analyse", "prune", directory, "--dry-run")
     assert len(re.findall("stale: .*(attractors|identified)-", out)) == 2
-    assert main("analyse", directory, "prune", "--dry-run")[1] == out
-    assert main("analyse", directory, "prune")[1] == out.replace("stale", "removed")
+    assert main("analyse", "prune", directory, "--dry-run")[1] == out
+    assert main("analyse", "prune", directory)[1] == out.replace("stale", "removed")
     assert not any((directory / "derived").iterdir())
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["attractors", "--tolerance", "-1"], "tolerance = -1.0 is out of bounds: it must be 0 (default) or"),
-        (["attractors", "--threshold", "0"], "threshold = 0.0 is out of bounds: it must be greater than 0."),
-        (["settling", "--n-sample", "0"], "n_sample = 0 is out of bounds: it must be 1 or more."),
-        (["settling", "--confidence", "1"], "confidence = 1.0 is out of bounds: it must lie"),
-        (["attractors", "--look-back", "0"], "look_back = 0 is out of bounds: it must be 1 or more."),
-        (["basins", "--rule-same-share", "1.5"], "rule_same_share = 1.5 is out of bounds: it must be at"),
-        (["basins", "--confidence", "nan"], "confidence = nan: must be a number."),
-        (["basins", "--box", "1"], "box = 1 is out of bounds: it must be 2 or more."),
+        (["attractors", "--tolerance", "-1"], "tolerance = -1.0: must be at least 0."),
+        (["attractors", "--threshold", "0"], "threshold = 0.0: must be greater than 0."),
+        (["settling", "--n-sample", "0"], "n_sample = 0: must be at least 1."),
+        (["settling", "--confidence", "1"], "confidence = 1.0: must be less than 1."),
+        (["attractors", "--look-back", "0"], "look_back = 0: must be at least 1."),
+        (["basins", "--rule-same-share", "1.5"], "rule_same_share = 1.5: must be at most 1."),
+        (["basins", "--confidence", "nan"], "confidence = nan: must be a finite number."),
+        (["basins", "--box", "1"], "box = 1: must be at least 2."),
+        (["basins", "--interval", "wilsen"], "Did you mean 'wilson'?"),
+        (["attractors", "--treshold", "1"], "did you mean"),
+        (["dimension", "--at", "freqency_hz=2.2"], "unknown axis 'freqency_hz'; did you mean frequency?"),
+        (["branches", "--parameter", "frequency_h"], "did you mean frequency_hz?"),
         (["hysteresis"], 'hysteresis needs a continuation with direction = "both".'),
         (["attractors", "--csv", "no/where.csv"], "--csv no/where.csv: must be a file in a folder"),
     ],
@@ -177,7 +169,7 @@ def test_analyse__incomplete_run_and_prune(main, made):
 )  # fmt: skip
 def test_analyse__refused_before_computing(main, made, arguments, message):
     made.commit(0)
-    code, out, err = main("analyse", made.info.directory, *arguments)
+    code, out, err = main("analyse", arguments[0], made.info.directory, *arguments[1:])
     assert code == Exit.REFUSED
     assert message in err
     assert out == ""
@@ -254,19 +246,19 @@ n_transient = 8
 n_keep = 16
 """)
     assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
-    code, out, err = main("analyse", "run", "attractors", "--csv", "a.csv")
-    assert (code, err) == (0, "")
+    code, out, err = main("analyse", "attractors", "run", "--csv", "a.csv")
+    assert code == 0, err
     assert "0 attractors at 2 parameter points" in out
     assert "0 of 12 cells belong to an attractor; 12 diverged" in out
-    code, out, err = main("analyse", "run", "basins")
-    assert (code, err) == (0, "")
+    code, out, err = main("analyse", "basins", "run")
+    assert code == 0, err
     assert re.search(r"diverged +6 +1\.0000 \(0\.6097 to 1\.0000\)", out)
-    code, out, err = main("analyse", "run", "settling")
-    assert (code, err) == (0, "")
+    code, out, err = main("analyse", "settling", "run")
+    assert code == 0, err
     assert "bounded sets: none" in out
     for figure in ("fractions", "attractors"):
         code, _, err = main("plot", figure, "run")
-        assert (code, err) == (0, "")
+        assert code == 0, err
     assert main("plot", "basins", "run", "--at", "frequency=2.6")[0] == 0
     code, _, err = main("plot", "gallery", "run", "--at", "frequency=2.6")
     assert code == Exit.REFUSED

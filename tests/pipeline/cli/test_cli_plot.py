@@ -43,7 +43,7 @@ def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
     for verb, options in figures.items():
         code, out, err = main("plot", verb, "run", *options)
         assert code == 0, err
-        assert ("attractors: computed" in out) == (verb == "basins")
+        assert ("attractors: computed" in err) == (verb == "basins")
         name = names[verb]
         assert out.splitlines()[-2:] == [f"figure: run/figures/{name}.png", f"data: run/figures/{name}.nc"]
         assert (tmp_path / "run" / "figures" / f"{name}.png").stat().st_size > 5000
@@ -82,9 +82,9 @@ def test_plot__no_run(main, tmp_path, verb):
 def test_plot__continuation_with_loops(main, write_spec, walk_text, tmp_path):
     write_spec(walk_text)
     assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
-    code, out, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
+    code, _, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
     assert code == 0, err
-    assert "hysteresis: computed" in out
+    assert "hysteresis: computed" in err
     with xr.open_dataset(tmp_path / "run" / "figures" / "attractors_psi1.nc", engine="scipy") as stored:
         assert {"value", "share", "present"} <= set(stored.data_vars)
         assert stored["value"].attrs["units"] == "deg"

@@ -14,7 +14,7 @@ import zarr
 
 from pipeline import open_run
 from pipeline.compute import execute, task
-from pipeline.products.derived import prune
+from pipeline.runs.derive import prune
 from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import run
 from pipeline.runs.status import state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import multiprocessing
 from pathlib import Path
@@ -10,12 +11,39 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.products.derived import attractors, derive
+from pipeline.products.product import Analysis, Options, option
+from pipeline.products.registry import ANALYSES
+from pipeline.runs import derive as deriving
+from pipeline.runs import versions
+from pipeline.runs.derive import AnalysedRun, derive
 from pipeline.spec.problems import SpecError
-from pipeline.store import directory as store
+from pipeline.store.commits import withdraw
+from pipeline.store.errors import DamagedError
 from pipeline.store.run import Run
 
 QUICK = {"polish": False, "rule_n_anchors": 16}
+
+
+class MeanOptions(Options):
+    """Of an analysis for these tests."""
+
+    a: int = option(1, "A number.", ge=0)
+
+
+def register(patch, compute):
+    """Put an analysis named ``mean`` beside the others, computed by a function."""
+    mean = Analysis("mean", "A mean.", MeanOptions, compute="tests:mean", table="tests:none")
+    patch.setattr(deriving, "ANALYSES", {**ANALYSES, "mean": mean})
+    real, version = deriving.function_of, deriving.code_version
+    patch.setattr(deriving, "function_of", lambda name: compute if name == "tests:mean" else real(name))
+    patch.setattr(deriving, "code_version", lambda name: "test" if name == "mean" else version(name))
+    return compute
+
+
+@pytest.fixture
+def compute(monkeypatch):
+    """The function of the analysis ``mean``: counts its calls."""
+    return register(monkeypatch, Counted())
 
 
 @pytest.fixture
@@ -32,9 +60,9 @@ class Counted:
     def __init__(self):
         self.calls = 0
 
-    def __call__(self, snapshot):
+    def __call__(self, run, options):
         self.calls += 1
-        ds = snapshot.cube()
+        ds = run.cube()
         words = ("row", ["left", "right", "left"], {"long_name": "words"})
         return xr.Dataset(
             {
@@ -52,10 +80,10 @@ def products(made, name="mean"):
     return sorted((made.info.directory / "derived").glob(f"{name}-*.zarr"))
 
 
-def test_derive__the_second_call_computes_nothing(whole):
-    compute, said = Counted(), []
-    first = derive(whole.info.directory, "mean", {"a": 1}, compute, said.append)
-    second = derive(whole.info.directory, "mean", {"a": 1}, compute, said.append)
+def test_derive__the_second_call_computes_nothing(whole, compute):
+    said = []
+    first = derive(whole.info.directory, "mean", {"a": 1}, echo=said.append)
+    second = derive(whole.info.directory, "mean", echo=said.append)
     assert compute.calls == 1
     xr.testing.assert_identical(first, second)
     assert "computed in" in said[0]
@@ -63,10 +91,9 @@ def test_derive__the_second_call_computes_nothing(whole):
     assert first.encoding["source"] == str(products(whole)[0])
 
 
-def test_derive__returns_what_was_computed(whole):
-    compute = Counted()
-    expected = compute(Run.open(whole.info.directory))
-    found = derive(whole.info.directory, "mean", {}, compute)
+def test_derive__returns_what_was_computed(whole, compute):
+    expected = compute(Run.open(whole.info.directory), MeanOptions())
+    found = derive(whole.info.directory, "mean")
     assert set(found.coords) == set(expected.coords)
     for name in expected.variables:
         np.testing.assert_array_equal(found[name].values, expected[name].values)
@@ -77,49 +104,77 @@ def test_derive__returns_what_was_computed(whole):
     assert found.attrs["number"] == 0.1
 
 
-def test_derive__is_plain_zarr_with_checksums(whole):
-    derive(whole.info.directory, "mean", {"a": [1, 2]}, Counted())
+def test_derive__is_plain_zarr_with_checksums(whole, compute):
+    derive(whole.info.directory, "mean", {"a": 2})
     (path,) = products(whole)
     ds = xr.open_zarr(path, consolidated=False)
-    assert json.loads(ds.attrs["derived_options"]) == {"a": [1, 2]}
+    assert json.loads(ds.attrs["derived_options"]) == {"a": 2}
     assert ds.attrs["parameters"]
     assert [ds["row"].attrs["words"][code] for code in ds["row"].values] == ["left", "right", "left"]
     codecs = [c["name"] for c in json.loads((path / "mean" / "zarr.json").read_text())["codecs"]]
     assert codecs[-1] == "crc32c"
 
 
-def test_derive__other_options_and_further_cells_compute_again(made):
-    compute = Counted()
+def test_derive__other_options_and_further_cells_compute_again(made, compute):
     made.commit(0)
     directory = made.info.directory
-    before = derive(directory, "mean", {"a": 1}, compute)
-    derive(directory, "mean", {"a": 2}, compute)
+    before = derive(directory, "mean", {"a": 1})
+    derive(directory, "mean", {"a": 2})
     assert compute.calls == 2
     made.commit(1)
-    after = derive(directory, "mean", {"a": 1}, compute)
+    after = derive(directory, "mean", {"a": 1})
     assert compute.calls == 3
     assert not after["mean"].equals(before["mean"])
     assert len(products(made)) == 3
-    store.withdraw(made.info, ["000001.json"])
-    xr.testing.assert_identical(derive(directory, "mean", {"a": 1}, compute), before)
+    withdraw(made.info, ["000001.json"])
+    xr.testing.assert_identical(derive(directory, "mean", {"a": 1}), before)
     assert compute.calls == 3
 
 
-def test_derive__other_code_computes_again(whole, monkeypatch):
-    from pipeline.products import derived
-
-    compute = Counted()
-    derive(whole.info.directory, "mean", {}, compute)
-    monkeypatch.setattr(derived, "analysis_version", lambda: "another")
-    derive(whole.info.directory, "mean", {}, compute)
+def test_derive__other_code_computes_again(whole, compute, monkeypatch):
+    derive(whole.info.directory, "mean")
+    monkeypatch.setattr(deriving, "code_version", lambda name: "another")
+    derive(whole.info.directory, "mean")
     assert compute.calls == 2
 
 
-def test_snapshot__does_not_see_later_commits(made):
+def test_code_version__follows_what_an_analysis_imports(monkeypatch):
+    """An edit of one analysis makes those stale that build on it, and no other."""
+    edited = versions._file("pipeline.analysis.attractors.hysteresis")
+    before = {name: versions.code_version(name) for name in ANALYSES}
+    real = versions.meaning_digest
+    monkeypatch.setattr(
+        versions, "meaning_digest", lambda paths: "edited" if list(paths) == [edited] else real(list(paths))
+    )
+    versions.code_version.cache_clear()
+    after = {name: versions.code_version(name) for name in ANALYSES}
+    versions.code_version.cache_clear()
+    assert before["hysteresis"] != after["hysteresis"]
+    assert before["chaos"] == after["chaos"]
+    assert before["dimension"] == after["dimension"]
+
+
+def test_builds_on__is_what_the_code_derives():
+    """Every analysis that a function derives is declared, so that an edit of it is seen."""
+    for name, analysis in ANALYSES.items():
+        module, _, function = analysis.compute.partition(":")
+        tree = ast.parse(versions._file(module).read_text())
+        (body,) = (n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
+        derived = {
+            node.args[0].value
+            for node in ast.walk(body)
+            if isinstance(node, ast.Call)
+            and getattr(node.func, "attr", "") == "derive"
+            and isinstance(node.args[0], ast.Constant)
+        }
+        assert derived <= set(analysis.builds_on), name
+
+
+def test_run__does_not_see_later_commits(made):
     made.commit(0)
-    snapshot = Run.open(made.info.directory)
+    run = AnalysedRun.of(made.info.directory)
     made.commit(1)
-    assert int((snapshot.cube()["status"] > 0).sum()) == made.plan.cells_in(0)
+    assert int((run.cube()["status"] > 0).sum()) == made.plan.cells_in(0)
     assert int((Run.open(made.info.directory).cube()["status"] > 0).sum()) > made.plan.cells_in(0)
 
 
@@ -144,44 +199,42 @@ def flip(path: Path):
     ],
     ids=["flipped", "chunk gone", "metadata gone", "metadata cut", "array gone", "attribute", "more"],
 )
-def test_derive__damage_is_said_and_mended(whole, harm):
-    compute, said = Counted(), []
-    first = derive(whole.info.directory, "mean", {}, compute)
+def test_derive__damage_is_said_and_mended(whole, compute, harm):
+    said = []
+    first = derive(whole.info.directory, "mean")
     harm(products(whole)[0])
-    again = derive(whole.info.directory, "mean", {}, compute, said.append)
+    again = derive(whole.info.directory, "mean", echo=said.append)
     assert compute.calls == 2
     assert "damaged" in said[0]
     xr.testing.assert_identical(again, first)
-    xr.testing.assert_identical(derive(whole.info.directory, "mean", {}, compute), first)
+    xr.testing.assert_identical(derive(whole.info.directory, "mean"), first)
     assert compute.calls == 2
     assert len(list((whole.info.directory / "derived").iterdir())) == 1
 
 
-def test_derive__a_damaged_cube_is_no_result(whole):
+def test_derive__a_damaged_cube_is_no_result(whole, compute):
     chunk = next((whole.info.directory / "cube.zarr" / "section").glob("c.*"))
     flip(chunk)
-    with pytest.raises(store.DamagedError, match="magpend verify"):
-        derive(whole.info.directory, "mean", {}, Counted())
+    with pytest.raises(DamagedError, match="magpend verify"):
+        derive(whole.info.directory, "mean")
     assert not products(whole)
 
 
-def test_derive__an_error_leaves_nothing(whole):
-    def fail(snapshot):
-        return xr.Dataset({"a": ("x", np.array([object()], dtype=object))})
-
+def test_derive__an_error_leaves_nothing(whole, monkeypatch):
+    register(monkeypatch, lambda run, options: xr.Dataset({"a": ("x", np.array([object()], dtype=object))}))
     with pytest.raises(TypeError, match="a: objects other than words"):
-        derive(whole.info.directory, "mean", {}, fail)
+        derive(whole.info.directory, "mean")
     assert not any((whole.info.directory / "derived").iterdir())
 
 
 def _write_often(directory, barrier, n):
-    compute = Counted()
+    register(pytest.MonkeyPatch(), Counted())
     for i in range(n):
         barrier.wait()
-        derive(directory, "mean", {"i": i}, compute)
+        derive(directory, "mean", {"a": i})
 
 
-def test_derive__writers_at_once(whole):
+def test_derive__writers_at_once(whole, compute):
     context = multiprocessing.get_context("spawn")
     barrier = context.Barrier(2)
     writers = [
@@ -193,18 +246,17 @@ def test_derive__writers_at_once(whole):
         writer.join()
     assert [w.exitcode for w in writers] == [0, 0]
     assert len(products(whole)) == len(list((whole.info.directory / "derived").iterdir())) == 5
-    compute = Counted()
     for i in range(5):
-        derive(whole.info.directory, "mean", {"i": i}, compute)
+        derive(whole.info.directory, "mean", {"a": i})
     assert compute.calls == 0
 
 
 def test_attractors__matching_again_identifies_nothing_again(whole):
     said = []
-    found = attractors(whole.info.directory, echo=said.append, **QUICK)
+    found = derive(whole.info.directory, "attractors", {**QUICK}, echo=said.append)
     assert found.attrs["matched"] == 1
     assert found["state"].values.tolist() == ["psi1", "psi2", "psi1_dot", "psi2_dot"]
-    again = attractors(whole.info.directory, echo=said.append, threshold=0.2, **QUICK)
+    again = derive(whole.info.directory, "attractors", {"threshold": 0.2, **QUICK}, echo=said.append)
     assert [line for line in said if "taken from" in line] == [f"identified: taken from {_identified(whole)}"]
     assert again.attrs["match_threshold"] == 0.2
     assert len(products(whole, "attractors")) == 2
@@ -216,14 +268,18 @@ def _identified(made):
 
 
 def test_attractors__a_default_given_is_no_other_option(whole):
-    one = attractors(whole.info.directory, **QUICK)
-    two = attractors(whole.info.directory, threshold=0.3, look_back=3, rule_box=0.1, n_points=64.0, **QUICK)
+    one = derive(whole.info.directory, "attractors", {**QUICK})
+    two = derive(
+        whole.info.directory,
+        "attractors",
+        {"threshold": 0.3, "look_back": 3, "rule_box": 0.1, "n_points": 64.0, **QUICK},
+    )
     assert one.encoding["source"] == two.encoding["source"]
 
 
 def test_attractors__pending_cells_stay_pending(made):
     made.commit(0)
-    found = attractors(made.info.directory, **QUICK)
+    found = derive(made.info.directory, "attractors", {**QUICK})
     pending = found["status"] == 0
     assert int((~pending).sum()) == made.plan.cells_in(0)
     assert (found["attractor_id"].where(pending, -1) == -1).all()
@@ -231,5 +287,5 @@ def test_attractors__pending_cells_stay_pending(made):
 
 def test_attractors__unknown_option(whole):
     with pytest.raises(SpecError, match="did you mean threshold"):
-        attractors(whole.info.directory, treshold=0.2)
+        derive(whole.info.directory, "attractors", {"treshold": 0.2})
     assert not products(whole, "*")

@@ -69,6 +69,7 @@ def _attractor(one: xr.Dataset) -> Row:
         "mirror_partner": int(one["mirror_partner"]),
         "mirror_distance": float(one["mirror_distance"]),
         "n_cells": int(one["n_cells"]),
+        **{name: _words(one[name])[int(one[name])] for name in ("match_basis",) if name in one},
     }
 
 
@@ -116,10 +117,21 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dic
         "side": _distinct(r["side"] for r in rows),
         **_ranges(ds, rows, dims),
         "cells": str(sum(r["n_cells"] for r in rows)),
+        "id rests on": _evidence([r["match_basis"] for r in rows if "match_basis" in r]),
     }
     if share:
         words["max share"] = _largest_share(ds, rows, dims)
     return words | {"mirror": _distinct(r["mirror_partner"] for r in rows if r["mirror_partner"] >= 0) or "-"}
+
+
+def _evidence(bases: Sequence[str]) -> str:
+    """Say what an id rests on: followed branches, doublings, or at how many points on distance alone."""
+    links = [basis for basis in bases if basis != "first_appearance"]
+    told = [name for name in ("branch", "doubling") if name in links]
+    n = links.count("distance")
+    if n and not told:
+        return "distance alone"
+    return ", ".join(told + ([f"distance at {n} of {len(links)}"] if n else [])) or "-"
 
 
 # ---- basins ------------------------------------------------------------------------------------

@@ -1,0 +1,65 @@
+"""Compiled functions as the plain Python that they were written in, and all that they call.
+
+`function.py_func` alone would still call compiled functions, and compile them for the types that it meets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from types import CellType, CodeType, FunctionType, ModuleType
+from typing import Any
+
+
+class _PlainModule:
+    """A module whose compiled functions are found in plain Python."""
+
+    def __init__(self, module: ModuleType, known: dict[int, Any]) -> None:
+        self._module, self._known = module, known
+
+    def __getattr__(self, name: str) -> Any:
+        return _replaced(getattr(self._module, name), self._known)
+
+
+def plain(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a compiled function as plain Python, down to what it calls.
+
+    Parameters
+    ----------
+    function
+        A dispatcher of numba's, found by its attribute ``py_func``; anything else is returned as it is.
+    """
+    found: Callable[..., Any] = _replaced(function, {})
+    return found
+
+
+def _replaced(value: Any, known: dict[int, Any]) -> Any:
+    if id(value) in known:
+        return known[id(value)]
+    source = getattr(value, "py_func", None)
+    if isinstance(source, FunctionType):
+        return _rebuilt(value, source, known)
+    if isinstance(value, ModuleType):
+        return _PlainModule(value, known)
+    return value
+
+
+def _rebuilt(dispatcher: Any, source: FunctionType, known: dict[int, Any]) -> FunctionType:
+    cells = tuple(CellType() for _ in source.__closure__ or ())
+    scope = dict(source.__globals__)
+    function = FunctionType(source.__code__, scope, source.__name__, source.__defaults__, cells)
+    function.__kwdefaults__ = source.__kwdefaults__
+    known[id(dispatcher)] = function  # before what it calls, which may be itself
+    for name in set(_names(source.__code__)):
+        if name in scope:
+            scope[name] = _replaced(scope[name], known)
+    for own, cell in zip(cells, source.__closure__ or (), strict=True):
+        own.cell_contents = _replaced(cell.cell_contents, known)
+    return function
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    """Names that a function and those defined in it look up."""
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)

@@ -1,0 +1,38 @@
+"""Basins as an analysis of a run (`pipeline.products.basins`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from pipeline.products.attractors import AttractorOptions
+from pipeline.products.basins import BasinOptions
+from pipeline.products.product import Table
+
+if TYPE_CHECKING:
+    from pipeline.store.run import Run
+
+
+def needs_starts(run: Run, options: BasinOptions) -> None:
+    """Refuse a run whose cells are no independent initial conditions."""
+    from pipeline.analysis.basins.basins import check_starts
+
+    check_starts(run.cube())
+
+
+def basins(run: Any, options: BasinOptions) -> xr.Dataset:
+    """Basins of a sweep: cells, fractions, boundaries."""
+    from pipeline.analysis.basins.basins import basins as compute
+
+    shared = options.part(AttractorOptions)
+    own = {name: value for name, value in options.plain().items() if name not in shared}
+    return compute(run.cube(), run.derive("attractors", **shared), **own)
+
+
+def basins_table(ds: xr.Dataset) -> Table:
+    """Table of the fractions, and lines of the boundaries' numbers."""
+    from pipeline.analysis import tables
+
+    rows = tables.basin_rows(ds)
+    return Table(rows, tables.basin_lines(ds, rows))

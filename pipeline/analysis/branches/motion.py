@@ -1,0 +1,77 @@
+"""What the whole of an orbit shows: the class of its motion, and how it turns."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from magpend_core.engine.variational import with_tangents
+from magpend_core.models.model import Classifier
+from magpend_core.models.parameters import Parameters
+from magpend_core.sections import run_branches
+from magpend_core.trajectory import trajectory
+from pipeline.analysis.branches.following import Branch
+from pipeline.analysis.branches.problems import FREQUENCY, RTOL
+from pipeline.products.reporting import track
+
+SAMPLES = 64
+"""Instants per drive period at which the side of an orbit is judged."""
+
+
+def sides_of(branches: Sequence[Branch], base: Parameters) -> list[np.ndarray]:
+    """Codes of the model's classifier for the orbits of each branch, from the whole orbit.
+
+    Parameters
+    ----------
+    branches
+        Of a model with a classifier.
+    base
+        What was integrated; parameters in which a branch differs are its own.
+    """
+    classifier = base.model.classifier
+    assert classifier is not None
+    return [_sides(branch, base, classifier) for branch in track(branches, "telling sides")]
+
+
+def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
+    family = branch.family
+    own = base.replace(**dict(zip(base.names, map(float, family.parameters), strict=True)))
+    name = family.free[0]
+    angles = np.flatnonzero(family.system.is_angle)
+    found = np.empty(len(branch.points), np.int8)
+    for j, point in enumerate(branch.points):
+        value = float(family.values(point.u)[0])
+        frequency = value if name == FREQUENCY else family.frequency_hz
+        parameters = own if name == FREQUENCY else own.replace(**{name: value})
+        times = np.arange(family.period * SAMPLES + 1) / (SAMPLES * frequency)
+        states = trajectory(parameters, frequency, family.state(point.u), times)
+        turns = np.round((states[-1, angles] - states[0, angles]) / (2.0 * np.pi)).astype(np.int64)
+        found[j] = classifier.classify(states, turns, _SEEN_WHOLE, _values(parameters))
+    return found
+
+
+_SEEN_WHOLE = np.array(np.inf)
+"""Frequency at which a motion is judged: between samples of the whole orbit nothing stays unseen."""
+
+
+def _values(parameters: Parameters) -> Mapping[str, Any]:
+    return parameters.as_dict()
+
+
+def rotation_of(branch: Branch) -> np.ndarray:
+    """Mean turns per drive period of each angle, from the branch's first orbit."""
+    family = branch.family
+    if not any(family.system.is_angle):
+        return np.zeros(0)
+    n = family.system.n_states
+    rows = family.rows(branch.points[0].u[None])
+    # the extended system, since that code is compiled already
+    extended = dataclasses.replace(with_tangents(family.system, n), n_controlled=None)
+    result = run_branches(
+        rows.parameters[:, None], rows.frequency_hz[:, None], np.append(rows.states[0], np.eye(n))[None],
+        n_transient=0, n_keep=family.period + 1, rtol=RTOL, atol=RTOL, system=extended,
+    )  # fmt: skip
+    return np.asarray(result.turns[0, 0] / family.period, np.float64)

@@ -1,0 +1,228 @@
+"""Tables of branches and of curves: what ``magpend analyse branches`` and ``curves`` say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.branches.bifurcations import FOLD
+from pipeline.analysis.branches.problems import FREQUENCY
+from pipeline.layout.vocabulary import parameter_name
+from pipeline.products.product import Table
+
+Row = dict[str, Any]
+
+
+def words(variable: xr.DataArray) -> list[str]:
+    """Meanings of a flag variable's values."""
+    meanings = str(variable.attrs["flag_meanings"]).split()
+    return [meanings[int(v)] for v in variable.values]
+
+
+def branches_table(ds: xr.Dataset) -> Table:
+    """Table of the located bifurcations; lines of the stable segments and of what was left out.
+
+    ``unstable_below`` and ``unstable_above`` say how many multipliers are unstable on the two sides of the
+    parameter; at a fold both orbits lie on one side, and the other says ``none``.
+    """
+    rows = table_of(ds)
+    if not ds.sizes["branch"]:
+        return Table(rows, ["no branch: no closed orbit to begin with", *_left_out(ds)])
+    head = f"{ds.sizes['bifurcation']} bifurcations on {ds.sizes['branch']} branches"
+    return Table(rows, [head, "", *_lines(ds, rows), "", *_windows(ds), *_left_out(ds)])
+
+
+def table_of(ds: xr.Dataset) -> list[Row]:
+    """Located bifurcations by rising parameter value, one dict for each; see `branches_table`.
+
+    The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``. Parameters
+    in which the branches differ follow, and ``side`` where the model has words for motions.
+    """
+    kinds, criticality = words(ds["kind"]), ["" if w == "unknown" else w for w in words(ds["criticality"])]
+    sides = words(ds["bifurcation_side"]) if "bifurcation_side" in ds else None
+    rows = []
+    for k in np.argsort(ds["value"].values, kind="stable"):
+        one = ds.isel(bifurcation=int(k))
+        branch = int(one["of_branch"])
+        below, above = _unstable(one, kinds[k])
+        rows.append(
+            {
+                parameter_name(str(ds.attrs["parameter"])): float(one["value"]),
+                "bracket": float(one["bracket"]),
+                "type": kinds[k],
+                "criticality": criticality[k],
+                "period": int(ds["orbit_period"].values[branch]),
+                **({} if sides is None else {"side": sides[k]}),
+                "multiplier_real": float(one["critical_real"]),
+                "multiplier_imag": float(one["critical_imag"]),
+                "unstable_below": below,
+                "unstable_above": above,
+                **fixed_of(ds, branch),
+                "branch": branch,
+                "to_branch": int(one["to_branch"]),
+            }
+        )
+    return rows
+
+
+def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
+    """Where a branch lies in the parameters that it does not follow: the frequency, and what differs."""
+    parameter = str(ds.attrs["parameter"])
+    names = [FREQUENCY] if parameter != FREQUENCY else []
+    names += [str(n) for n in ds.data_vars if str(ds[n].attrs.get("long_name", "")) == f"value of {n}"]
+    return {parameter_name(n): float(ds[n].values[branch]) for n in names}
+
+
+def _unstable(one: xr.Dataset, kind: str) -> tuple[str, str]:
+    """How many multipliers are unstable below and above in the parameter."""
+    before, after = int(one["n_unstable_before"]), int(one["n_unstable_after"])
+    rises = bool(one["rises_before"])
+    if kind == FOLD:
+        both = f"{min(before, after)}|{max(before, after)}"
+        return (both, "none") if rises else ("none", both)
+    return (str(before), str(after)) if rises else (str(after), str(before))
+
+
+def _lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
+    parameter = parameter_name(str(ds.attrs["parameter"]))
+    table = []
+    for row in rows:
+        to = f" -> {row['to_branch']}" if row["to_branch"] >= 0 else ""
+        z = complex(row["multiplier_real"], row["multiplier_imag"])
+        known = {
+            _with_unit(ds): f"{row[parameter]:.7f}", "type": row["type"], "criticality": row["criticality"],
+            "period": str(row["period"]), "side": row.get("side", ""), "multiplier": _number(z),
+            "unstable below, above": f"{row['unstable_below']}, {row['unstable_above']}",
+            "branch": f"{row['branch']}{to}{_at(ds, row['branch'])}",
+        }  # fmt: skip
+        table.append(known if "side" in row else {n: v for n, v in known.items() if n != "side"})
+    return _aligned(table)
+
+
+def _with_unit(ds: xr.Dataset) -> str:
+    units = str(ds.attrs["parameter_units"])
+    return (
+        f"{ds.attrs['parameter']} {units}".rstrip() if units not in ("", "1") else str(ds.attrs["parameter"])
+    )
+
+
+def _aligned(rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """Align rows under their headings."""
+    if not rows:
+        return []
+    cells = [list(rows[0]), *(list(row.values()) for row in rows)]
+    widths = [max(len(line[k]) for line in cells) for k in range(len(cells[0]))]
+    return ["  ".join(w.ljust(n) for w, n in zip(line, widths, strict=True)).rstrip() for line in cells]
+
+
+def _at(ds: xr.Dataset, branch: int) -> str:
+    """Values of what is not varied, in words."""
+    found = [
+        f"{value:g} Hz" if name == parameter_name(FREQUENCY) else f"{name} {value:g}"
+        for name, value in fixed_of(ds, branch).items()
+    ]
+    return f" at {', '.join(found)}" if found else ""
+
+
+def _number(z: complex) -> str:
+    return f"{z.real:.5f}" if abs(z.imag) < 1e-9 else f"{z.real:.5f}{z.imag:+.5f}i"
+
+
+def _windows(ds: xr.Dataset) -> list[str]:
+    lines = ["stable segments"]
+    for w in windows_of(ds):
+        ends = f"{w['from']:.7f} ({w['begins']}) to {w['to']:.7f} ({w['ends']})"
+        side = f", {w['side']}" if w["side"] else ""
+        lines.append(f"  period {w['period']}{side}, branch {w['branch']}{_at(ds, w['branch'])}: {ends}")
+    return lines if len(lines) > 1 else ["no stable segment"]
+
+
+def _left_out(ds: xr.Dataset) -> list[str]:
+    lines = str(ds.attrs.get("left_out", "")).splitlines()
+    return ["", "left out", *(f"  {line}" for line in lines)] if lines else []
+
+
+def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
+    """Stable segments of the branches, and what bounds each of them, by period, side and parameter."""
+    found = []
+    for i in range(ds.sizes["branch"]):
+        n = int(ds["n_points"][i])
+        for first, last in _stable_runs(ds["n_unstable"].values[i, :n] == 0, _ends_of(ds, i)[0] == "closed"):
+            ends = sorted([_bound(ds, i, first, first - 1, 0), _bound(ds, i, last, last, 1)])
+            middle = (first + (last - first) % n // 2) % n
+            found.append(
+                {
+                    "from": ends[0][0],
+                    "to": ends[1][0],
+                    "begins": ends[0][1],
+                    "ends": ends[1][1],
+                    "period": int(ds["orbit_period"][i]),
+                    "side": words(ds["side"][i, middle : middle + 1])[0] if "side" in ds else "",
+                    **fixed_of(ds, i),
+                    "branch": i,
+                }
+            )
+    return sorted(found, key=lambda w: (w["period"], w["side"], w["from"]))
+
+
+def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
+    """First and last points of runs of stable points; on a closed branch the ends hang together."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], stable.astype(np.int8), [0]])))
+    runs = [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
+    if closed and len(runs) > 1 and stable[0] and stable[-1]:
+        runs = [(runs[-1][0], runs[0][1]), *runs[1:-1]]
+    return runs
+
+
+def _ends_of(ds: xr.Dataset, branch: int) -> tuple[str, str]:
+    rows = ds.isel(branch=slice(branch, branch + 1))
+    return words(rows["first_end"])[0], words(rows["last_end"])[0]
+
+
+def _bound(ds: xr.Dataset, branch: int, point: int, after: int, end: int) -> tuple[float, str]:
+    """Parameter value and name of what bounds a stable segment: a bifurcation after `after`, or the end."""
+    here = np.flatnonzero((ds["of_branch"].values == branch) & (ds["after"].values == after))
+    value = float(ds["parameter"][branch, point])
+    if len(here):
+        return _named(ds, int(here[0 if end else -1]))
+    if point not in (0, int(ds["n_points"][branch]) - 1):
+        return value, "not located"
+    origins = np.flatnonzero(ds["to_branch"].values == branch)
+    name = _ends_of(ds, branch)[end]
+    if name in ("start", "period_halving") and len(origins):
+        nearest = origins[np.argmin(np.abs(ds["value"].values[origins] - value))]
+        parent = int(ds["orbit_period"][int(ds["of_branch"][nearest])])
+        at, kind = _named(ds, int(nearest))
+        return at, f"{kind} of period {parent}"
+    return value, name
+
+
+def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
+    criticality = words(ds["criticality"][k : k + 1])[0]
+    name = words(ds["kind"][k : k + 1])[0]
+    return float(ds["value"][k]), name if criticality == "unknown" else f"{criticality} {name}"
+
+
+# ---- curves ------------------------------------------------------------------------------------
+
+
+def curves_table(ds: xr.Dataset) -> Table:
+    """Table of the curves: kind, period, points, and the ranges of both parameters."""
+    names = [parameter_name(str(ds.attrs[f"{role}_parameter"])) for role in ("first", "second")]
+    kinds = words(ds["kind"])
+    rows: list[Row] = []
+    for i in range(ds.sizes["curve"]):
+        one, n = ds.isel(curve=i), int(ds["n_points"][i])
+        row: Row = {"curve": i, "type": kinds[i], "period": int(one["orbit_period"]), "n_points": n}
+        for role, name in zip(("first", "second"), names, strict=True):
+            values = one[role].values[:n]
+            row |= {f"{name}_min": float(values.min()), f"{name}_max": float(values.max())}
+        rows.append(row)
+    lines = [f"{len(rows) or 'no'} curve{'s' * (len(rows) != 1)} in the plane of {names[0]} and {names[1]}"]
+    for row in rows:
+        spans = ", ".join(f"{n} {row[f'{n}_min']:.7g} to {row[f'{n}_max']:.7g}" for n in names)
+        lines.append(f"  {row['curve']}: {row['type']}, period {row['period']}: {spans}")
+    return Table(rows, lines)

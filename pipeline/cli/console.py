@@ -1,0 +1,215 @@
+"""What the commands say: results on the standard output, everything else beside it.
+
+Notes, warnings and progress go to the standard error and, with ``--log``, with times to a file; so the
+standard output can be read by a program, or by ``head``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.products.reporting import reporting
+from pipeline.runs.progress import duration
+
+LOG = logging.getLogger("magpend")
+
+FIRST_LINE_S, LINE_EVERY_S, BAR_EVERY_S = 2.0, 10.0, 0.3
+
+
+class EnoughError(Exception):
+    """Whoever read the standard output has enough, as ``head`` does."""
+
+
+def note(line: str) -> None:
+    """Say what happens; not with ``--quiet``."""
+    LOG.info(line)
+
+
+def result(line: str) -> None:
+    """Write a line of a result to the standard output.
+
+    Raises
+    ------
+    EnoughError
+        If nobody reads it any more.
+    """
+    try:
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise EnoughError from None
+
+
+def is_shown() -> bool:
+    """Whether notes are shown, not with ``--quiet``."""
+    return any(isinstance(h, _Stderr) and h.level <= logging.INFO for h in LOG.handlers)
+
+
+class _Stderr(logging.Handler):
+    """Writes to whatever the standard error is now, above a progress bar if one is drawn."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        bar = Display.current
+        if bar is not None:
+            bar.clear()
+        sys.stderr.write(f"{self.format(record)}\n")
+
+
+def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
+    """Set who hears what.
+
+    Raises
+    ------
+    SpecError
+        If the log file cannot be written.
+    """
+    close()
+    LOG.propagate = False
+    LOG.setLevel(logging.DEBUG)
+    shown = logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO
+    stderr = _Stderr(shown)
+    LOG.addHandler(stderr)
+    if log is not None:
+        try:
+            file = logging.FileHandler(log, encoding="utf-8")
+        except OSError as error:
+            from pipeline.spec.problems import SpecError
+
+            raise SpecError([f"--log {log}: cannot be written to ({error.strerror})."]) from None
+        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        LOG.addHandler(file)
+        LOG.debug("command: %s", " ".join(sys.argv))
+
+
+def close() -> None:
+    """Close the log file, if there is one."""
+    for handler in list(LOG.handlers):
+        LOG.removeHandler(handler)
+        handler.close()
+
+
+class Display:
+    """Shows how far a command is: a bar on a terminal, else a line now and then.
+
+    It hears what `pipeline.products.reporting` reports, and from the first seconds on says at intervals
+    what is being done and for how long, reports or not.
+
+    Parameters
+    ----------
+    name
+        What is shown while nothing is reported.
+    terminal
+        Draw a bar; by default if the standard error is a terminal.
+    clock
+        Seconds that only ever grow.
+    """
+
+    current: Display | None = None
+
+    def __init__(
+        self, name: str, *, terminal: bool | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._terminal = sys.stderr.isatty() if terminal is None else terminal
+        self._clock, self._started = clock, clock()
+        self._work = Work(name, self._started)
+        self._drawn = False
+        self._lock, self._over = threading.RLock(), threading.Event()
+
+    def __call__(self, what: str, done: float, total: float) -> None:
+        """Take a report."""
+        with self._lock:
+            if what != self._work.what:
+                self._work = Work(what, self._clock(), done)
+            self._work.done, self._work.total, self._work.heard = done, total, self._clock()
+
+    def show(self) -> None:
+        """Say now how far the work is."""
+        with self._lock:
+            line = self._work.line(self._clock())
+            if not self._terminal:
+                note(line)
+            elif is_shown():
+                sys.stderr.write(f"\r\x1b[2K{line}")
+                sys.stderr.flush()
+                self._drawn = True
+
+    def clear(self) -> None:
+        """Take the bar away."""
+        with self._lock:
+            if self._drawn:
+                sys.stderr.write("\r\x1b[2K")
+                sys.stderr.flush()
+                self._drawn = False
+
+    def watch(self) -> None:
+        """Show at intervals until `stop` is called."""
+        pause = FIRST_LINE_S
+        while not self._over.wait(pause):
+            self.show()
+            pause = BAR_EVERY_S if self._terminal else LINE_EVERY_S
+
+    def stop(self) -> None:
+        """End `watch`, and take the bar away."""
+        self._over.set()
+        self.clear()
+
+
+@dataclass
+class Work:
+    """A piece of work and how far it is.
+
+    Attributes
+    ----------
+    what : str
+    started : float
+        When the first report of it came [s].
+    begun : float
+        How much was done then.
+    done, total : float
+        As last reported; without a total, only the time is known.
+    heard : float
+        When the last report came [s].
+    """
+
+    what: str
+    started: float
+    begun: float = 0.0
+    done: float = 0.0
+    total: float = 0.0
+    heard: float = 0.0
+
+    def line(self, now: float) -> str:
+        """Say how far it is, and how long it will take."""
+        elapsed = max(now - self.started, 0.0)
+        if not self.total:
+            return f"{self.what}: {duration(elapsed)} so far"
+        share = min(self.done / self.total, 1.0)
+        text = f"{self.what}: {self.done:g} of {self.total:g} ({100 * share:.0f} %)"
+        if share == 1:
+            return text
+        took, more = self.heard - self.started, self.done - self.begun
+        left = took * (self.total - self.done) / more - (now - self.heard) if more > 0 else 0.0
+        return f"{text}, {duration(left)} left" if left > 0 else f"{text}, {duration(elapsed)} so far"
+
+
+@contextlib.contextmanager
+def progress(name: str) -> Iterator[None]:
+    """Show the progress of what is done inside, which has a name."""
+    display = Display(name)
+    Display.current = display
+    watcher = threading.Thread(target=display.watch, daemon=True)
+    watcher.start()
+    try:
+        with reporting(display):
+            yield
+    finally:
+        display.stop()
+        watcher.join()
+        Display.current = None

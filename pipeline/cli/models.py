@@ -1,0 +1,109 @@
+"""``magpend models`` and ``magpend presets``: what can be integrated, and with which values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipeline.cli.common import Json
+from pipeline.cli.options import completing
+
+if TYPE_CHECKING:
+    from magpend_core.models.model import Model
+
+
+DEFAULT = "pendulum"
+"""As `magpend_core.models.DEFAULT`, which is not imported for the help."""
+
+
+def names() -> Iterable[str]:
+    """Names of the models that ship."""
+    from magpend_core.models import model_names
+
+    return model_names()
+
+
+def models(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Show this model alone, with all it has.", autocompletion=completing(names)),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """List the models: their states, parameters, quantities and presets."""
+    from magpend_core.models import load_model, model_names
+    from pipeline.cli.common import tell
+    from pipeline.products.product import Table
+
+    chosen = [load_model(name)] if name else [load_model(n) for n in model_names()]
+    rows = [_described(model) for model in chosen]
+    if name:
+        lines = _all_of(chosen[0])
+    else:
+        width = max(len(model.name) for model in chosen)
+        lines = [f"{m.name:{width}}  {m.title}; states {', '.join(m.state_names)}" for m in chosen]
+        lines.append('all of one: magpend models NAME; a specification chooses with: model = "NAME"')
+    tell(Table(rows, lines), None, json)
+
+
+def _described(model: Model) -> dict[str, Any]:
+    about = [
+        {"name": s.name, "unit": s.unit, "meaning": s.meaning, "on_circle": s.on_circle, "scale": s.scale}
+        for s in model.states
+    ]
+    return {
+        "name": model.name,
+        "title": model.title,
+        "states": about,
+        "parameters": [{"name": p.name, "unit": p.unit, "meaning": p.meaning} for p in model.parameters],
+        "quantities": [{"name": q.name, "unit": q.unit, "meaning": q.meaning} for q in model.quantities],
+        "motions": list(model.classifier.words) if model.classifier else [],
+        "presets": [{"name": p.name, "values": dict(model.load(p.name).as_dict())} for p in model.presets],
+    }
+
+
+def _all_of(model: Model) -> list[str]:
+    lines = [f"{model.name}: {model.title}", f"sections are taken at {model.section}", "", "states"]
+    lines += _table([(s.name, s.unit, s.meaning) for s in model.states])
+    lines += ["", "parameters"]
+    lines += _table([(p.name, p.unit, p.meaning) for p in model.parameters])
+    if model.quantities:
+        lines += ["", "quantities", *_table([(q.name, q.unit, q.meaning) for q in model.quantities])]
+    if model.classifier:
+        lines += ["", f"motions: {', '.join(model.classifier.words)} ({model.classifier.meaning})"]
+    for preset in model.preset_names:
+        lines += ["", *_preset(model, preset)]
+    return lines
+
+
+def _table(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
+    return [
+        "  " + "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def _preset(model: Model, name: str) -> list[str]:
+    """Values of a preset, and where each comes from."""
+    known, origin = model.load(name), model.preset(name).provenance
+    rows = [
+        (p.name, f"{known[p.name]:g}", p.unit, p.meaning, origin.get(p.name, "")) for p in model.parameters
+    ]
+    return [f"preset {name}", *_table(rows)]
+
+
+def presets(
+    name: Annotated[str | None, typer.Argument(help="Show this preset alone.")] = None,
+    model: Annotated[str, typer.Option(help="Whose presets.", autocompletion=completing(names))] = DEFAULT,
+) -> None:
+    """List the presets of a model: values, units, and where each comes from."""
+    from magpend_core.models import load_model
+    from pipeline.cli import console
+
+    chosen = load_model(model)
+    for preset in [chosen.preset(name).name] if name else chosen.preset_names:
+        for line in _preset(chosen, preset):
+            console.result(line)

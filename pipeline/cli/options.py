@@ -1,0 +1,168 @@
+"""From a model of options to a command: names, types, defaults, bounds and help, none of them twice."""
+
+from __future__ import annotations
+
+import inspect
+import types
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
+
+import typer
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
+
+    from pipeline.products.product import Options
+
+Command = Callable[..., None]
+
+QUIET = Annotated[bool, typer.Option("--quiet", "-q", help="Results and warnings alone.")]
+VERBOSE = Annotated[bool, typer.Option("--verbose", "-v", help="Say more, and show the trace of an error.")]
+LOGFILE = Annotated[
+    Path | None, typer.Option("--log", metavar="FILE", help="Write a log, with times, to this file, too.")
+]
+_METAVARS = {int: "N", float: "X", str: "TEXT"}
+_VOICES = {"quiet": (QUIET, False), "verbose": (VERBOSE, False), "log": (LOGFILE, None)}
+
+
+def speaking(command: Command) -> Command:
+    """Give a command ``--quiet``, ``--verbose`` and ``--log``, and show the progress of what it does."""
+
+    def run(*args: Any, **given: Any) -> None:
+        from pipeline.cli import console
+
+        console.configure(**{name: given.pop(name) for name in _VOICES})
+        with console.progress(command.__name__):
+            command(*args, **given)
+
+    voices = [_keyword(name, kind, default) for name, (kind, default) in _VOICES.items()]
+    return _signed(run, command, [*_own(command), *voices])
+
+
+def taking(model: type[Options], command: Command) -> Command:
+    """Give a command that takes ``options`` one option for each field of a model.
+
+    What is given is validated as a whole, and the command is called with the model.
+    """
+
+    def run(*args: Any, **given: Any) -> None:
+        from pipeline.spec.problems import SpecError, validated
+
+        wanted, problems = {}, []
+        for name in model.model_fields:
+            value = given.pop(name)
+            if value is None or value == []:
+                continue
+            try:
+                wanted[name] = _value(model.model_fields[name], flag_of(model, name), value)
+            except SpecError as error:
+                problems += error.problems
+        if problems:
+            raise SpecError(problems)
+        command(*args, options=validated(model, wanted), **given)
+
+    own = [p for p in _own(command) if p.name != "options"]
+    return _signed(run, command, [*own, *(_parameter(model, name) for name in model.model_fields)])
+
+
+def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Return what a shell asks for the words that an incomplete one may become."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [word for word in words() if word.startswith(incomplete)]
+
+    return complete
+
+
+def flag_of(model: type[Options], name: str) -> str:
+    """What a field is called on the command line."""
+    extra: Any = model.model_fields[name].json_schema_extra or {}
+    return str(extra.get("flag") or f"--{name.replace('_', '-')}")
+
+
+def help_of(info: FieldInfo) -> str:
+    """Sentence of a field with its unit and bounds."""
+    extra: Any = info.json_schema_extra or {}
+    text = (info.description or "").rstrip(".")
+    unit = f" [{extra['unit']}]" if extra.get("unit") else ""
+    limits = bounds_of(info)
+    return f"{text}{unit}{'; ' if limits else ''}{limits}."
+
+
+def bounds_of(info: FieldInfo) -> str:
+    """Bounds of a field in words, such as ``above 0, at most 1``; empty if there are none."""
+    words = {"gt": "above {}", "ge": "{} or more", "lt": "below {}", "le": "at most {}"}
+    found = []
+    for bound in info.metadata:
+        for name, text in words.items():
+            if getattr(bound, name, None) is not None:
+                found.append(text.format(f"{getattr(bound, name):g}"))
+    return ", ".join(found)
+
+
+def kind_of(info: FieldInfo) -> Any:
+    """Type of a field without ``None``."""
+    kind = info.annotation
+    if get_origin(kind) in (Union, types.UnionType):
+        (kind,) = [part for part in get_args(kind) if part is not type(None)]
+    return kind
+
+
+def _parameter(model: type[Options], name: str) -> inspect.Parameter:
+    from pipeline.products.product import default_of
+
+    info, flag = model.model_fields[name], flag_of(model, name)
+    kind, default = kind_of(info), default_of(model, name)
+    text = help_of(info) + (
+        f" Default: {_shown(default)}." if default not in (None, "", [], {}, False) else ""
+    )
+    declared: dict[str, Any] = {"help": text}
+    if get_origin(kind) is Literal:
+        choices = [c for c in get_args(kind) if c]
+        declared |= {"metavar": "|".join(choices), "autocompletion": completing(lambda: choices)}
+        kind = str
+    elif kind is bool:
+        flag = f"{flag}/--no-{flag[2:]}" if default else flag
+    elif get_origin(kind) is dict:
+        declared |= {"metavar": "AXIS=VALUE"}
+        kind = list[str]
+    elif get_origin(kind) is tuple:
+        declared |= {"metavar": "LOW HIGH"}
+    elif kind in _METAVARS:
+        declared |= {"metavar": _METAVARS[kind]}
+    return _keyword(
+        name,
+        Annotated[kind if info.is_required() else kind | None, typer.Option(flag, **declared)],
+        inspect.Parameter.empty if info.is_required() else None,
+    )
+
+
+def _shown(default: Any) -> str:
+    return "yes" if default is True else f"{default:g}" if isinstance(default, float) else str(default)
+
+
+def _value(info: FieldInfo, flag: str, value: Any) -> Any:
+    from pipeline.cli.common import read_pairs
+
+    if get_origin(kind_of(info)) is dict:
+        return read_pairs(flag, value, "frequency=2.2")
+    return value
+
+
+def _own(command: Command) -> list[inspect.Parameter]:
+    return list(inspect.signature(command, eval_str=True).parameters.values())
+
+
+def _keyword(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _signed(run: Command, command: Command, parameters: Sequence[inspect.Parameter]) -> Command:
+    signed: Any = run
+    signed.__name__, signed.__doc__ = command.__name__, command.__doc__
+    signed.__signature__ = inspect.Signature(
+        [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]
+    )
+    signed.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run

@@ -1,0 +1,295 @@
+"""The tables of README and docs, made from the code: ``python -m pipeline.cli.reference``.
+
+A table stands between the marks ``<!-- reference: NAME -->`` and ``<!-- /reference -->``; what is between
+them is replaced. With ``--check`` nothing is written, and the exit code is 1 if a page is not true any more.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+_BLOCK = re.compile(r"(<!-- reference: ([\w ]+) -->\n).*?(<!-- /reference -->)", re.DOTALL)
+
+
+def pages() -> list[Path]:
+    """Files that have tables."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def rendered(text: str) -> str:
+    """Return a page with all its tables made again.
+
+    Raises
+    ------
+    KeyError
+        If a mark names a table that does not exist.
+    """
+    return _BLOCK.sub(lambda block: f"{block[1]}{TABLES[block[2]]()}\n{block[3]}", text)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of Markdown."""
+    lines = [list(head), ["---"] * len(head), *(list(row) for row in rows)]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines)
+
+
+# ---- commands ----------------------------------------------------------------------------------
+
+
+def commands() -> str:
+    """Every command in a line."""
+    rows = ((f"`magpend {name}{_arguments(command)}`", _first(command)) for name, command in _commands())
+    return table(("command", "does"), rows)
+
+
+SHARED = ("plot fractions", "analyse attractors", "analyse branches")
+"""Commands whose options others have too: listed with these alone."""
+
+
+def options() -> str:
+    """Every command with its options."""
+    found, parts = dict(_commands()), []
+    listed = {name: dict(_options(found[name])) for name in SHARED}
+    for name, command in found.items():
+        own, also = dict(_options(command)), list[str]()
+        for other in SHARED:
+            if other != name and listed[other].items() <= own.items() and not _covered(other, also):
+                also.append(f"`magpend {other}`")
+                own = {flag: text for flag, text in own.items() if flag not in listed[other]}
+        paragraphs = "\n\n".join(" ".join(p.split()) for p in (command.help or "").split("\n\n"))
+        part = f"### `magpend {name}{_arguments(command)}`\n\n{_text(paragraphs)}"
+        part += f"\n\nTakes the options of {' and '.join(also)}{', and:' if own else '.'}" if also else ""
+        parts.append(part + (f"\n\n{table(('option', 'meaning'), own.items())}" if own else ""))
+    return "\n\n".join(parts)
+
+
+def _covered(name: str, others: list[str]) -> bool:
+    return name == "analyse attractors" and "`magpend plot fractions`" in others
+
+
+def _options(command: Any) -> list[tuple[str, str]]:
+    return [
+        (f"`{', '.join((*p.opts, *p.secondary_opts))}{_metavar(p)}`", _help(p))
+        for p in command.params
+        if p.param_type_name == "option" and p.name not in ("help", "quiet", "verbose", "log")
+    ]
+
+
+def exit_codes() -> str:
+    """What a command's exit code says."""
+    from pipeline.cli.exits import Exit
+
+    return table(("code", "meaning"), ((str(int(code)), code.sentence) for code in Exit))
+
+
+def _commands() -> list[tuple[str, Any]]:
+    from typer.main import get_command
+
+    from pipeline.cli.main import app
+
+    def walk(group: Any, prefix: str) -> list[tuple[str, Any]]:
+        found = []
+        for name in group.list_commands(None):
+            command = group.get_command(None, name)
+            inner = hasattr(command, "list_commands")
+            found += walk(command, f"{prefix}{name} ") if inner else [(f"{prefix}{name}", command)]
+        return found
+
+    return walk(get_command(app), "")
+
+
+def _arguments(command: Any) -> str:
+    named = (p for p in command.params if p.param_type_name == "argument")
+    return "".join(f" {(p.metavar or p.name.upper())}" for p in named)
+
+
+def _metavar(parameter: Any) -> str:
+    return "" if parameter.is_flag else f" {parameter.metavar or 'VALUE'}"
+
+
+def _help(parameter: Any) -> str:
+    """Sentence of an option, with the default of those that the help shows one for."""
+    has_default = isinstance(parameter.default, (int, float, str, Path)) and parameter.default is not False
+    return _text(parameter.help or "") + (f" Default: {parameter.default}." if has_default else "")
+
+
+def _first(command: Any) -> str:
+    return _text(" ".join((command.help or "").split("\n\n")[0].split()))
+
+
+def _text(text: str) -> str:
+    return text.replace("<", "&lt;")
+
+
+def workflows() -> str:
+    """Specifications that ship."""
+    from pipeline.runs.workflows import shipped_workflows
+
+    def title(path: Path) -> str:
+        return str(tomllib.loads(path.read_text("utf-8")).get("title", ""))
+
+    return table(
+        ("workflow", "what it computes"), ((f"`{n}`", title(p)) for n, p in shipped_workflows().items())
+    )
+
+
+# ---- specification -----------------------------------------------------------------------------
+
+
+def specification() -> str:
+    """Keys of a specification, table by table."""
+    from pipeline.spec import starts, tables
+
+    parts = [
+        ("[parameters]", tables.ParametersTable, ""),
+        ("[axes] NAME = {...}", tables.Range, "NAME is `frequency_hz` or a parameter of the model."),
+        (
+            '[initial_conditions] kind = "grid"',
+            starts.GridStarts,
+            _STATES.format("a number or a range {...}"),
+        ),
+        ('[initial_conditions] kind = "list"', starts.ListStarts, ""),
+        (
+            '[initial_conditions] kind = "random"',
+            starts.RandomStarts,
+            _STATES.format("a number or [low, high]"),
+        ),
+        ("[continuation]", tables.Continuation, 'For `kind = "continuation"` alone.'),
+        ("[integration]", tables.Integration, ""),
+        ("[execution]", tables.Execution, "Decides the layout of the store, never the numbers."),
+    ]
+    return "\n\n".join(_keys(*part) for part in parts)
+
+
+_STATES = "Beside these: each state of the model by name, or with `_deg` if it is an angle or its rate: {}."
+
+
+def products() -> str:
+    """Products of a specification with their keys."""
+    from pipeline.products.registry import CELL_PRODUCTS
+
+    return "\n\n".join(
+        _keys(f"[products] {name} = {{...}}", product.options, product.help)
+        for name, product in CELL_PRODUCTS.items()
+    )
+
+
+def _keys(head: str, model: Any, more: str) -> str:
+    rows = []
+    for name, info in model.model_fields.items():
+        if name == "kind":
+            continue
+        extra: Any = info.json_schema_extra or {}
+        unit = f" [{extra['unit']}]" if extra.get("unit") else ""
+        rows.append(
+            (f"`{name}`", _default(info), _bounds(info), f"{(info.description or '').rstrip('.')}{unit}")
+        )
+    text = f"{more}\n\n" if more else ""
+    return f"### `{head}`\n\n{text}{table(('key', 'default', 'bounds', 'meaning'), rows)}"
+
+
+def _default(info: Any) -> str:
+    if info.is_required():
+        return "required"
+    default = info.get_default(call_default_factory=True)
+    if default is None or default in ("", {}):
+        return ""
+    return f"`{str(default).lower() if isinstance(default, bool) else repr(default)}`"
+
+
+def _bounds(info: Any) -> str:
+    from typing import Literal, get_args, get_origin
+
+    from pipeline.cli.options import bounds_of
+
+    if get_origin(info.annotation) is Literal:
+        return ", ".join(f"`{choice}`" for choice in get_args(info.annotation))
+    inner = [part for kind in get_args(info.annotation) for part in getattr(kind, "__metadata__", ())]
+    words = [bounds_of(info)] + [bounds_of(part) for part in inner if hasattr(part, "metadata")]
+    return ", ".join(word for word in words if word)
+
+
+# ---- cube --------------------------------------------------------------------------------------
+
+
+def variables() -> str:
+    """Variables of a cube, those of products last."""
+    from magpend_core.models import load_model
+    from pipeline.layout.schema import base_variables
+    from pipeline.products.registry import CELL_PRODUCTS
+
+    model, examples = load_model(), {"extremes": {"quantities": ("energy",)}}
+    found = [("", variable) for variable in base_variables(model)]
+    for name, product in CELL_PRODUCTS.items():
+        options = product.settle(product.options(**examples.get(name, {})), model)
+        found += [(name, variable) for variable in product.variables(options, model)]
+    rows = (
+        (f"`{v.name}`", ", ".join(f"`{d}`" for d in v.own_dims), v.dtype, v.units, v.long_name, product)
+        for product, v in found
+    )
+    return table(("variable", "own dims", "type", "unit", "meaning", "product"), rows)
+
+
+def statuses() -> str:
+    """What can become of a cell."""
+    from magpend_core.status import Status
+
+    return table(
+        ("code", "status", "meaning"), ((str(int(s)), f"`{s.name.lower()}`", s.sentence) for s in Status)
+    )
+
+
+def models() -> str:
+    """Models that ship."""
+    from magpend_core.models import load_model, model_names
+
+    rows = []
+    for name in model_names():
+        model = load_model(name)
+        states = ", ".join(f"`{s.name}` [{s.unit}]" for s in model.states)
+        presets = ", ".join(f"`{p}`" for p in model.preset_names)
+        rows.append((f"`{name}`", model.title, states, presets))
+    return table(("model", "what it is", "states", "presets"), rows)
+
+
+def public() -> str:
+    """Names of the Python package."""
+    import magpend
+
+    return ", ".join(f"`{name}`" for name in dir(magpend) if not name.startswith("_"))
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "commands": commands,
+    "options": options,
+    "exit codes": exit_codes,
+    "workflows": workflows,
+    "specification": specification,
+    "products": products,
+    "variables": variables,
+    "statuses": statuses,
+    "models": models,
+    "public": public,
+}
+
+
+def main() -> None:
+    """Write the pages that are not true any more, or with ``--check`` name them."""
+    check = "--check" in sys.argv[1:]
+    stale = [page for page in pages() if rendered(page.read_text("utf-8")) != page.read_text("utf-8")]
+    for page in stale:
+        print(f"{'not true any more' if check else 'written'}: {page.relative_to(ROOT)}")
+        if not check:
+            page.write_text(rendered(page.read_text("utf-8")), "utf-8")
+    if check and stale:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

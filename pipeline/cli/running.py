@@ -1,0 +1,110 @@
+"""``magpend run``, ``status`` and ``verify``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import Directory
+from pipeline.cli.exits import Exit
+from pipeline.cli.options import completing
+
+
+def _workflows() -> Iterable[str]:
+    from pipeline.runs.workflows import shipped_workflows
+
+    return shipped_workflows()
+
+
+Spec = Annotated[
+    str,
+    typer.Argument(
+        metavar="SPEC", help="A TOML file, or the name of a shipped workflow.",
+        autocompletion=completing(_workflows),
+    ),
+]  # fmt: skip
+
+
+def run(
+    spec: Spec,
+    out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Address of a dask scheduler, or 'none'. Default: $DASK_SCHEDULER_ADDRESS, or own workers."
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")
+    ] = False,
+    smoke: Annotated[
+        bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")
+    ] = False,
+    plot: Annotated[
+        bool,
+        typer.Option("--plot", help="Draw the bifurcation diagram of one parameter at the end."),
+    ] = False,
+) -> None:
+    """Compute what a specification asks for, or what is missing of it.
+
+    Stop it whenever you like: the same command goes on where it was, and the finished files are the same.
+    """
+    from pipeline.cli import console
+    from pipeline.runs import preview
+    from pipeline.runs import run as runs
+
+    if dry_run:
+        for line in preview.describe_plan(spec, out, workers=workers, smoke=smoke):
+            console.result(line)
+        return
+    if plot:
+        preview.check_diagram(spec, smoke=smoke)
+    state = runs.run(spec, out, workers=workers, scheduler=scheduler, smoke=smoke, echo=console.note)
+    console.result(f"cube: {state.directory / 'cube.zarr'}")
+    if plot:
+        _diagram(state.directory)
+    else:
+        figure = preview.first_figure(state.plan)
+        console.result(f"plot it with: magpend plot {figure} {state.directory}")
+
+
+def _diagram(directory: Path) -> None:
+    from pipeline.cli.plot import draw
+    from pipeline.products.registry import FIGURES
+
+    options = FIGURES["bifurcation"].options
+    draw(directory, "bifurcation", options())
+
+
+def status(directory: Directory) -> None:
+    """Say how much of a run is committed and what became of its cells."""
+    from pipeline.cli import console
+    from pipeline.runs.status import describe_state, state
+
+    for line in describe_state(state(directory)):
+        console.result(line)
+
+
+def verify(
+    directory: Directory,
+    repair: Annotated[
+        bool,
+        typer.Option("--repair", help="Withdraw damaged tasks, so that the next run computes them again."),
+    ] = False,
+) -> None:
+    """Check every committed byte against the commit records."""
+    from pipeline.cli import console
+    from pipeline.runs import verify as verification
+
+    found = verification.verify_run(directory, repair=repair)
+    for line in verification.describe(found, directory, repaired=repair):
+        console.result(line)
+    if not (found.sound or (repair and not found.skeleton)):
+        raise typer.Exit(Exit.DAMAGED)

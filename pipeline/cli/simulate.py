@@ -1,0 +1,100 @@
+"""``magpend simulate``: one trajectory of any model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipeline.cli.common import read_pairs
+from pipeline.cli.models import DEFAULT, names
+from pipeline.cli.options import completing
+from pipeline.cli.plot import check_figure_path
+
+EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
+"""States are options by their own names, which the model decides."""
+
+
+def simulate(
+    context: typer.Context,
+    model: Annotated[
+        str, typer.Option(help="Which one; see magpend models.", autocompletion=completing(names))
+    ] = DEFAULT,
+    frequency_hz: Annotated[
+        float, typer.Option("--frequency-hz", "--frequency", help="Drive frequency [Hz].")
+    ] = 2.2,
+    preset: Annotated[
+        str | None, typer.Option(help="Parameter preset; by default the model's first.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")
+    ] = None,
+    transient: Annotated[int, typer.Option(help="Drive periods before the series begins.")] = 0,
+    periods: Annotated[int, typer.Option(help="Drive periods of the series.")] = 10,
+    samples: Annotated[int, typer.Option(help="Samples per period.")] = 200,
+    rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = 1e-8,
+    atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = 1e-8,
+    out: Annotated[Path, typer.Option(help="Series, .csv or .nc.")] = Path("trajectory.csv"),
+    figure: Annotated[
+        Path | None, typer.Option(help="Figure, .png, .pdf or .svg; by default beside the series.")
+    ] = None,
+    no_figure: Annotated[bool, typer.Option("--no-figure", help="Write the series alone.")] = False,
+) -> None:
+    """Integrate one trajectory: states and the model's quantities as CSV or NetCDF, and a figure.
+
+    The initial state is given by name, such as --psi1 0.2 or --psi1-deg 12 for the pendulum, --x 0.5 for
+    duffing; what is not given is 0. Time 0 is the instant of a section.
+    """
+    from pipeline.cli import console
+    from pipeline.compute import simulate as simulation
+
+    simulation.check_output(out)
+    target = figure or out.with_suffix(".png")
+    if not no_figure:
+        check_figure_path(target)
+    overrides = read_pairs("--set", settings or [], "q=1.5")
+    frequency = overrides.pop("frequency_hz", overrides.pop("frequency", frequency_hz))
+    ds = simulation.simulate(
+        frequency, simulation.start_of(model, _states(context.args)), model=model, preset=preset,
+        overrides=overrides, n_transient=transient, n_periods=periods, samples_per_period=samples,
+        rtol=rtol, atol=atol,
+    )  # fmt: skip
+    console.result(f"series: {simulation.write_series(ds, out)}")
+    if not no_figure:
+        from pipeline.plots import plot_trajectory, save_figure
+
+        console.result(f"figure: {save_figure(plot_trajectory(ds), target)}")
+
+
+def _states(words: list[str]) -> dict[str, float]:
+    """Read ``--NAME VALUE`` pairs of options that the command does not have."""
+    return {name: values[0] for name, values in read_named(words, 1).items()}
+
+
+def read_named(words: list[str], n: int) -> dict[str, Any]:
+    """Read ``--NAME VALUE ...`` with `n` numbers each, as ``NAME`` with underscores; all mistakes at once."""
+    from pipeline.spec.problems import SpecError
+
+    found: dict[str, Any] = {}
+    problems, left = [], list(words)
+    while left:
+        word = left.pop(0)
+        own: list[str] = []
+        name, is_joined, value = word.partition("=")
+        if is_joined:
+            left.insert(0, value)
+        while left and len(own) < n and not left[0].startswith("--"):
+            own.append(left.pop(0))
+        try:
+            if not name.startswith("--") or len(own) != n:
+                raise ValueError
+            found[name[2:].replace("-", "_")] = tuple(map(float, own))
+        except ValueError:
+            numbers = "a number" if n == 1 else f"{n} numbers"
+            problems.append(
+                f"{' '.join([word, *own])}: no option of this command, and no name with {numbers}."
+            )
+    if problems:
+        raise SpecError(problems)
+    return found

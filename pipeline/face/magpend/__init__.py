@@ -1,0 +1,98 @@
+"""magpend: sweeps, continuations, attractors, basins and bifurcations of periodically forced systems.
+
+    import magpend
+
+    magpend.run("quickstart")                                # or any specification
+    ds = magpend.open_run("runs/quickstart")                 # the cube, an xarray.Dataset
+    found = magpend.attractors("runs/quickstart")            # an analysis, kept in the run directory
+    magpend.figure("runs/quickstart", "bifurcation")         # what the command line draws
+    magpend.sections(magpend.load_preset(q=1.6), [2.2], [[0.2, 0.2, 0, 0]], n_transient=300, n_keep=50)
+
+Every name is imported when it is first used; ``dir(magpend)`` lists them. Analyses take a run directory, or
+an opened `Run`, and the options of ``magpend analyse``; ``plot_`` functions take datasets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+_HOMES = {
+    "magpend_core.models": ("load_model", "load_preset", "model_names", "preset_names"),
+    "magpend_core.models.model": ("Model",),
+    "magpend_core.models.parameters": ("ParameterError", "Parameters"),
+    "magpend_core.sections": ("Sections", "run_branches", "sections"),
+    "magpend_core.trajectory": ("trajectory",),
+    "magpend_core.orbits": ("PeriodicOrbits", "polish_orbits"),
+    "magpend_core.engine.lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
+    "magpend_core.engine.system": ("System",),
+    "magpend_core.pointwise": ("evaluate", "jacobian", "rates"),
+    "magpend_core.status": ("Status",),
+    "pipeline.spec.problems": ("SpecError",),
+    "pipeline.store.run": ("Run",),
+    "pipeline.store.reading": ("open_run",),
+    "pipeline.compute.simulate": ("simulate",),
+    "pipeline.runs.run": ("run", "state"),
+    "pipeline.runs.verify": ("verify_run",),
+    "pipeline.runs.zoom": ("zoom",),
+    "pipeline.runs.derive": ("derive", "prune"),
+    "pipeline.runs.drawing": ("figure",),
+    "pipeline.analysis.chaos.indicators": (
+        "correlation_dimension", "kaplan_yorke_dimension", "zero_one_test",
+    ),
+    "pipeline.analysis.chaos.lyapunov": ("spectrum_of_jacobians",),
+}  # fmt: skip
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+
+def _analysis(name: str) -> Callable[..., Any]:
+    """Function of an analysis, with its options in the docstring."""
+    from pipeline.products.product import default_of
+    from pipeline.products.registry import ANALYSES
+    from pipeline.runs.derive import derive
+
+    def found(source: Any, *, echo: Any = None, **options: Any) -> Any:
+        return derive(source, name, options, echo=echo)
+
+    analysis = ANALYSES[name]
+    model = analysis.options
+    lines = [
+        f"    {k} = {default_of(model, k)!r}: {info.description}" for k, info in model.model_fields.items()
+    ]
+    found.__name__ = found.__qualname__ = name
+    found.__doc__ = "\n".join([analysis.help, "", "Options:", *lines])
+    return found
+
+
+def _analyses() -> tuple[str, ...]:
+    from pipeline.products.registry import COMMANDS
+
+    return COMMANDS
+
+
+def _plots() -> list[str]:
+    import pipeline.plots
+
+    return pipeline.plots.__all__
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib import metadata
+
+        return metadata.version("magpend")
+    if name in _HOME_OF:
+        value = getattr(import_module(_HOME_OF[name]), name)
+    elif name.startswith(("plot_", "save_")):
+        value = getattr(import_module("pipeline.plots"), name)
+    elif not name.startswith("_") and name in _analyses():
+        value = _analysis(name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*_HOME_OF, *_analyses(), *_plots(), "__version__", "__doc__"})

@@ -1,0 +1,231 @@
+"""Results of analyses, computed once and kept in a run's ``derived/``.
+
+A result is named by what decides its numbers: the digest of the committed cells, the analysis' name, its
+options, and the version of its code (`code_version`). `derive` returns what is stored under that name and
+computes it otherwise. A result that is damaged, or was left half written, is computed again; one of an
+earlier cube or an earlier version of the code stays until `prune` is called, and is never read.
+
+Each is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``, readable by
+``xarray.open_zarr(path, consolidated=False)``: options as JSON in the attribute ``derived_options``, words
+(``state``, ``direction``) as codes with the attribute ``words``. Two processes may derive at once: both
+compute, one of the two equal results stays.
+
+To add an analysis see `pipeline.products.product`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.products.product import Analysis, Options, function_of
+from pipeline.products.registry import ANALYSES
+from pipeline.runs.naming import named
+from pipeline.runs.versions import code_version
+from pipeline.spec.problems import SpecError, unknown_name, validated
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import DERIVED
+from pipeline.store.products import (
+    leftover_products,
+    open_product,
+    product_paths,
+    read_product_attrs,
+    remove_product,
+    write_product,
+)
+from pipeline.store.run import Run
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Echo = Callable[[str], None]
+Source = str | Path | Run
+
+_LEFTOVER_SECONDS = 3600.0
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class AnalysedRun(Run):
+    """A run as analyses see it: with the other analyses of the same cells.
+
+    Attributes
+    ----------
+    echo : callable
+        Prints a line.
+    """
+
+    echo: Echo = _silent
+
+    @classmethod
+    def of(cls, source: Source, echo: Echo | None = None) -> AnalysedRun:
+        """Return what stands in a run directory now, or the cells that an opened run speaks of."""
+        run = Run.open(source)
+        if isinstance(run, AnalysedRun) and echo is None:
+            return run
+        return cls(**{f.name: getattr(run, f.name) for f in fields(Run)}, echo=echo or _silent)
+
+    def derive(self, name: str, **options: Any) -> xr.Dataset:
+        """Another analysis of the same cells; see `derive`."""
+        return derive(self, name, options)
+
+
+def derive(
+    source: Source,
+    name: str,
+    options: Mapping[str, Any] | Options | None = None,
+    *,
+    echo: Echo | None = None,
+) -> xr.Dataset:
+    """Return what an analysis finds in a run, stored or computed.
+
+    Parameters
+    ----------
+    source
+        Run directory, or an opened run.
+    name
+        One of `pipeline.products.registry.ANALYSES`.
+    options
+        Those that are not as by default.
+    echo
+        Prints a line; says what is computed, and why.
+
+    Returns
+    -------
+    Dataset
+        In memory; ``encoding["source"]`` is its folder, absent if it could not be written.
+
+    Raises
+    ------
+    SpecError
+        If the analysis or an option is unknown or out of bounds, or the run has not what it takes.
+    RefusedError
+        If there is no run.
+    DamagedError
+        If a chunk of the cube is damaged.
+    """
+    if name not in ANALYSES:
+        raise SpecError([unknown_name("analysis", name, ANALYSES)])
+    analysis = ANALYSES[name]
+    wanted = options if isinstance(options, Options) else validated(analysis.options, options or {})
+    run = AnalysedRun.of(source, echo)
+    wanted = prepared(run, analysis, wanted)
+    key = _key(run, analysis, wanted)
+    path = run.directory / DERIVED / f"{name}-{key['derived_key'][:8]}.zarr"
+    try:
+        ds = open_product(path)
+        if all(ds.attrs.get(part) == value for part, value in key.items()):
+            run.echo(f"{name}: taken from {path}")
+            return _placed(ds, path)
+    except FileNotFoundError:
+        pass
+    except DamagedError as error:
+        run.echo(f"{name}: damaged ({error}); computing it again")
+    return _kept(run, path, _compute(run, analysis, wanted).assign_attrs(key))
+
+
+def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
+    """Return options with the run's own names, completed from it, once it has what a product takes.
+
+    Raises
+    ------
+    SpecError
+        If it has not, with the directory's name.
+    """
+    with refused(run.directory):
+        options = named(run, options)
+        if product.needs:
+            function_of(product.needs)(run, options)
+        settle = getattr(product, "settle", "")
+        return function_of(settle)(run, options) if settle else options
+
+
+@contextlib.contextmanager
+def refused(directory: Path) -> Iterator[None]:
+    """Turn what an analysis or a figure refuses into a sentence with the directory's name."""
+    try:
+        yield
+    except SpecError:
+        raise
+    except ValueError as error:
+        if "checksum" in str(error).lower():
+            raise DamagedError(
+                f"{directory}: a chunk is damaged; look with: magpend verify {directory}"
+            ) from None
+        if hasattr(error, "problems"):  # parameters out of bounds say enough themselves
+            raise
+        raise SpecError([f"{directory}: {error}"]) from None
+
+
+def _key(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
+    """Attributes that name a result."""
+    plain = {name: value for name, value in options.plain().items() if name not in analysis.ignores}
+    parts = {
+        "derived_product": analysis.name,
+        "derived_options": json.dumps(plain, sort_keys=True),
+        "cube_digest": run.digest,
+        "analysis_version": code_version(analysis.name),
+    }
+    return {**parts, "derived_key": hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()}
+
+
+def _compute(run: AnalysedRun, analysis: Analysis, options: Options) -> xr.Dataset:
+    started = time.perf_counter()
+    with refused(run.directory):
+        result: xr.Dataset = function_of(analysis.compute)(run, options)
+    run.echo(f"{analysis.name}: computed in {time.perf_counter() - started:.1f} s")
+    return result
+
+
+def _kept(run: AnalysedRun, path: Path, result: xr.Dataset) -> xr.Dataset:
+    try:
+        write_product(path, result)
+    except PermissionError as error:
+        run.echo(f"{path.name}: not kept ({error})")
+        return result
+    return _placed(open_product(path), path)
+
+
+def _placed(ds: xr.Dataset, path: Path) -> xr.Dataset:
+    ds.encoding["source"] = str(path)
+    return ds
+
+
+def stale(source: Source) -> list[Path]:
+    """Results of an earlier cube or an earlier version of the code, damaged ones, and leftovers.
+
+    A leftover is what a process that was killed had begun to write; one younger than an hour may
+    belong to a process at work and is not listed.
+    """
+    run = Run.open(source)
+    folder = run.directory / DERIVED
+
+    def is_stale(path: Path) -> bool:
+        try:
+            attrs = read_product_attrs(path)
+        except DamagedError:
+            return True
+        name = str(attrs.get("derived_product"))
+        if name not in ANALYSES or attrs.get("cube_digest") != run.digest:
+            return True
+        return bool(attrs.get("analysis_version") != code_version(name))
+
+    products = [path for path in product_paths(folder) if is_stale(path)]
+    return products + leftover_products(folder, older_than=_LEFTOVER_SECONDS)
+
+
+def prune(source: Source) -> list[Path]:
+    """Remove what `stale` lists; returns it."""
+    found = stale(source)
+    for path in found:
+        remove_product(path)
+    return found

@@ -1,0 +1,72 @@
+"""Figures of a run by name: what ``magpend plot`` draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from pipeline.products.product import FigureOptions
+from pipeline.products.registry import FIGURES
+from pipeline.runs.derive import AnalysedRun, Echo, Source, prepared, refused
+from pipeline.spec.problems import SpecError, unknown_name, validated
+
+if TYPE_CHECKING:
+    from pipeline.plots.style import DataFigure
+
+
+def figure(
+    source: Source,
+    name: str,
+    options: Mapping[str, Any] | FigureOptions | None = None,
+    *,
+    echo: Echo | None = None,
+    **more: Any,
+) -> DataFigure:
+    """Draw a figure of a run.
+
+    Parameters
+    ----------
+    source
+        Run directory, or an opened run.
+    name
+        One of `pipeline.products.registry.FIGURES`.
+    options, more
+        Those that are not as by default; ``out`` and ``format`` are for the command line.
+    echo
+        Prints a line.
+
+    Returns
+    -------
+    DataFigure
+        The figure; its `data` are the Dataset drawn. `pipeline.plots.save_figure` writes it.
+
+    Raises
+    ------
+    SpecError
+        If the figure or an option is unknown or out of bounds, or the run has not what it takes.
+    """
+    if name not in FIGURES:
+        raise SpecError([unknown_name("figure", name, FIGURES)])
+    if isinstance(options, FigureOptions):
+        wanted = options
+    else:
+        wanted = validated(FIGURES[name].options, {**(options or {}), **more})
+    run, wanted = ready(source, name, wanted, echo)
+    return drawn(run, name, wanted)
+
+
+def ready(
+    source: Source, name: str, options: FigureOptions, echo: Echo | None
+) -> tuple[AnalysedRun, FigureOptions]:
+    """Open a run, and return it with the options in its own names."""
+    run = AnalysedRun.of(source, echo)
+    settled: Any = prepared(run, FIGURES[name], options)
+    return run, settled
+
+
+def drawn(run: AnalysedRun, name: str, options: FigureOptions) -> DataFigure:
+    """Draw a figure with options that are settled."""
+    from pipeline.plots import draw_figure
+
+    with refused(run.directory):
+        return draw_figure(run, name, options)

@@ -1,0 +1,86 @@
+"""One name for each axis, parameter and state, whichever of its spellings a person uses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from pipeline.layout.vocabulary import axis_name, grid_dim, is_grid_dim, model_of, parameter_name
+from pipeline.products.product import Options
+from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.spec.tables import FREQUENCY
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from pipeline.store.run import Run
+
+DEGREES = "_deg"
+
+
+def named(run: Run, options: Options) -> Options:
+    """Return options in which axes, parameters and the state have the names that the cube and the model use.
+
+    ``at`` takes ``frequency`` or ``frequency_hz``, a parameter, and for a grid of initial states its axis
+    ``x_0``, the state ``x`` or, of an angle, ``x_deg``. ``parameter`` and ``second`` take either name of the
+    frequency. An empty ``state`` is the model's first.
+
+    Raises
+    ------
+    SpecError
+        Naming all that do not exist, with the nearest that do.
+    """
+    fields, problems = type(options).model_fields, []
+    changes: dict[str, Any] = {}
+    given: dict[str, Any] = {name: getattr(options, name) for name in fields}
+    if given.get("at"):
+        changes["at"] = {}
+        for name, value in given["at"].items():
+            try:
+                axis, number = place(run.cube(), name, value, bool(given.get("degrees")))
+                changes["at"][axis] = number
+            except SpecError as error:
+                problems += error.problems
+    model = model_of(run.cube()) if {"parameter", "second", "state"} & fields.keys() else None
+    if model is not None:
+        for role in {"parameter", "second"} & fields.keys():
+            changes[role] = parameter_name(given[role])
+            problems += _unknown("parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY))
+        if "state" in fields:
+            changes["state"] = given["state"] or model.state_names[0]
+            problems += _unknown("state", given["state"], changes["state"], model.state_names)
+    if problems:
+        raise SpecError(problems)
+    return options.model_copy(update=changes)
+
+
+def _unknown(what: str, given: str, name: str, known: Iterable[str]) -> list[str]:
+    return [] if name in known else [unknown_name(what, given, known)]
+
+
+def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> tuple[str, float]:
+    """Return the axis of a cube that a name means, and a value in the axis' unit.
+
+    Parameters
+    ----------
+    cube
+        As `pipeline.open_run` gives it.
+    name
+        Any spelling of the axis, see `named`.
+    value
+        In degrees if the name ends in ``_deg``, or with `degrees` if the axis is an angle or its rate.
+
+    Raises
+    ------
+    SpecError
+        If there is no such axis.
+    """
+    dims = [str(dim) for dim in cube["status"].dims]
+    plain = name.removesuffix(DEGREES)
+    for axis in (axis_name(name), grid_dim(name), grid_dim(plain), plain):
+        if axis in dims:
+            turned = axis in cube.coords and str(cube[axis].attrs.get("units", "")).startswith("rad")
+            in_degrees = is_grid_dim(axis) and turned and (degrees or name != plain)
+            return axis, math.radians(value) if in_degrees else value
+    raise SpecError([unknown_name("axis", name, [d for d in dims if d in cube.coords] or dims)])

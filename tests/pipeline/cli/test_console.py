@@ -1,0 +1,219 @@
+"""What goes where: results to the standard output, notes beside it, progress from the first seconds on."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import logging
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from pipeline.cli import console
+from pipeline.cli.common import tell
+from pipeline.cli.console import Display, Work, progress
+from pipeline.cli.exits import Exit
+from pipeline.products.product import Table
+from pipeline.products.reporting import report, reporting, track
+
+TABLE = Table([{"x": np.float64(1.5), "name": "a"}, {"x": np.nan, "name": "b"}], ["two lines", "for people"])
+
+
+@pytest.fixture(autouse=True)
+def _configured():
+    console.configure(False, False, None)
+    yield
+    console.close()
+
+
+def test_tell__lines_for_people_and_rows_for_programs(capsys, tmp_path):
+    tell(TABLE, None, False)
+    assert capsys.readouterr().out == "two lines\nfor people\n"
+    tell(TABLE, "-", False)
+    assert list(csv.DictReader(io.StringIO(capsys.readouterr().out))) == [
+        {"x": "1.5", "name": "a"}, {"x": "", "name": "b"},
+    ]  # fmt: skip
+    tell(TABLE, None, True)
+    assert json.loads(capsys.readouterr().out) == [{"x": 1.5, "name": "a"}, {"x": None, "name": "b"}]
+    tell(TABLE, str(tmp_path / "a.csv"), False)
+    captured = capsys.readouterr()
+    assert captured.out == "two lines\nfor people\n"
+    assert "table:" in captured.err
+    assert (tmp_path / "a.csv").read_text() == "x,name\n1.5,a\n,b\n"
+
+
+def test_configure__quiet_verbose_and_log(capsys, tmp_path):
+    console.configure(True, False, tmp_path / "a.log")
+    console.note("a note")
+    logging.getLogger("magpend").warning("a warning")
+    assert capsys.readouterr().err == "a warning\n"
+    assert "INFO a note" in (tmp_path / "a.log").read_text()
+    console.configure(False, True, None)
+    console.LOG.debug("a detail")
+    assert capsys.readouterr().err == "a detail\n"
+
+
+def test_work__says_how_far_and_how_long():
+    work = Work("polishing orbits", started=0.0)
+    assert work.line(3.0) == "polishing orbits: 3.0 s so far"
+    work.done, work.total, work.heard = 5.0, 20.0, 10.0
+    assert work.line(10.0) == "polishing orbits: 5 of 20 (25 %), 30 s left"
+    assert work.line(25.0) == "polishing orbits: 5 of 20 (25 %), 15 s left"
+    assert work.line(50.0) == "polishing orbits: 5 of 20 (25 %), 50 s so far"
+    work.done = 20.0
+    assert work.line(40.0) == "polishing orbits: 20 of 20 (100 %)"
+
+
+def test_progress__first_line_within_seconds_and_without_reports(monkeypatch, capsys):
+    monkeypatch.setattr(console, "FIRST_LINE_S", 0.05)
+    with progress("analyse"):
+        time.sleep(0.3)
+    assert "analyse: 0." in capsys.readouterr().err
+
+
+def test_track__reports_each_item():
+    heard = []
+    with reporting(lambda *said: heard.append(said)):
+        assert list(track([7, 8], "work")) == [7, 8]
+        report("more", 1, 3)
+    assert heard == [("work", 0, 2), ("work", 1, 2), ("work", 2, 2), ("more", 1, 3)]
+    report("nobody listens", 0, 1)
+    assert len(heard) == 4
+
+
+def test_display__a_bar_is_taken_away(capsys):
+    display = Display("work", terminal=True)
+    display("work", 1, 4)
+    display.show()
+    display.stop()
+    assert capsys.readouterr().err.endswith("\r\x1b[2K")
+
+
+def test_head__ends_with_0(magpend, made, environment):
+    """Whoever reads no further is no error."""
+    command = f"{sys.executable} -m pipeline.cli.main status {made.info.directory} | head -c 1"
+    found = subprocess.run(
+        ["bash", "-c", f"{command}; echo rc ${{PIPESTATUS[0]}}"],
+        env=environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert found.stdout.endswith("rc 0\n")
+    assert found.stderr == ""
+    code = "import sys; from pipeline.cli import console\nfor i in range(100000): console.result('line')"
+    found = subprocess.run(
+        ["bash", "-c", f"{sys.executable} -c \"{code}\" 2>&1 | head -1"],
+        env=environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "EnoughError" in found.stdout or found.stdout == "line\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["analyse", "run", "chaos"], "the directory comes last: magpend analyse chaos run"),
+        (["analyse", "run", "basins", "--box", "3"], "the directory comes last: magpend analyse basins run"),
+        (["plot", "run", "basins"], "the directory comes last: magpend plot basins run"),
+        (["branches", "run"], "magpend analyse branches DIR"),
+        (["analyse", "atractors", "run"], "did you mean attractors?"),
+        (["plot", "bifurcations", "run"], "did you mean bifurcation"),
+        (["stauts", "run"], "did you mean status"),
+        (["analyse", "attractors", "run", "--treshold", "1"], "did you mean --"),
+        (["analyse", "curves", "run"], "Missing option '--second'"),
+    ],
+    ids=" ".join,
+)
+def test_grammar__one_order_and_the_nearest_name(main, arguments, sentence):
+    code, out, err = main(*arguments)
+    assert code == Exit.REFUSED
+    assert out == ""
+    assert sentence in err
+    assert "Traceback" not in err
+
+
+def test_help__keeps_square_brackets_units_bounds_and_defaults(main):
+    code, out, _ = main("analyse", "chaos", "--help")
+    assert code == 0
+    text = " ".join(out.split())
+    assert "[products] lyapunov" in text
+    assert "differs from 0 [1/s]; 0 or more. Default: 0.005." in text
+    for group in ("analyse", "plot"):
+        assert main(group, "--help")[0] == 0
+
+
+def test_completion__is_offered(main):
+    assert "--install-completion" in main("--help")[1]
+
+
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("magpend analyse hy", "hysteresis"),
+        ("magpend plot ga", "gallery"),
+        ("magpend analyse basins --metric ch", "chessboard"),
+        ("magpend run quick", "quickstart"),
+        ("magpend models duff", "duffing"),
+    ],
+)
+def test_completion__completes_names(environment, line, word):
+    code = "import sys; sys.argv[0] = 'magpend'; from pipeline.cli.main import main; main()"
+    asked = {
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split()) - 1),
+        "_MAGPEND_COMPLETE": "complete_bash",
+    }
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**environment, **asked},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.stdout.split() == [word]
+
+
+def test_default_model__is_that_of_the_models():
+    from magpend_core.models import DEFAULT
+    from pipeline.cli import models
+
+    assert models.DEFAULT == DEFAULT
+
+
+def test_models__lists_states_parameters_and_presets(main):
+    code, out, _ = main("models")
+    assert code == 0
+    assert "duffing" in out
+    _, out, _ = main("models", "duffing")
+    assert "damping" in out
+    assert "preset hardening" in out
+    _, out, _ = main("models", "duffing", "--json")
+    assert [s["name"] for s in json.loads(out)[0]["states"]] == ["x", "v"]
+    code, _, err = main("models", "dufing")
+    assert code == Exit.REFUSED
+    assert "duffing" in err
+    assert "twin-well" in main("presets", "--model", "duffing")[1]
+
+
+@pytest.mark.parametrize("name", ["frequency", "frequency_hz"])
+def test_zoom__both_names_of_the_frequency(main, write_spec, sweep_text, tmp_path, name):
+    write_spec(sweep_text)
+    code, _, err = main("zoom", "spec.toml", f"--{name.replace('_', '-')}", "2.1", "2.2", "--out", "a.toml")
+    assert code == 0, err
+    assert "frequency_hz = { start = 2.1, stop = 2.2" in (tmp_path / "a.toml").read_text()
+    assert main("zoom", "spec.toml", "--at", f"{name}=2.5", "--out", "b.toml")[0] == 0
+    assert "frequency_hz = 2.5" in (tmp_path / "b.toml").read_text()
+
+
+def test_simulate__states_by_their_own_names(main, tmp_path):
+    code, _, err = main("simulate", "--model", "duffing", "--psi1", "1", "--no-figure")
+    assert code == Exit.REFUSED
+    assert "unknown state of duffing 'psi1'" in err
+    code, _, err = main("simulate", "--psi1", "1", "--psi1-deg", "3", "--no-figure")
+    assert code == Exit.REFUSED
+    assert "keep one" in err
+    code, _, err = main("simulate", "--psi1", "--no-figure")
+    assert code == Exit.REFUSED
+    assert "--psi1" in err
+    assert not list(tmp_path.glob("*.csv"))
