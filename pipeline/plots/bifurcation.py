@@ -190,7 +190,7 @@ class Diagram:
         """Draw the points into axes whose places are final, and return what was drawn."""
         width = 72.0 * self.frame.width_in * 0.88 / len(panels)
         left, right = panels[0].ax.get_xlim()
-        shown = np.count_nonzero((self.x >= min(left, right)) & (self.x <= max(left, right)))
+        shown = int(np.count_nonzero((self.x >= min(left, right)) & (self.x <= max(left, right))))
         drawn = pixels.draw_points(panels, self.view, min(1.7, max(0.75, 0.8 * width / max(shown, 1))))
         axis = self.view.ds[self.parameter]
         drawn["x"].attrs = {"units": str(axis.attrs.get("units", "1")), "long_name": self.parameter}
