@@ -190,7 +190,7 @@ class Diagram:
         """Draw the points into axes whose places are final, and return what was drawn."""
         width = 72.0 * self.frame.width_in * 0.88 / len(panels)
         left, right = panels[0].ax.get_xlim()
-        shown = np.count_nonzero((self.x >= min(left, right)) & (self.x <= max(left, right)))
+        shown = int(np.count_nonzero((self.x >= min(left, right)) & (self.x <= max(left, right))))
         drawn = pixels.draw_points(panels, self.view, min(1.7, max(0.75, 0.8 * width / max(shown, 1))))
         axis = self.view.ds[self.parameter]
         drawn["x"].attrs = {"units": str(axis.attrs.get("units", "1")), "long_name": self.parameter}
@@ -203,6 +203,13 @@ class Diagram:
         drawn = drawn.assign({name: (dims, values) for name, values in counts.items() if values.any()})
         drawn = drawn.assign_coords({self.parameter: axis.variable, **_fixed(self.view.ds)})
         return drawn.assign_attrs(title="bifurcation diagram", parameter=self.parameter)
+
+
+def with_diagram(data: xr.Dataset, drawn: xr.Dataset) -> xr.Dataset:
+    """Add what a diagram shows to the data of a figure, under names that end in ``_diagram``."""
+    drawn = drawn.drop_vars([c for c in drawn.coords if c in data.variables or c in data.dims])
+    renamed = drawn.rename({str(n): f"{n}_diagram" for n in (*drawn.data_vars, *drawn.dims)})
+    return data.merge(renamed).assign_attrs(data.attrs)
 
 
 def _fixed(ds: xr.Dataset) -> dict[str, Any]:
