@@ -50,7 +50,39 @@ def _leave(state: Any, memory: Any, settings: Any) -> None:
 
 @dataclass(frozen=True)
 class Observer:
-    """Named functions for the engine, with values for free names in them."""
+    """Named functions for the engine, with values for free names in them.
+
+    They are plain Python functions, compiled when they are bound to a system: inside, `N` is the number of
+    states, `IS_ANGLE` and `SCALES` are the system's, and further free names are those of `bindings`. They run
+    once per cell and period, not per step, on plain numbers and arrays.
+
+    Attributes
+    ----------
+    name : str
+        One name, one set of functions and bindings: it names the compiled code.
+    observe, memory_size, renew : callable
+        See the text of this module.
+    bindings : mapping
+        Values of free names: numbers, tuples of numbers, compiled functions.
+    renew_below : float
+        `renew` is also called after a step that leaves the last state below this.
+
+    Examples
+    --------
+    Count the periods that end with a first state above 0, and stop after `n` periods:
+
+    >>> class Settings(NamedTuple):
+    ...     n: int
+    >>> def observe(section, turns, i_period, memory, record, measures, settings):
+    ...     measures[0] += section[0] > 0.0
+    ...     return BOUNDED if i_period == settings.n else PENDING
+    >>> def memory_size(settings, n_states):
+    ...     return 0
+    >>> codes = {"PENDING": PENDING, "BOUNDED": BOUNDED}
+    >>> positive = Observer("positive", observe, inline(memory_size), codes)
+
+    `entry.integrate(system, positive, Settings(100), n_keep=0, n_measures=1, ...)` runs it.
+    """
 
     name: str
     observe: Callable[..., int]

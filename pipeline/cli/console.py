@@ -127,7 +127,7 @@ class Display:
         with self._lock:
             if what != self._work.what:
                 self._work = Work(what, self._clock(), done)
-            self._work.done, self._work.total = done, total
+            self._work.done, self._work.total, self._work.heard = done, total, self._clock()
 
     def show(self) -> None:
         """Say now how far the work is."""
@@ -174,6 +174,8 @@ class Work:
         How much was done then.
     done, total : float
         As last reported; without a total, only the time is known.
+    heard : float
+        When the last report came [s].
     """
 
     what: str
@@ -181,6 +183,7 @@ class Work:
     begun: float = 0.0
     done: float = 0.0
     total: float = 0.0
+    heard: float = 0.0
 
     def line(self, now: float) -> str:
         """Say how far it is, and how long it will take."""
@@ -189,10 +192,11 @@ class Work:
             return f"{self.what}: {duration(elapsed)} so far"
         share = min(self.done / self.total, 1.0)
         text = f"{self.what}: {self.done:g} of {self.total:g} ({100 * share:.0f} %)"
-        rate = (self.done - self.begun) / elapsed if elapsed > 0 else 0.0
-        if rate > 0 and share < 1:
-            return f"{text}, {duration((self.total - self.done) / rate)} left"
-        return text if share == 1 else f"{text}, {duration(elapsed)} so far"
+        if share == 1:
+            return text
+        took, more = self.heard - self.started, self.done - self.begun
+        left = took * (self.total - self.done) / more - (now - self.heard) if more > 0 else 0.0
+        return f"{text}, {duration(left)} left" if left > 0 else f"{text}, {duration(elapsed)} so far"
 
 
 @contextlib.contextmanager

@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cli.common import read_pairs
+from pipeline.cli.models import DEFAULT, names
+from pipeline.cli.options import completing
 from pipeline.cli.plot import check_figure_path
 
 EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
@@ -16,7 +18,9 @@ EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
 
 def simulate(
     context: typer.Context,
-    model: Annotated[str, typer.Option(help="Which one; see magpend models.")] = "pendulum",
+    model: Annotated[
+        str, typer.Option(help="Which one; see magpend models.", autocompletion=completing(names))
+    ] = DEFAULT,
     frequency_hz: Annotated[
         float, typer.Option("--frequency-hz", "--frequency", help="Drive frequency [Hz].")
     ] = 2.2,

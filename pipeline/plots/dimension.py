@@ -20,7 +20,7 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     Parameters
     ----------
     ds
-        Result of `pipeline.analysis.chaos.indicators.correlation_dimension` for one set of points, or of
+        Result of `pipeline.analysis.chaos.dimensions.correlation_dimension` for one set of points, or of
         `pipeline.analysis.chaos.chaos.section_dimension` for one parameter point.
     frame
         Width of the figure, range of the radius, and of the correlation sum.

@@ -90,10 +90,11 @@ from pipeline.analysis.attractors.lifetimes import lifetimes
 from pipeline.analysis.attractors.matching import match
 from pipeline.analysis.attractors.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.attractors.searching import Search, search_all
+from pipeline.analysis.chaos.lyapunov import on_attractor
 from pipeline.analysis.sides import flags_of
 from pipeline.layout.vocabulary import BOUNDED_SET, split_dims
 from pipeline.products.attractors import IdentifyOptions
-from pipeline.products.lyapunov import LyapunovFlag
+from pipeline.products.chaos import ChaosOptions
 
 __all__ = ["hysteresis", "identify", "lifetimes", "match"]
 
@@ -209,13 +210,13 @@ def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
     """Fill in the largest exponent of bounded sets, the mean over their cells, where the cube has it."""
     if "lyapunov" not in ds:
         return result
-    dims = result["attractor_id"].dims
+    dims, signs = result["attractor_id"].dims, ChaosOptions()
     rate = ds["lyapunov"].isel(exponent=0, drop=True).transpose(*dims).values
-    good = ds["lyapunov_flag"].transpose(*dims).values == LyapunovFlag.GOOD
+    counts = on_attractor(ds, n_sigma=signs.n_sigma, least=signs.least).transpose(*dims).values
     ids, kind = result["attractor_id"].values, result["kind"].values
     for index in np.argwhere(kind == BOUNDED_SET):
         point, i = tuple(index[:-1]), index[-1]
-        own = rate[point][(ids[point] == i) & good[point]]
+        own = rate[point][(ids[point] == i) & counts[point]]
         if own.size:  # in rising order, so that the last bit does not depend on that of the cells
             result["lyapunov_max"].values[tuple(index)] = np.sort(own).mean()
     return result

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from pipeline.products.attractors import AttractorOptions, IdentifyOptions, SettlingOptions
-from pipeline.products.product import Table
 
 if TYPE_CHECKING:
     from pipeline.store.run import Run
@@ -28,14 +27,6 @@ def attractors(run: Any, options: AttractorOptions) -> xr.Dataset:
     return match(found, threshold=options.threshold, look_back=options.look_back, connect=options.connect)
 
 
-def attractors_table(ds: xr.Dataset) -> Table:
-    """Table of the attractors, per parameter point or per id."""
-    from pipeline.analysis import tables
-
-    rows = tables.attractor_rows(ds)
-    return Table(rows, tables.attractor_lines(ds, rows))
-
-
 def needs_directions(run: Run, options: AttractorOptions) -> None:
     """Refuse a run that is no continuation in both directions."""
     from pipeline.analysis.attractors.hysteresis import check_directions
@@ -50,25 +41,9 @@ def hysteresis(run: Any, options: AttractorOptions) -> xr.Dataset:
     return compute(run.cube(), run.derive("attractors", **options.plain()))
 
 
-def hysteresis_table(ds: xr.Dataset) -> Table:
-    """Table of the jumps, and lines of the loops."""
-    from pipeline.analysis import tables
-
-    rows = tables.jump_rows(ds)
-    return Table(rows, tables.hysteresis_lines(ds, rows))
-
-
 def settling(run: Any, options: SettlingOptions) -> xr.Dataset:
     """Transient or attractor: a sample of every bounded set is run on."""
     from pipeline.analysis.attractors.lifetimes import lifetimes
 
     found = run.derive("attractors", **options.part(AttractorOptions))
     return lifetimes(run.cube(), found, options)
-
-
-def settling_table(ds: xr.Dataset) -> Table:
-    """Table of the bounded sets."""
-    from pipeline.analysis import tables
-
-    rows = tables.settling_rows(ds)
-    return Table(rows, tables.settling_lines(ds, rows))

@@ -26,6 +26,7 @@ SAME = 1e-6
 """Scaled distance within which two orbits at one parameter value are the same."""
 
 FOLLOWING = "following branches"
+"""Name of the work in reports."""
 
 GUESS = 0.05
 """Scaled distance from the chord of a branch within which an orbit may lie on it."""

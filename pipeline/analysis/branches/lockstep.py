@@ -76,7 +76,7 @@ def _report(
         low, high = seen.get(i, (last, last))
         seen[i] = min(low, last), max(high, last)
     going = [min(seen[i][1] - seen[i][0], 0.9) for i in waiting]
-    report(what, n - len(going) + sum(going), n)
+    report(what, round(n - len(going) + sum(going), 1), n)
 
 
 def run_alone(computation: Steps[T]) -> T:

@@ -38,9 +38,8 @@ _HOMES = {
     "pipeline.runs.zoom": ("zoom",),
     "pipeline.runs.derive": ("derive", "prune"),
     "pipeline.runs.drawing": ("figure",),
-    "pipeline.analysis.chaos.indicators": (
-        "correlation_dimension", "kaplan_yorke_dimension", "zero_one_test",
-    ),
+    "pipeline.analysis.chaos.dimensions": ("correlation_dimension", "kaplan_yorke_dimension"),
+    "pipeline.analysis.chaos.zero_one": ("zero_one_test",),
     "pipeline.analysis.chaos.lyapunov": ("spectrum_of_jacobians",),
 }  # fmt: skip
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}

@@ -1,0 +1,117 @@
+"""Branches of Duffing oscillators, a model without angles: against harmonic balance and symmetry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magpend_core import trajectory
+from magpend_core.models import load_model
+from pipeline.analysis.branches import Scope, Start, curves_dataset, curves_from, dataset_of, explore
+from pipeline.analysis.branches.arclength import Settings
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.table import branches_table, curves_table, windows_of
+
+DUFFING = load_model("duffing")
+TWO_PI = 2.0 * np.pi
+
+
+def harmonic_balance(parameters):
+    """Frequencies [rad/s] of both folds of x = A cos(w t - phi), and a state at w = 0.85.
+
+    ``(c - w^2)^2 + (damping w)^2 = (F/A)^2`` with ``c = linear + 3/4 cubic A^2`` (Nayfeh and Mook, Nonlinear
+    Oscillations, 1979, section 4.1): a quadratic in w^2 for each amplitude A.
+    """
+    p = parameters
+    a = np.linspace(1e-3, 4.0, 400001)
+    c = p["linear"] + 0.75 * p["cubic"] * a**2
+    half = c - 0.5 * p["damping"] ** 2
+    root = np.sqrt(half**2 - c**2 + (p["amplitude"] / a) ** 2 + 0j)
+    real = np.abs(root.imag) < 1e-12
+    left = np.sqrt(np.maximum(half - root.real, 0.0)[real])
+    right = np.sqrt((half + root.real)[real])
+    bends = np.flatnonzero((np.diff(right)[:-1] < 0.0) & (np.diff(right)[1:] >= 0.0)) + 1
+    lower = right[bends[0]]
+    upper = max(left.max(), right[bends[0] :].max())
+    w = 0.85
+    amplitude = a[real][np.argmin(np.abs(left - w))]
+    phase = np.arctan2(p["damping"] * w, p["linear"] + 0.75 * p["cubic"] * amplitude**2 - w**2)
+    return (lower, upper), np.array([amplitude * np.cos(phase), amplitude * w * np.sin(phase)]), w
+
+
+def weakly_nonlinear(size):
+    """Damping, cubic stiffness and drive of one order, so that amplitudes are of order 1."""
+    return DUFFING.load("hardening", damping=size, cubic=size, amplitude=2.0 * size)
+
+
+def folds_of(parameters):
+    (lower, upper), state, w = harmonic_balance(parameters)
+    family = Family(DUFFING.system, 1, w / TWO_PI, parameters.pack(), ("frequency",), (0.1,))
+    scope = Scope(0.85 / TWO_PI, 1.25 / TWO_PI, settings=Settings(longest_step=0.1))
+    (branch,) = explore([Start(family, state, w / TWO_PI)], scope)
+    found = sorted(TWO_PI * family.values(b.point.u)[0] for b in branch.bifurcations)
+    assert [b.kind for b in branch.bifurcations] == ["fold", "fold"]
+    return branch, np.array(found), np.array([lower, upper])
+
+
+def test_explore__folds_by_harmonic_balance():
+    """What the first harmonic leaves out falls faster than what is small: here to a tenth at a quarter."""
+    errors = []
+    for size in (0.05, 0.0125):
+        _, found, expected = folds_of(weakly_nonlinear(size))
+        errors.append(np.abs(found - expected))
+    assert (errors[1] < 3e-5).all()
+    assert (errors[0] / errors[1] > 8.0).all()
+
+
+def test_dataset_of__model_without_angles():
+    """States, units and dims are the model's; there are no sides, and no angle turns."""
+    parameters = weakly_nonlinear(0.1)
+    branch, found, _ = folds_of(parameters)
+    ds = dataset_of([branch], "frequency", parameters)
+    assert ds["state"].values.tolist() == ["x", "v"]
+    assert ds["section"].attrs["units"] == "m, m/s"
+    assert ds.sizes["angle"] == 0
+    assert "side" not in ds
+    table = branches_table(ds)
+    assert [row["frequency_hz"] for row in table.rows] == pytest.approx(found / TWO_PI)
+    assert any("stable segments" in line for line in table.lines)
+    assert {w["begins"] for w in windows_of(ds)} == {"bound", "fold"}
+
+
+def test_curves_from__folds_meet_in_a_cusp():
+    """With less drive the two folds come together; the curve is one, through the cusp."""
+    parameters = weakly_nonlinear(0.025)
+    branch, *_ = folds_of(parameters)
+    ds = dataset_of([branch], "frequency", parameters)
+    bounds = ((0.85 / TWO_PI, 1.25 / TWO_PI), (0.02, 0.08))
+    curves = curves_from(ds, parameters, "amplitude", bounds, 1)
+    assert len(curves) == 1
+    told = curves_dataset(curves, "frequency", "amplitude", DUFFING)
+    assert told["second"].attrs["units"] == "m/s2"
+    least = float(told["second"].min())
+    # to first order in what is small
+    expected = np.sqrt(32.0 * parameters["damping"] ** 3 / (9.0 * np.sqrt(3.0) * parameters["cubic"]))
+    assert least == pytest.approx(expected, rel=0.05)
+    (row,) = curves_table(told).rows
+    assert row["amplitude_min"] == least
+    assert {"frequency_hz_min", "frequency_hz_max"} <= set(row)
+
+
+def test_explore__twin_wells_are_mirror_images():
+    """Both wells' cascades have their doublings at the same amplitudes, half a period apart."""
+    frequency = 1.2 / TWO_PI
+    parameters = DUFFING.load("twin-well", damping=0.3, amplitude=0.2)
+    family = Family(DUFFING.system, 1, frequency, parameters.pack(), ("amplitude",), (0.1,))
+    times = np.array([400.0, 400.5]) / frequency
+    right, half = trajectory(parameters, frequency, np.array([1.2, 0.0]), times)
+    scope = Scope(0.2, 0.29, max_period=2, settings=Settings(longest_step=0.05))
+    branches = explore([Start(family, right, 0.2), Start(family, -half, 0.2)], scope)
+    assert sorted(b.family.period for b in branches) == [1, 1, 2, 2]
+    for period in (1, 2):
+        one, other = (b for b in branches if b.family.period == period)
+        at = [[b.family.values(x.point.u)[0] for x in b.bifurcations] for b in (one, other)]
+        assert at[0] == pytest.approx(at[1], abs=1e-8)
+    rows = branches_table(dataset_of(branches, "amplitude", parameters)).rows
+    assert {row["type"] for row in rows} == {"period_doubling"}
+    assert {row["frequency_hz"] for row in rows} == {frequency}
