@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.engine.checks import check_system
 from magpend_core.engine.jit import inline, is_covered, kernel, specialise
 from magpend_core.engine.simd import WIDTH, load, load_rows, store_rows
 from magpend_core.engine.system import System
@@ -81,8 +82,10 @@ def _at(kind: str, n_out: int, t: Any, state: Any, parameters: Parameters, frequ
     times = np.broadcast_to(np.asarray(t, np.float64), leading).reshape(-1)
     # one period is as good as another, and short times keep the drive's phase exact
     local = np.ascontiguousarray(np.mod(times, 1.0 / float(frequency)))
+    packed = parameters.pack()
+    check_system(system, packed[None], frequency[None], many, jacobian=kind == "jacobian")
     out = np.empty((len(many), n_out))
-    _evaluator(system, kind)(local, many, float(frequency), parameters.pack(), out)
+    _evaluator(system, kind)(local, many, float(frequency), packed, out)
     return out.reshape((*leading, n_out))
 
 

@@ -20,17 +20,15 @@ def check_array(name: str, values: Any, ndim: int | tuple[int, ...]) -> np.ndarr
     if array.ndim not in allowed:
         wanted = " or ".join(str(n) for n in allowed)
         raise ValueError(f"{name} has {array.ndim} dimensions (shape {array.shape}); it must have {wanted}.")
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        where = tuple(int(i) for i in bad[0])
+    finite = np.isfinite(array)
+    if not finite.all():
+        where = tuple(int(i) for i in np.argwhere(~finite)[0])
         entry = name + (str(list(where)) if where else "")
         raise ValueError(f"{entry} = {array[where]} is not finite; give finite numbers.")
     return array
 
 
-def check_states(
-    values: Any, ndim: int | tuple[int, ...], n_states: int = 4, name: str = "state"
-) -> np.ndarray:
+def check_states(values: Any, ndim: int | tuple[int, ...], n_states: int, name: str = "state") -> np.ndarray:
     """Return states as an array whose last dimension has `n_states` entries.
 
     Raises
@@ -55,9 +53,9 @@ def check_frequency(values: Any, ndim: int) -> np.ndarray:
         See `check_array`; or if a frequency is not positive.
     """
     array = check_array("frequency_hz", values, ndim)
-    bad = array[array <= 0.0]
-    if bad.size:
-        raise ValueError(f"frequency_hz = {bad.flat[0]} is out of bounds: it must be greater than 0.")
+    if (array <= 0.0).any():
+        bad = array[array <= 0.0].flat[0]
+        raise ValueError(f"frequency_hz = {bad} is out of bounds: it must be greater than 0.")
     return array
 
 

@@ -105,9 +105,9 @@ def test_plot__without_kernel(directory, tmp_path):
     """The figure comes from the cube alone: with a kernel that raises, it is the same file."""
     plotted = tmp_path / "again.png"
     code = (
-        "import sys, magpend_core.sections as s, magpend_core.engine.lanes as l\n"
+        "import sys, magpend_core.engine.entry as entry, magpend_core.engine.lanes as lanes\n"
         "def broken(*a, **k): raise AssertionError('the kernel was called')\n"
-        "s.run_branches = s.engine_of = l.engine_of = broken\n"
+        "entry.integrate = entry.engine_of = lanes.engine_of = broken\n"
         "from pipeline.cli.main import main\n"
         f"sys.argv = ['magpend', 'plot', 'bifurcation', {str(directory)!r}, '--out', {str(plotted)!r}]\n"
         "main()"

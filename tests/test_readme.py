@@ -1,27 +1,29 @@
-"""What README shows is what magpend takes."""
+"""What README and docs show is what magpend takes, and their tables are those of the code."""
 
 from __future__ import annotations
 
 import re
+import shlex
 import tomllib
 from pathlib import Path
 
 import pytest
 from typer.main import get_command
 
-from magpend_core.models import load_model
+from pipeline.cli import reference
 from pipeline.cli.main import app
-from pipeline.layout.schema import base_variables
+from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.runs.workflows import shipped_workflows
 from pipeline.spec.parsing import parse_spec
 
-VARIABLES = base_variables(load_model())
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text("utf-8")
+PAGES = {page.relative_to(ROOT).as_posix(): page.read_text("utf-8") for page in reference.pages()}
+PAGES["CONTRIBUTING.md"] = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
 
-README = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
 
-
-def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+def blocks(language, text=README):
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
 def test_readme__specification_is_valid():
@@ -32,18 +34,58 @@ def test_readme__specification_is_valid():
     assert smoke["axes"]["frequency_hz"] == {"num": 5}
 
 
-def test_readme__commands_exist():
-    known = get_command(app).commands
-    named = set(re.findall(r"`magpend (\w+)", README)) - {"COMMAND"}
-    assert named <= set(known)
-    assert set(known) <= named
+def test_readme__fits_two_screens():
+    assert len(README.splitlines()) <= 130
+    assert "](docs/quickstart.png)" in README
 
 
-def test_readme__workflows_and_variables_are_listed():
+@pytest.mark.parametrize("page", PAGES)
+def test_docs__tables_are_those_of_the_code(page):
+    """Mended by: python -m pipeline.cli.reference."""
+    assert reference.rendered(PAGES[page]) == PAGES[page]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_docs__links_lead_somewhere(page):
+    folder = (ROOT / page).parent
+    for target in re.findall(r"\]\(([^)#]+)\)", PAGES[page]):
+        if not target.startswith("http"):
+            assert (folder / target).exists(), target
+
+
+def commands():
+    """Every line of a shell block that begins with magpend, with its page."""
+    for page, text in PAGES.items():
+        for block in blocks("sh", text):
+            for line in re.sub(r"\\\n\s*", " ", block).splitlines():
+                for part in line.split("&&"):
+                    words = shlex.split(part, comments=True)
+                    if words and words[0] == "magpend":
+                        yield page, words[1:]
+
+
+@pytest.mark.parametrize(("page", "words"), list(commands()), ids=lambda value: str(value))
+def test_docs__commands_and_options_exist(page, words):
+    command = get_command(app)
+    while hasattr(command, "list_commands"):
+        name = words.pop(0)
+        assert name in command.list_commands(None), (page, name)
+        command = command.get_command(None, name)
+    flags = {flag for p in command.params for flag in (*p.opts, *p.secondary_opts)}
+    takes_names = command.context_settings.get("ignore_unknown_options", False)
+    for word in words:
+        if word.startswith("--"):
+            assert takes_names or word.partition("=")[0] in flags, (page, word)
+
+
+def test_reference__names_everything():
+    """Commands, workflows and variables are listed with their names."""
+    listed = PAGES["docs/reference/commands.md"]
     for name in shipped_workflows():
-        assert f"`{name}`" in README
-    for variable in VARIABLES:
-        assert f"`{variable.name}`" in README
+        assert f"`{name}`" in listed
+    assert "`magpend analyse branches DIR`" in listed
+    assert "`section`" in PAGES["docs/reference/cube.md"]
+    assert f"`{FREQUENCY_DIM}`" in PAGES["docs/reference/cube.md"]
 
 
 @pytest.mark.parametrize("name", ["main job", "tests"])

@@ -22,6 +22,13 @@ N_SAMPLES = 16
 STEP = 1e-4
 """Largest step of the differences, in units of a state's scale."""
 
+LEAST_MISTAKE = 1e-3
+"""Smallest relative error of the Jacobian that counts.
+
+That of an implicit equation, which the rates solve by a fixed number of iterations, may be off by a tenth of
+it where these converge slowly.
+"""
+
 TWICE = 2
 """A difference counts if it is seen at this many samples: one may lie within a layer."""
 
@@ -47,27 +54,34 @@ class SystemCheckError(ValueError):
 
 @dataclass
 class _Checked:
-    """Ranges of the frequency and the parameters at which a system has been checked."""
+    """Ranges of the parameters, and at their end of the frequency, at which a system has been checked."""
 
     low: np.ndarray
     high: np.ndarray
 
-    def covers(self, low: np.ndarray, high: np.ndarray) -> bool:
-        return bool((self.low <= low).all() and (high <= self.high).all())
+    def covers(self, packed: np.ndarray, frequency: np.ndarray) -> bool:
+        if not (self.low[-1] <= frequency.min() and frequency.max() <= self.high[-1]):
+            return False
+        return bool(((self.low[:-1] <= packed) & (packed <= self.high[:-1])).all())
 
 
 _CHECKED: dict[tuple[System, bool], _Checked] = {}
 
 
 def check_system(
-    system: System, parameters: np.ndarray, frequency_hz: np.ndarray, states: np.ndarray
+    system: System,
+    parameters: np.ndarray,
+    frequency_hz: np.ndarray,
+    states: np.ndarray,
+    *,
+    jacobian: bool = False,
 ) -> None:
     """Check a system where it is about to be integrated.
 
     The lengths of what the functions return, the edges' times and widths, that constants are finite, that
     the forcing has the drive's period and that nothing changes as an angle goes round once; and the Jacobian
-    against differences, if tangent vectors are carried along. All of it once for each system; constants and
-    edges again where a parameter goes beyond the range in which they were looked at.
+    against differences, if it is asked for or tangent vectors are carried along. All of it once for each
+    system; constants and edges again where a parameter goes beyond the range in which they were looked at.
 
     Parameters
     ----------
@@ -79,6 +93,8 @@ def check_system(
         The leading shape of `parameters` [Hz].
     states
         Initial states, shape (n, n_states).
+    jacobian
+        Whether the Jacobian will be used.
 
     Raises
     ------
@@ -90,19 +106,19 @@ def check_system(
     Functions without a form in plain Python (numba's intrinsics, say) are passed over.
     """
     subject = system if system.tangents_of is None else system.tangents_of
-    key = (subject, system.tangents_of is not None)
-    if not frequency_hz.size:
+    key = (subject, jacobian or system.tangents_of is not None)
+    if not frequency_hz.size or not len(states):
         return
     packed = parameters.reshape(frequency_hz.size, parameters.shape[-1])
-    low = np.append(packed.min(axis=0), frequency_hz.min())
-    high = np.append(packed.max(axis=0), frequency_hz.max())
     checked = _CHECKED.get(key)
-    if checked is not None and checked.covers(low, high):
+    if checked is not None and checked.covers(packed, frequency_hz):
         return
     with np.errstate(all="ignore"):
         problems = _problems(subject, key[1], checked, packed, frequency_hz.ravel(), states)
     if problems:
         raise SystemCheckError(subject.name, problems)
+    low = np.append(packed.min(axis=0), frequency_hz.min())
+    high = np.append(packed.max(axis=0), frequency_hz.max())
     if checked is not None:
         low, high = np.minimum(low, checked.low), np.maximum(high, checked.high)
     _CHECKED[key] = _Checked(low, high)
@@ -352,10 +368,8 @@ class _Motion:
             coarse, fine = self._slopes(j, step), self._slopes(j, 0.5 * step)
             slopes = (4.0 * fine - coarse) / 3.0
             rounding = 1e-14 * size[:, None] / step
-            allowed = 1e-5 * (np.abs(given[:, j]) + np.abs(slopes)) + 10.0 * (
-                np.abs(fine - coarse) + rounding
-            )
-            allowed += 1e-8 * size[:, None] / self.scales[j]
+            own_error = 10.0 * (np.abs(fine - coarse) + rounding) + 1e-8 * size[:, None] / self.scales[j]
+            allowed = LEAST_MISTAKE * (np.abs(given[:, j]) + np.abs(slopes)) + own_error
             wrong = np.abs(given[:, j] - slopes) > allowed
             for i in np.flatnonzero(wrong.sum(axis=1) >= TWICE):
                 k = int(np.flatnonzero(wrong[i])[0])

@@ -156,6 +156,12 @@ class System:
             "is_angle": (False,) * n, "scales": (1.0,) * n, "escape": (math.inf,) * n,
             "forcing": no_forcing, "edges": no_edges, "layers": no_layers,
         }  # fmt: skip
+        kinds = {
+            "state_names": str, "parameter_names": str, "quantity_names": str,
+            "is_angle": bool, "scales": float, "escape": float,
+        }  # fmt: skip
+        for name, kind in kinds.items():  # lists cannot be hashed, integers among numbers not be looped over
+            object.__setattr__(self, name, tuple(kind(value) for value in getattr(self, name)))
         object.__setattr__(self, "has_layers", self.has_layers and self.layers is not None)
         for name, value in absent.items():
             if not getattr(self, name):

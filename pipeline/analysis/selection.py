@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from pipeline.layout.vocabulary import split_dims
+
+Floats = npt.NDArray[np.float64]
 
 
 def parameter_dims(attractors: xr.Dataset) -> list[str]:
@@ -28,7 +31,7 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
     ds
         With `attractor_id`.
     at
-        Value by axis; the nearest one on the axis is taken.
+        Value by axis; it must be one of the axis (`place`).
     keep
         Axes to keep.
     purpose
@@ -37,7 +40,7 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
     Raises
     ------
     ValueError
-        If an axis is unknown, a value lies off its axis, or an axis longer than 1 is left over.
+        If an axis is unknown, a value is not on its axis, or an axis longer than 1 is left over.
     """
     dims = [str(d) for d in ds["attractor_id"].dims]
     for name, value in (at or {}).items():
@@ -46,7 +49,7 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
             raise ValueError(
                 f"unknown axis {name!r}; values can be chosen of: {', '.join(allowed) or 'none'}"
             )
-        ds = ds.isel({name: nearest(ds[name], float(value))})
+        ds = ds.isel({name: place(ds[name], float(value))})
     left = [d for d in ds["attractor_id"].dims if d not in keep]
     long = [str(d) for d in left if ds.sizes[d] > 1]
     if long:
@@ -58,16 +61,45 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
     return ds.isel(dict.fromkeys(left, 0))
 
 
-def nearest(axis: xr.DataArray, value: float) -> int:
-    """Return the place on an axis that is nearest to a value; raises ValueError if that lies off the axis."""
+def place(axis: xr.DataArray, value: float) -> int:
+    """Return the place of a value on an axis.
+
+    Raises
+    ------
+    ValueError
+        If it is not there, within 1e-6 of the spacing to the next value; the message names the
+        values on either side.
+    """
     values = axis.values.astype(np.float64)
     index = int(np.abs(values - value).argmin())
-    step = np.diff(values).max() if values.size > 1 else 1e-6 * max(abs(values[0]), 1.0)
-    if not abs(values[index] - value) <= 0.5001 * step:
+    if abs(values[index] - value) <= _slack(values, index):
+        return index
+    low, high = values.min(), values.max()
+    if not low < value < high:
         raise ValueError(
-            f"{axis.name} = {value:g} lies off its axis, which runs from {values[0]:g} to {values[-1]:g}"
+            f"{axis.name} = {value:.10g} lies off its axis, which runs from {low:.10g} to {high:.10g}"
         )
-    return index
+    below, above = values[values < value].max(), values[values > value].min()
+    raise ValueError(
+        f"{axis.name} = {value:.10g} is not on its axis; the nearest values are {below:.10g} and {above:.10g}"
+    )
+
+
+def _slack(values: Floats, index: int) -> float:
+    """How far from a value of an axis a number may be that means it."""
+    apart = np.abs(values - values[index])
+    spacing = apart[apart > 0].min() if (apart > 0).any() else abs(values[index])
+    return float(1e-6 * spacing)
+
+
+def snap(ds: xr.Dataset, at: Mapping[str, float]) -> dict[str, float]:
+    """Return the nearest values that the axes have; what lies off an axis stays as it is."""
+    found = {}
+    for name, value in at.items():
+        axis = ds[name].values.astype(np.float64).ravel() if name in ds.dims else np.array([value])
+        inside = axis.min() <= value <= axis.max()
+        found[name] = float(axis[np.abs(axis - value).argmin()]) if inside else float(value)
+    return found
 
 
 def select_points(ds: xr.Dataset, at: Mapping[str, float] | None, *, purpose: str = "") -> xr.Dataset:
@@ -78,21 +110,21 @@ def select_points(ds: xr.Dataset, at: Mapping[str, float] | None, *, purpose: st
     ds
         Cube.
     at
-        Value by parameter; the nearest one on the axis is taken.
+        Value by parameter; it must be one of the axis (`place`).
     purpose
         If given, one point must be left; says what it is for, in the message.
 
     Raises
     ------
     ValueError
-        If an axis is unknown, a value lies off its axis, or more than one point is left where one must be.
+        If an axis is unknown, a value is not on its axis, or more than one point is left where one must be.
     """
     dims, _ = split_dims(ds["status"])
     for name, value in (at or {}).items():
         if name not in dims:
             allowed = ", ".join(dims) or "none"
             raise ValueError(f"unknown axis {name!r}; values can be chosen of: {allowed}")
-        index = nearest(ds[name], float(value))
+        index = place(ds[name], float(value))
         ds = ds.isel({name: slice(index, index + 1)})
     long = [d for d in dims if ds.sizes[d] > 1]
     if purpose and long:

@@ -8,13 +8,16 @@ their number.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from magpend_core.engine.system import System
+if TYPE_CHECKING:
+    from magpend_core.engine.system import System
+    from magpend_core.models.model import Model
 
 TWO_PI = 2.0 * np.pi
 
@@ -33,9 +36,9 @@ class Geometry:
     scales: tuple[float, ...]
 
     @classmethod
-    def of(cls, system: System) -> Geometry:
-        """Geometry of a system's states."""
-        return cls(system.is_angle, system.scales)
+    def of(cls, owner: System | Model) -> Geometry:
+        """Geometry of the states of a system, or of a model."""
+        return cls(owner.is_angle, owner.scales)
 
     @property
     def circumference(self) -> np.ndarray:

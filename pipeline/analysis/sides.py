@@ -1,144 +1,98 @@
-"""On which side of the fixed magnet a motion stays, told from its stored sections.
+"""What the classifier of a run's model says of its cells: on which side a motion stays, for the pendulum.
 
-The rule
---------
-The moving magnet hangs at the horizontal distance ::
-
-    dx = l1 sin(psi1) + l2 sin(psi2)
-
-from the vertical line through the pivot, on which the fixed magnet stands; the repelling torque
-changes its sign there. A motion is one-sided if `dx` never changes its sign. What the cube has of a
-motion is one point per drive period, the kept sections; so a cell counts as
-
-* rotating, if a link made full turns, net, over the kept periods;
-* left or right, if `dx` is negative or positive at every kept section;
-* straddling, if it is neither: kept sections lie on both sides;
-* undecided, if all kept sections lie on one side but the drive is slower than `slowest_hz`: between
-  two sections the pendulum then has time to cross over and come back;
-* unknown, if there is nothing to judge: pending, failed, or not reached.
-
-The sign of `psi1` at the sections is no substitute: it would call 360 of the 5089 one-sided closed
-orbits below straddling.
-
-Evidence
---------
-Preset ``wojna2018``; each kept section was integrated over the period that follows it, and the sign of
-`dx` along the way compared with the label.
-
-* 2 to 3 Hz, up and down continuation, 16 branches of 401 frequencies, 64 kept sections: all 5089
-  closed orbits are one-sided and labelled as they move. Of 1327 cells that are not closed, 1 is called
-  one-sided though it steps across between two sections; with 12 kept sections, 65 are that straddle
-  within 64 periods.
-* 2.2 to 3 Hz, 1500 random initial states with angles up to pi, 64 kept sections: no wrong label.
-* 0.1 to 2 Hz, 8 branches of 191 frequencies, 32 kept sections: every motion straddles or rotates. At
-  0.72 Hz and below 167 of them show all their kept sections on one side, above that none does. Hence
-  `SLOWEST_HZ`.
-
-The torque of the fitted magnet changes its sign at ``psi1 - m psi_rel - n = 0`` instead of ``dx = 0``;
-judging the motions by that line moved 1 of these 9444 cells to another class. `dx` is used because it
-needs no magnet model and has no jump where an angle passes pi.
-
-Limits
-------
-One section per period is a sample: a motion that crosses over and back within every period at the same
-phase is not seen (hence undecided), a chaotic one that crosses rarely needs many kept sections, and
-turns that cancel over the kept periods are not rotation here.
+The words, the rule and its evidence are the model's (`magpend_core.models.model.Classifier`); here they meet
+the parameters of the run, those that it sweeps included.
 """
 
 from __future__ import annotations
 
-from enum import IntEnum
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-ARM_LENGTHS = (0.174, 0.1788)
-"""Distances [m] from joint 1 to joint 2 and from joint 2 to the moving magnet, preset ``wojna2018``."""
+from magpend_core.models.model import Classifier
+from magpend_core.models.parameters import Parameters
+from magpend_core.models.pendulum.sides import Side as Side
+from pipeline.layout.vocabulary import BOUNDED, FREQUENCY_DIM, INFERRED, PERIODIC, model_of, parameters_of
 
-SLOWEST_HZ = 0.926
-"""Slower small-angle mode [Hz] of the preset without magnets: its period is the time of a full swing."""
+UNKNOWN = 0
+"""Code of every classifier's first word: there is nothing to judge."""
 
-_COMPUTED = (1, 2, 7)  # PERIODIC, BOUNDED, INFERRED of magpend_core.status
-
-
-class Side(IntEnum):
-    """Label of a cell."""
-
-    UNKNOWN = 0
-    LEFT = 1
-    RIGHT = 2
-    STRADDLING = 3
-    ROTATING = 4
-    UNDECIDED = 5
+_COMPUTED = (PERIODIC, BOUNDED, INFERRED)
 
 
-def magnet_offset(section: xr.DataArray, lengths: tuple[float, float] = ARM_LENGTHS) -> xr.DataArray:
-    """Horizontal distance of the moving magnet from the fixed one [m], positive to the right.
-
-    Parameters
-    ----------
-    section
-        States with dim `state` that holds ``psi1`` and ``psi2`` [rad].
-    lengths
-        Distances [m] from joint 1 to joint 2, and from there to the moving magnet.
-
-    Returns
-    -------
-    DataArray
-        As `section`, without `state`.
-    """
-    offset: xr.DataArray = sum(
-        length * xr.apply_ufunc(np.sin, section.sel(state=name, drop=True), dask="allowed")
-        for length, name in zip(lengths, ("psi1", "psi2"), strict=True)
-    )
-    return offset
-
-
-def side(
-    ds: xr.Dataset, *, lengths: tuple[float, float] = ARM_LENGTHS, slowest_hz: float = SLOWEST_HZ
-) -> xr.DataArray:
-    """Label each cell by the side of the fixed magnet on which it moves.
-
-    The rule, what supports it and where it fails are in the text of this module. Lazy where `ds` is.
+def classify(ds: xr.Dataset, *, parameters: Parameters | None = None) -> xr.DataArray | None:
+    """Label each cell by the classifier of the model. Lazy where `ds` is.
 
     Parameters
     ----------
     ds
-        Cube with `section` and `status`; `turns` tells rotation, and without it no cell is called
-        rotating. The drive frequency [Hz] is the coordinate `frequency`, else the attribute
-        `frequency_hz`; if neither is there, no cell is undecided.
-    lengths
-        See `magnet_offset`. The class depends on their ratio alone. Not taken from `ds`.
-    slowest_hz
-        Drive frequency [Hz] below which one section per period cannot show one-sidedness.
+        Cube with `section` and `status`, and `turns` if the model has angles; without `turns` nothing
+        counts as turning. The drive frequency [Hz] is the coordinate ``frequency``, else the attribute
+        ``frequency_hz``, else infinite. Coordinates named like parameters replace those of the run.
+    parameters
+        What was integrated; by default as the attributes say.
 
     Returns
     -------
-    DataArray of int8
-        Codes of `Side`, on the dims of `status`; attributes `flag_values` and `flag_meanings`.
+    DataArray of int8, or None
+        Codes of the classifier's words on the dims of ``status``, with the attributes ``flag_values`` and
+        ``flag_meanings``; 0 (unknown) for cells that were not computed. None if the model has no classifier.
+
+    Raises
+    ------
+    ValueError
+        If the run's parameters are not there.
     """
-    offset = magnet_offset(ds["section"], lengths)
-    left = (offset < 0.0).all("period_index")
-    right = (offset > 0.0).all("period_index")
-    label = xr.full_like(left, Side.STRADDLING, dtype=np.int8)
-    label = label.where(~left, np.int8(Side.LEFT)).where(~right, np.int8(Side.RIGHT))
-    label = label.where(~(left | right) | ~_is_slow(ds, slowest_hz), np.int8(Side.UNDECIDED))
+    model = model_of(ds) if parameters is None else parameters.model
+    if model.classifier is None:
+        return None
+    values = parameters_of(ds) if parameters is None else parameters
+    swept = [name for name in values if name in ds.coords]
+    names = [name for name in values if name not in swept]
+    inputs = [ds["section"], ds["status"], _frequency(ds), *(ds.coords[name] for name in swept)]
+    cores: list[list[str]] = [["period_index", "state"], *([] for _ in inputs[1:])]
     if "turns" in ds:
-        turns = ds["turns"]
-        links = [dim for dim in turns.dims if dim not in ds["status"].dims]
-        label = label.where(~(turns != 0).any(links), np.int8(Side.ROTATING))
-    known = ds["status"].isin(_COMPUTED) & offset.notnull().all("period_index")
-    label = label.where(known, np.int8(Side.UNKNOWN)).transpose(*ds["status"].dims)
-    return label.rename("side").assign_attrs(
-        long_name="side of the fixed magnet on which the motion stays",
-        flag_values=np.array(list(Side), dtype=np.int8),
-        flag_meanings=" ".join(s.name.lower() for s in Side),
-    )
+        inputs.append(ds["turns"])
+        cores.append([str(d) for d in ds["turns"].dims if d not in ds["status"].dims])
+    label: xr.DataArray = xr.apply_ufunc(
+        _label, *inputs, input_core_dims=cores, dask="parallelized", output_dtypes=[np.int8],
+        dask_gufunc_kwargs={"allow_rechunk": True},
+        kwargs={"classifier": model.classifier, "fixed": {name: values[name] for name in names},
+                "swept": swept, "n_angles": len(model.angles)},
+    )  # fmt: skip
+    label = label.transpose(*ds["status"].dims)
+    return label.rename("side").assign_attrs(flags_of(model.classifier))
 
 
-def _is_slow(ds: xr.Dataset, slowest_hz: float) -> xr.DataArray:
-    """Say where the drive is too slow for one section per period."""
-    frequency = ds.coords.get("frequency")
-    if frequency is None:
-        frequency = xr.DataArray(ds.attrs.get("frequency_hz", np.inf))
-    return frequency < slowest_hz
+def flags_of(classifier: Classifier) -> dict[str, Any]:
+    """Attributes of an array of a classifier's codes."""
+    return {
+        "units": "1",
+        "long_name": classifier.meaning,
+        "flag_values": np.arange(len(classifier.words), dtype=np.int8),
+        "flag_meanings": " ".join(classifier.words),
+    }
+
+
+def _frequency(ds: xr.Dataset) -> xr.DataArray:
+    found = ds.coords.get(FREQUENCY_DIM)
+    return xr.DataArray(float(ds.attrs.get("frequency_hz", np.inf))) if found is None else found
+
+
+def _label(
+    section: np.ndarray, status: np.ndarray, frequency: np.ndarray, *rest: np.ndarray,
+    classifier: Classifier, fixed: Mapping[str, float], swept: list[str], n_angles: int,
+) -> np.ndarray:  # fmt: skip
+    """Codes of one block: leading dims broadcast, the section's last two are its sections and states."""
+    values = {**fixed, **dict(zip(swept, rest, strict=False))}
+    turns = rest[len(swept)] if len(rest) > len(swept) else np.zeros((1,) * status.ndim + (n_angles,), int)
+    known = np.isfinite(section).all(axis=(-2, -1)) & np.isin(status, _COMPUTED)
+    code = classifier.classify(np.nan_to_num(section), turns, frequency, values)
+    return np.where(known, code, np.int8(UNKNOWN)).astype(np.int8)
+
+
+side = classify
+ARM_LENGTHS = (0.174, 0.1788)

@@ -122,12 +122,12 @@ class Display:
         self._drawn = False
         self._lock, self._over = threading.RLock(), threading.Event()
 
-    def __call__(self, what: str, done: float, total: float) -> None:
+    def __call__(self, what: str, done: float, total: float, expected_s: float = 0.0) -> None:
         """Take a report."""
         with self._lock:
             if what != self._work.what:
-                self._work = Work(what, self._clock(), done)
-            self._work.done, self._work.total = done, total
+                self._work = Work(what, self._clock(), done, expected_s=expected_s)
+            self._work.done, self._work.total, self._work.heard = done, total, self._clock()
 
     def show(self) -> None:
         """Say now how far the work is."""
@@ -174,6 +174,10 @@ class Work:
         How much was done then.
     done, total : float
         As last reported; without a total, only the time is known.
+    heard : float
+        When the last report came [s].
+    expected_s : float
+        Time that all of it will take as far as is known beforehand [s]; 0 if it is not.
     """
 
     what: str
@@ -181,6 +185,8 @@ class Work:
     begun: float = 0.0
     done: float = 0.0
     total: float = 0.0
+    heard: float = 0.0
+    expected_s: float = 0.0
 
     def line(self, now: float) -> str:
         """Say how far it is, and how long it will take."""
@@ -189,10 +195,14 @@ class Work:
             return f"{self.what}: {duration(elapsed)} so far"
         share = min(self.done / self.total, 1.0)
         text = f"{self.what}: {self.done:g} of {self.total:g} ({100 * share:.0f} %)"
-        rate = (self.done - self.begun) / elapsed if elapsed > 0 else 0.0
-        if rate > 0 and share < 1:
-            return f"{text}, {duration((self.total - self.done) / rate)} left"
-        return text if share == 1 else f"{text}, {duration(elapsed)} so far"
+        if share == 1:
+            return text
+        took, more = self.heard - self.started, self.done - self.begun
+        if more > 0:
+            left, about = took * (self.total - self.done) / more - (now - self.heard), ""
+        else:
+            left, about = self.expected_s - elapsed, "about "
+        return f"{text}, {about}{duration(left)} left" if left > 0 else f"{text}, {duration(elapsed)} so far"
 
 
 @contextlib.contextmanager

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pipeline.cli.common import Json
+from pipeline.cli.options import completing
 
 if TYPE_CHECKING:
     from magpend_core.models.model import Model
 
 
+DEFAULT = "pendulum"
+"""As `magpend_core.models.DEFAULT`, which is not imported for the help."""
+
+
+def names() -> Iterable[str]:
+    """Names of the models that ship."""
+    from magpend_core.models import model_names
+
+    return model_names()
+
+
 def models(
-    name: Annotated[str | None, typer.Argument(help="Show this model alone, with all it has.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Show this model alone, with all it has.", autocompletion=completing(names)),
+    ] = None,
     json: Json = False,
 ) -> None:
     """List the models: their states, parameters, quantities and presets."""
@@ -82,7 +97,7 @@ def _preset(model: Model, name: str) -> list[str]:
 
 def presets(
     name: Annotated[str | None, typer.Argument(help="Show this preset alone.")] = None,
-    model: Annotated[str, typer.Option(help="Whose presets.")] = "pendulum",
+    model: Annotated[str, typer.Option(help="Whose presets.", autocompletion=completing(names))] = DEFAULT,
 ) -> None:
     """List the presets of a model: values, units, and where each comes from."""
     from magpend_core.models import load_model

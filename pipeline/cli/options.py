@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -66,6 +66,15 @@ def taking(model: type[Options], command: Command) -> Command:
     return _signed(run, command, [*own, *(_parameter(model, name) for name in model.model_fields)])
 
 
+def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Return what a shell asks for the words that an incomplete one may become."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [word for word in words() if word.startswith(incomplete)]
+
+    return complete
+
+
 def flag_of(model: type[Options], name: str) -> str:
     """What a field is called on the command line."""
     extra: Any = model.model_fields[name].json_schema_extra or {}
@@ -111,7 +120,7 @@ def _parameter(model: type[Options], name: str) -> inspect.Parameter:
     declared: dict[str, Any] = {"help": text}
     if get_origin(kind) is Literal:
         choices = [c for c in get_args(kind) if c]
-        declared |= {"metavar": "|".join(choices), "autocompletion": lambda: choices}
+        declared |= {"metavar": "|".join(choices), "autocompletion": completing(lambda: choices)}
         kind = str
     elif kind is bool:
         flag = f"{flag}/--no-{flag[2:]}" if default else flag

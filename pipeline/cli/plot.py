@@ -57,8 +57,7 @@ def draw(directory: Path, name: str, options: FigureOptions) -> None:
 
     target.parent.mkdir(exist_ok=True)
     console.result(f"figure: {save_figure(figure, target)}")
-    if hasattr(figure, "data"):
-        console.result(f"data: {save_data(figure, target)}")
+    console.result(f"data: {save_data(figure, target)}")
 
 
 def _target_of(options: FigureOptions) -> Path:

@@ -48,19 +48,37 @@ def commands() -> str:
     return table(("command", "does"), rows)
 
 
+SHARED = ("plot fractions", "analyse attractors", "analyse branches")
+"""Commands whose options others have too: listed with these alone."""
+
+
 def options() -> str:
     """Every command with its options."""
-    parts = []
-    for name, command in _commands():
+    found, parts = dict(_commands()), []
+    listed = {name: dict(_options(found[name])) for name in SHARED}
+    for name, command in found.items():
+        own, also = dict(_options(command)), list[str]()
+        for other in SHARED:
+            if other != name and listed[other].items() <= own.items() and not _covered(other, also):
+                also.append(f"`magpend {other}`")
+                own = {flag: text for flag, text in own.items() if flag not in listed[other]}
         paragraphs = "\n\n".join(" ".join(p.split()) for p in (command.help or "").split("\n\n"))
-        rows = [
-            (f"`{', '.join((*p.opts, *p.secondary_opts))}{_metavar(p)}`", _help(p))
-            for p in command.params
-            if p.param_type_name == "option" and p.name not in ("help", "quiet", "verbose", "log")
-        ]
-        listed = f"\n\n{table(('option', 'meaning'), rows)}" if rows else ""
-        parts.append(f"### `magpend {name}{_arguments(command)}`\n\n{_text(paragraphs)}{listed}")
+        part = f"### `magpend {name}{_arguments(command)}`\n\n{_text(paragraphs)}"
+        part += f"\n\nTakes the options of {' and '.join(also)}{', and:' if own else '.'}" if also else ""
+        parts.append(part + (f"\n\n{table(('option', 'meaning'), own.items())}" if own else ""))
     return "\n\n".join(parts)
+
+
+def _covered(name: str, others: list[str]) -> bool:
+    return name == "analyse attractors" and "`magpend plot fractions`" in others
+
+
+def _options(command: Any) -> list[tuple[str, str]]:
+    return [
+        (f"`{', '.join((*p.opts, *p.secondary_opts))}{_metavar(p)}`", _help(p))
+        for p in command.params
+        if p.param_type_name == "option" and p.name not in ("help", "quiet", "verbose", "log")
+    ]
 
 
 def exit_codes() -> str:

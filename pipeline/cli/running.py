@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -9,8 +10,22 @@ import typer
 
 from pipeline.cli.common import Directory
 from pipeline.cli.exits import Exit
+from pipeline.cli.options import completing
 
-Spec = Annotated[str, typer.Argument(metavar="SPEC", help="A TOML file, or the name of a shipped workflow.")]
+
+def _workflows() -> Iterable[str]:
+    from pipeline.runs.workflows import shipped_workflows
+
+    return shipped_workflows()
+
+
+Spec = Annotated[
+    str,
+    typer.Argument(
+        metavar="SPEC", help="A TOML file, or the name of a shipped workflow.",
+        autocompletion=completing(_workflows),
+    ),
+]  # fmt: skip
 
 
 def run(

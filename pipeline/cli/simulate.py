@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cli.common import read_pairs
+from pipeline.cli.models import DEFAULT, names
+from pipeline.cli.options import completing
 from pipeline.cli.plot import check_figure_path
 
 EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
@@ -16,7 +18,9 @@ EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
 
 def simulate(
     context: typer.Context,
-    model: Annotated[str, typer.Option(help="Which one; see magpend models.")] = "pendulum",
+    model: Annotated[
+        str, typer.Option(help="Which one; see magpend models.", autocompletion=completing(names))
+    ] = DEFAULT,
     frequency_hz: Annotated[
         float, typer.Option("--frequency-hz", "--frequency", help="Drive frequency [Hz].")
     ] = 2.2,
@@ -39,8 +43,8 @@ def simulate(
 ) -> None:
     """Integrate one trajectory: states and the model's quantities as CSV or NetCDF, and a figure.
 
-    The initial state is given by name, such as --psi1 0.2 or --psi1-deg 12 for the pendulum, --x 0.5 for
-    duffing; what is not given is 0. Time 0 is the instant of a section.
+    The initial state is given by the model's names: --NAME VALUE, or --NAME-deg VALUE of an angle or its
+    rate; what is not given is 0. Time 0 is the instant of a section.
     """
     from pipeline.cli import console
     from pipeline.compute import simulate as simulation

@@ -28,7 +28,7 @@ BRANCH, START = "branch", "initial_condition"
 ABSENT, CLOSED_ORBIT, BOUNDED_SET = range(3)
 """Values of `kind`, see `pipeline.analysis.attractors`."""
 
-PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = map(int, Status)
+PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = Status
 
 FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED)
 """What became of cells that could not be integrated to the end."""

@@ -1,22 +1,32 @@
 """Figures of a cube: Dataset in, matplotlib Figure out.
 
-Nothing here integrates, opens a store or touches pyplot: figures are plain objects, so they can be made
-in any thread and without a display.
+Nothing here opens a store or touches pyplot: figures are plain objects, so they can be made in any thread
+and without a display. `draw_figure` draws any figure of a run by name; `Frame` is the size of a figure and
+the part that it shows.
 """
 
 from pipeline.plots.basins import plot_basins
 from pipeline.plots.bifurcation import plot_bifurcation
-from pipeline.plots.branches import plot_branches, plot_curves, plot_multipliers
-from pipeline.plots.chaos import plot_convergence, plot_dimension
+from pipeline.plots.branches import plot_branches
 from pipeline.plots.coexisting import plot_coexisting
+from pipeline.plots.convergence import plot_convergence
+from pipeline.plots.dimension import plot_dimension
+from pipeline.plots.door import draw_figure
+from pipeline.plots.exponent_map import plot_lyapunov_map
+from pipeline.plots.files import save_data, save_figure
 from pipeline.plots.fractions import plot_fractions
 from pipeline.plots.gallery import plot_gallery
-from pipeline.plots.lyapunov import plot_lyapunov, plot_lyapunov_map
+from pipeline.plots.lyapunov import plot_lyapunov
+from pipeline.plots.multipliers import plot_curves, plot_multipliers
 from pipeline.plots.regimes import plot_regimes
-from pipeline.plots.style import save_data, save_figure
+from pipeline.plots.section import plot_section
+from pipeline.plots.style import DataFigure, Frame
 from pipeline.plots.trajectory import plot_trajectory
 
 __all__ = [
+    "DataFigure",
+    "Frame",
+    "draw_figure",
     "plot_basins",
     "plot_bifurcation",
     "plot_branches",
@@ -30,6 +40,7 @@ __all__ = [
     "plot_lyapunov_map",
     "plot_multipliers",
     "plot_regimes",
+    "plot_section",
     "plot_trajectory",
     "save_data",
     "save_figure",

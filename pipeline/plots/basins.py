@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,15 +9,14 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
-from matplotlib.figure import Figure
-from matplotlib.ticker import AutoMinorLocator, LogLocator, NullLocator, ScalarFormatter
+from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.vocabulary import CLOSED_ORBIT, INFERRED, is_grid_dim
-from pipeline.plots import palette, style
+from pipeline.layout.vocabulary import CLOSED_ORBIT, INFERRED, grid_dim, model_of
+from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.products.figures import BasinFigureOptions
 
-_SIDE_IN = 3.9
-_LEFT_IN, _BOTTOM_IN, _TOP_IN = 0.68, 0.52, 0.3
 _DARKEST = 0.62
 _OTHERS = -1
 _FIRST_GREY = -2
@@ -30,6 +28,7 @@ def plot_basins(
     at: Mapping[str, float] | None = None,
     degrees: bool = False,
     n_periods: xr.DataArray | None = None,
+    frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
     """Draw the basins of attraction on a plane of initial states, a colour per attractor.
 
@@ -38,19 +37,20 @@ def plot_basins(
     attractors
         Result of `pipeline.analysis.attractors.attractors.match` for a sweep over a grid of initial states.
     at
-        Values of all other axes, such as ``{"frequency": 2.2}`` [units of the axis, rad]; the nearest
-        ones are drawn.
+        Values of all other axes, such as ``{"frequency": 2.2}`` [units of the axis, rad].
     degrees
         Degrees instead of radians.
     n_periods
         Drive periods that each cell took, of the same cube; if given, cells that took longer to close are
         darker, on a logarithmic scale from the 1st to the 99th percentile. Inferred cells took none and
         keep the plain colour.
+    frame
+        Width of the figure and ranges of its axes.
 
     Returns
     -------
     DataFigure
-        7 in wide. Cells without an attractor are grey. The legend gives each basin's share of the
+        Cells without an attractor are grey. The legend gives each basin's share of the
         cells drawn. Its `data` hold ``attractor_id`` and ``status`` of these, and ``n_periods`` if drawn.
 
     Raises
@@ -68,30 +68,41 @@ def plot_basins(
         )["attractor_id"].transpose(*reversed(axes))
     cast = palette.cast_of(attractors, part)
     codes, counts = _codes(data, cast)
-    fig = style.new_data_figure(_SIDE_IN + _BOTTOM_IN + _TOP_IN, _stored(data, part, cast))
-    ax = _square(fig)
+    fig, ax = palette.new_panel(_stored(data, part, cast), _entries(cast, counts, codes.size), frame, 4.7)
     scale = _scale(data, part)
     image = ax.imshow(
-        _painted(codes, data, part, cast, scale), origin="lower", extent=_extent(data, axes, degrees),
-        aspect="equal" if _is_square(data, axes) else "auto", interpolation="nearest",
+        _painted(codes, data, part, cast, scale), origin="lower",
+        extent=_extent(data, attractors, axes, degrees),
+        aspect="equal" if _is_square(data, attractors, axes) and not (frame.xlim or frame.ylim) else "auto",
+        interpolation="nearest",
     )  # fmt: skip
     image.set_gid("basins")
-    _dress(ax, axes, degrees)
-    stride = max(1, max(codes.shape) // 400)
-    palette.write_letters(ax, codes[::stride, ::stride], cast.main)
-    entries = _entries(cast, counts, codes.size)
-    left = _LEFT_IN + _SIDE_IN + 0.18
-    palette.legend_column(fig, entries, left, _TOP_IN)
+    style.limits(ax, frame)
+    _dress(ax, attractors, axes, degrees)
     if scale is not None:
-        _draw_scale(fig, scale, left)
-    ax.text(0.0, 1.015, palette.caption(part), transform=ax.transAxes, fontsize=style.LEGEND_PT)
-    style.style_text(fig)
+        _draw_scale(fig, ax, scale)
+    style.caption(ax, labels.caption(part, drop=axes))
+    style.finish(fig)
+    _write_letters(ax, codes, cast)
     return fig
+
+
+def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
+    """Write letters into what is shown of the image."""
+    left, right, bottom, top = ax.get_images()[0].get_extent()
+    row, column = (
+        np.clip(((np.arange(400) + 0.5) / 400 * (b - a) + a - low) / (high - low) * n, 0, n - 1).astype(int)
+        for (a, b), low, high, n in (
+            (ax.get_ylim(), bottom, top, codes.shape[0]), (ax.get_xlim(), left, right, codes.shape[1]),
+        )
+    )  # fmt: skip
+    palette.write_letters(ax, codes[np.ix_(row, column)], cast.main)
 
 
 def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, str]:
     """Names of the two axes of the image: horizontal, vertical."""
-    grid = [str(d) for d in attractors["attractor_id"].dims if is_grid_dim(str(d))]
+    dims = start_dims(attractors)
+    grid = [grid_dim(name) for name in model_of(attractors).state_names if grid_dim(name) in dims]
     if len(grid) < 2:
         have = ", ".join(start_dims(attractors)) or "none"
         raise ValueError(
@@ -159,39 +170,30 @@ def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
     return LogNorm(low, high if high > low else low + 1.0)
 
 
-def _extent(data: xr.Dataset, axes: tuple[str, str], degrees: bool) -> tuple[float, float, float, float]:
+def _extent(
+    data: xr.Dataset, attractors: xr.Dataset, axes: tuple[str, str], degrees: bool
+) -> tuple[float, float, float, float]:
     """Limits of the image: the outer edges of the outer cells."""
-    unit = 180.0 / math.pi if degrees else 1.0
-    x, y = (style.edges(data[d].values.astype(np.float64)) * unit for d in axes)
+    x, y = (
+        labels.start_measure(attractors, d, degrees).shown(style.edges(data[d].values.astype(np.float64)))
+        for d in axes
+    )
     return float(x[0]), float(x[-1]), float(y[0]), float(y[-1])
 
 
-def _is_square(data: xr.Dataset, axes: tuple[str, str]) -> bool:
-    """Whether both axes are angles in the same range, or both rates."""
-    left, right, bottom, top = _extent(data, axes, False)
-    alike = style.is_angle(axes[0].removesuffix("_0")) == style.is_angle(axes[1].removesuffix("_0"))
-    return alike and math.isclose(right - left, top - bottom, rel_tol=0.02)
+def _is_square(data: xr.Dataset, attractors: xr.Dataset, axes: tuple[str, str]) -> bool:
+    """Whether both axes have one unit and the same range."""
+    left, right, bottom, top = _extent(data, attractors, axes, False)
+    units = {labels.start_measure(attractors, d).unit for d in axes}
+    return len(units) == 1 and bool(np.isclose(right - left, top - bottom, rtol=0.02))
 
 
-def _square(fig: Figure) -> Axes:
-    width, height = fig.get_size_inches()
-    ax = fig.add_axes((_LEFT_IN / width, _BOTTOM_IN / height, _SIDE_IN / width, _SIDE_IN / height))
-    style.style_axes(ax)
-    # ticks inside would lie on the image
-    ax.tick_params(which="both", direction="out", top=False, right=False)
-    return ax
-
-
-def _dress(ax: Axes, axes: tuple[str, str], degrees: bool) -> None:
-    for axis, name in zip(("x", "y"), axes, strict=True):
-        state = name.removesuffix("_0")
-        label = style.state_label(state, degrees).replace("$ [", "(0)$ [", 1)
-        (ax.set_xlabel if axis == "x" else ax.set_ylabel)(label, fontsize=style.LABEL_PT, labelpad=2.0)
-        target = ax.xaxis if axis == "x" else ax.yaxis
-        target.set_minor_locator(AutoMinorLocator(2))
-        if style.is_angle(state):
-            low, high = ax.get_xlim() if axis == "x" else ax.get_ylim()
-            style.set_angle_ticks(ax, low, high, degrees=degrees, axis=axis)
+def _dress(ax: Axes, attractors: xr.Dataset, axes: tuple[str, str], degrees: bool) -> None:
+    labels.some_angle(model_of(attractors), degrees, "initial states")
+    x, y = (labels.start_measure(attractors, name, degrees) for name in axes)
+    style.label_axes(ax, x.label, y.label)
+    labels.angle_ticks(ax, x, "x")
+    labels.angle_ticks(ax, y, "y")
 
 
 def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[tuple[str, str]]:
@@ -207,19 +209,19 @@ def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[
     return entries
 
 
-def _draw_scale(fig: Figure, scale: LogNorm, left_in: float) -> None:
-    width, height = fig.get_size_inches()
-    box = fig.add_axes((left_in / width, (_BOTTOM_IN + 0.08) / height, 1.9 / width, 0.11 / height))
+def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm) -> None:
+    """Draw how dark which time is, below the image."""
     ramp = LinearSegmentedColormap.from_list("time", [(0.85,) * 3, (0.85 * (1.0 - _DARKEST),) * 3])
-    bar = fig.colorbar(ScalarMappable(scale, ramp), cax=box, orientation="horizontal")
+    bar = fig.colorbar(
+        ScalarMappable(scale, ramp), ax=ax, orientation="horizontal", shrink=0.6, aspect=24, pad=0.02
+    )
     bar.outline.set_linewidth(style.LINE_PT)
-    box.set_gid("time")
-    bar.set_label("drive periods to converge", fontsize=style.LEGEND_PT, labelpad=4.0)
-    box.xaxis.set_label_position("top")
-    box.tick_params(labelsize=style.TICK_PT, width=style.LINE_PT, length=2.5, pad=1.5)
-    box.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 3.0, 5.0, 7.0), numticks=12))
-    box.xaxis.set_major_formatter(ScalarFormatter())
-    box.xaxis.set_minor_locator(NullLocator())
+    bar.ax.set_gid("time")
+    bar.set_label("drive periods to converge", fontsize=fig.look.legend, labelpad=2.0)
+    bar.ax.tick_params(labelsize=fig.look.tick, width=style.LINE_PT, length=2.5, pad=1.5)
+    bar.ax.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 3.0, 5.0, 7.0), numticks=12))
+    bar.ax.xaxis.set_major_formatter(ScalarFormatter())
+    bar.ax.xaxis.set_minor_locator(NullLocator())
 
 
 def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Dataset:
@@ -232,3 +234,12 @@ def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Datase
     stored = stored.assign_coords(scalars)
     stored.attrs = {"title": "basins of attraction"}
     return stored
+
+
+def draw(run: Run, options: BasinFigureOptions) -> style.DataFigure:
+    """Draw the figure ``basins`` of a run."""
+    at, notes = values_of(run, options)
+    found = attractors_of(run, options)
+    times = run.cube()["n_periods"] if options.shade else None
+    figure = plot_basins(found, at=at, degrees=options.degrees, n_periods=times, frame=frame_of(options))
+    return noted(figure, notes)

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import AutoMinorLocator
 
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.plots import palette, style
-from pipeline.plots.fractions import new_panel, swept_parameter
-from pipeline.plots.trajectory import wrapped
+from pipeline.layout.letters import letter
+from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.fractions import swept_parameter
+from pipeline.products.attractors import AttractorOptions
+from pipeline.products.figures import CoexistingOptions
 
 _LEAST_PT, _GROWTH_PT = 1.1, 5.0
 _UP_PT, _DOWN_PT, _TINT = 1.5, 4.2, 0.55
@@ -26,10 +26,11 @@ _SPAN: dict[str, Any] = {"facecolor": "0.9", "edgecolor": "none", "linewidth": 0
 def plot_coexisting(
     attractors: xr.Dataset,
     *,
-    state: str = "psi1",
+    state: str = "",
     at: Mapping[str, float] | None = None,
     degrees: bool = False,
     hysteresis: xr.Dataset | None = None,
+    frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
     """Draw the section points of all attractors over the swept parameter.
 
@@ -38,18 +39,20 @@ def plot_coexisting(
     attractors
         Result of `pipeline.analysis.attractors.attractors.match` over one parameter or more.
     state
-        ``psi1``, ``psi2``, ``psi1_dot`` or ``psi2_dot``.
+        Name of the state drawn; by default the model's first.
     at
-        Values of the other swept parameters; the nearest ones are drawn.
+        Values of the other swept parameters.
     degrees
         Degrees instead of radians.
     hysteresis
         Result of `pipeline.analysis.attractors.hysteresis.hysteresis`; its loops are shaded.
+    frame
+        Width of the figure and ranges of its axes.
 
     Returns
     -------
     DataFigure
-        7 in wide. In a sweep the area of the points of an attractor shares out its basin fraction. In a
+        In a sweep the area of the points of an attractor shares out its basin fraction. In a
         continuation in both directions small dark points are met upwards, large light ones downwards.
         A bounded set is drawn by the points of it that are stored. Its `data` hold ``value`` and what
         decides the look of each point: ``share``, or ``present`` for each direction.
@@ -59,35 +62,39 @@ def plot_coexisting(
     ValueError
         For an unknown state, and if there is not one swept parameter left.
     """
-    style.check_choice("state", state, [str(name) for name in attractors["state"].values])
+    measure = labels.state_measure(attractors, state, degrees)
     parameter = swept_parameter(attractors, at, "attractors")
     keep = (parameter, *start_dims(attractors))
     part = choose(attractors, at, keep, f"attractors are drawn over {parameter}")
     cast = palette.cast_of(attractors, part)
-    data = _points(part, parameter, state, degrees)
+    data = _points(part, parameter, measure)
     loops = _loops(hysteresis, part, parameter) if hysteresis is not None else []
     both = "direction" in data.dims
-    fig, ax = new_panel(data, _entries(data, cast, both, bool(loops)))
+    fig, ax = palette.new_panel(data, _entries(data, cast, both, bool(loops)), frame)
+    style.style_axes(ax)
     for low, high in loops:
         ax.axvspan(low, high, gid="loop", zorder=0.5, **_SPAN)
     for number in sorted(range(len(cast.names)), key=lambda i: float(data["share"].isel(attractor=i).sum())):
         (_draw_directions if both else _draw_weighted)(ax, data.isel(attractor=number), parameter, cast)
-    _dress(ax, data, parameter, state, degrees)
-    ax.text(0.0, 1.015, palette.caption(part), transform=ax.transAxes, fontsize=style.LEGEND_PT)
-    style.style_text(fig)
+    ax.set_xlim(*style.span(data[parameter].values))
+    ax.margins(y=0.05)
+    ax.autoscale_view(scalex=False)
+    style.limits(ax, frame)
+    labels.angle_ticks(ax, measure)
+    style.label_axes(ax, labels.parameter_label(data[parameter]), measure.label)
+    style.caption(ax, labels.caption(part, drop=[parameter]))
+    style.finish(fig)
     return fig
 
 
-def _points(part: xr.Dataset, parameter: str, state: str, degrees: bool) -> xr.Dataset:
+def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> xr.Dataset:
     """Values to draw, with what decides their look."""
-    values = part["attractor_points"].sel(state=state, drop=True).transpose(parameter, "attractor", "point")
-    if style.is_angle(state):
-        values = values.copy(data=wrapped(values.values))
-    units = style.state_label(state, degrees).rpartition("[")[2].rstrip("]")
-    shown = values.copy(data=np.rad2deg(values.values)) if degrees else values
+    values = part["attractor_points"].sel(state=measure.name, drop=True)
+    values = values.transpose(parameter, "attractor", "point")
+    shown = values.copy(data=measure.shown(values.values, wrap=True))
     data = xr.Dataset(
         {
-            "value": shown.assign_attrs(units=units, long_name=f"{state} at the section"),
+            "value": shown.assign_attrs(units=measure.unit, long_name=f"{measure.name} at the section"),
             "share": part["share"].transpose(parameter, "attractor"),
         }
     )
@@ -138,7 +145,7 @@ def _draw_weighted(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast
     size = _diameter(share[row] / np.bincount(row)[row]) ** 2 if row.size else 1.0
     ax.scatter(
         x, y, s=size, c=cast.colours[number], linewidths=0.0, rasterized=True,
-        gid=f"points:{palette.letter(number)}",
+        gid=f"points:{letter(number)}",
     )  # fmt: skip
 
 
@@ -156,27 +163,9 @@ def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Ca
         up = word == "up"
         ax.plot(
             x, y, linestyle="none", marker="o", markersize=_UP_PT if up else _DOWN_PT, markeredgewidth=0.0,
-            color=cast.colours[number] if up else _tinted(cast.colours[number]), zorder=2.2 if up else 2.0,
-            rasterized=True, gid=f"points:{word}:{palette.letter(number)}",
+            color=style.tinted(cast.colours[number], 0.0 if up else _TINT), zorder=2.2 if up else 2.0,
+            rasterized=True, gid=f"points:{word}:{letter(number)}",
         )  # fmt: skip
-
-
-def _tinted(colour: str) -> tuple[float, float, float]:
-    red, green, blue = (c + (1.0 - c) * _TINT for c in to_rgb(colour))
-    return red, green, blue
-
-
-def _dress(ax: Axes, data: xr.Dataset, parameter: str, state: str, degrees: bool) -> None:
-    edges = style.edges(data[parameter].values.astype(np.float64))
-    ax.set_xlim(float(edges.min()), float(edges.max()))
-    ax.margins(y=0.05)
-    ax.autoscale_view(scalex=False)
-    ax.set_xlabel(style.parameter_label(data[parameter]), fontsize=style.LABEL_PT)
-    ax.set_ylabel(style.state_label(state, degrees), fontsize=style.LABEL_PT, labelpad=2.0)
-    if style.is_angle(state):
-        style.set_angle_ticks(ax, *ax.get_ylim(), degrees=degrees)
-    ax.xaxis.set_minor_locator(AutoMinorLocator())
-    ax.yaxis.set_minor_locator(AutoMinorLocator(2))
 
 
 def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> list[palette.Entry]:
@@ -187,16 +176,24 @@ def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> l
     if rest:
         entries.append((f"{rest} others", palette.OTHERS))
     if both:
-        entries += [_dot(_UP_PT, "0.0", "up"), _dot(_DOWN_PT, _tinted("0.0"), "down")]
+        entries += [style.dot("up", "0.0", _UP_PT), style.dot("down", style.tinted("0.0", _TINT), _DOWN_PT)]
     else:
         sizes = ((1.0, "basin fraction per point 1"), (0.1, "0.1"), (0.0, "below 0.01"))
-        entries += [_dot(float(_diameter(share)), "0.3", text) for share, text in sizes]
+        entries += [style.dot(text, "0.3", float(_diameter(share))) for share, text in sizes]
     if loops:
         entries.append(Patch(label="up and down differ", **_SPAN))
     return entries
 
 
-def _dot(size: float, colour: Any, label: str) -> Line2D:
-    return Line2D(
-        [], [], linestyle="none", marker="o", markersize=size, markeredgewidth=0, color=colour, label=label
+def draw(run: Run, options: CoexistingOptions) -> style.DataFigure:
+    """Draw the figure ``attractors`` of a run, with its hysteresis if it was walked up and down."""
+    at, notes = values_of(run, options)
+    found = attractors_of(run, options)
+    both = "direction" in found.coords and {"up", "down"} == set(
+        found["direction"].values.astype(str).tolist()
     )
+    loops = run.derive("hysteresis", **options.part(AttractorOptions)) if both else None
+    figure = plot_coexisting(
+        found, state=options.state, at=at, degrees=options.degrees, hysteresis=loops, frame=frame_of(options)
+    )
+    return noted(figure, notes)

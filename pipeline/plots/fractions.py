@@ -10,20 +10,23 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import AutoMinorLocator
 
 from pipeline.analysis.basins.numbers import binomial_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
-from pipeline.plots import palette, style
+from pipeline.layout.letters import letter
+from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.products.figures import AttractorFigureOptions
 
 MOST_BARS = 60
 """Most bars that are drawn: more would hide the bands."""
 
 _BAR: dict[str, Any] = {"linewidth": 0.7, "color": "black"}
-_LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN, _HEIGHT_IN = 0.66, 4.6, 0.5, 0.3, 3.5
 
 
-def plot_fractions(attractors: xr.Dataset, *, at: Mapping[str, float] | None = None) -> style.DataFigure:
+def plot_fractions(
+    attractors: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
+) -> style.DataFigure:
     """Draw the share of the initial states that end on each attractor, over the swept parameter.
 
     Parameters
@@ -31,12 +34,14 @@ def plot_fractions(attractors: xr.Dataset, *, at: Mapping[str, float] | None = N
     attractors
         Result of `pipeline.analysis.attractors.attractors.match` for a sweep over one parameter or more.
     at
-        Values of the other swept parameters, such as ``{"q": 1.5}``; the nearest ones are drawn.
+        Values of the other swept parameters, such as ``{"q": 1.5}``.
+    frame
+        Width of the figure and ranges of its axes.
 
     Returns
     -------
     DataFigure
-        7 in wide. Bands are stacked, the largest at the bottom; cells without an attractor are grey, at
+        Bands are stacked, the largest at the bottom; cells without an attractor are grey, at
         the top. Each value of the parameter is a column, for between two of them nothing is known. Its
         `data` hold ``fraction`` and the number of cells, ``n_cells``; of a sweep also ``low`` and ``high``,
         the 95 % Wilson interval of each fraction, as if the starts were drawn independently. The widest
@@ -58,26 +63,15 @@ def plot_fractions(attractors: xr.Dataset, *, at: Mapping[str, float] | None = N
     entries: list[palette.Entry] = [(band.name, band.colour) for band in reversed(bands)]
     if bars := "low" in data and 0 < data.sizes[parameter] * (len(bands) - 1) <= MOST_BARS:
         entries.append(Line2D([], [], label="95 % interval of an edge", **_BAR))
-    fig, ax = new_panel(data, entries)
+    fig, ax = palette.new_panel(data, entries, frame)
     _draw(ax, data, parameter, bands)
     if bars:
         _draw_intervals(ax, data, parameter, bands)
-    text = ", ".join(filter(None, [palette.caption(part), _about(data)]))
-    ax.text(0.0, 1.015, text, transform=ax.transAxes, fontsize=style.LEGEND_PT)
-    style.style_text(fig)
+    style.limits(ax, frame)
+    style.caption(ax, style.join([labels.caption(part, drop=[parameter]), _about(data)]))
+    style.finish(fig)
+    _write_letters(ax, data, parameter, bands)
     return fig
-
-
-def new_panel(data: xr.Dataset, entries: Sequence[palette.Entry]) -> tuple[style.DataFigure, Axes]:
-    """Make a figure with one panel and a legend beside it, high enough for both."""
-    left = _RIGHT_IN + 0.15
-    panel = max(_HEIGHT_IN, palette.column_height(entries, left) - 0.3)
-    fig = style.new_data_figure(panel + _BOTTOM_IN + _TOP_IN, data)
-    width, height = fig.get_size_inches()
-    ax = fig.add_axes((_LEFT_IN / width, _BOTTOM_IN / height, (_RIGHT_IN - _LEFT_IN) / width, panel / height))
-    style.style_axes(ax)
-    palette.legend_column(fig, entries, left, _TOP_IN)
-    return fig, ax
 
 
 def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what: str) -> str:
@@ -109,7 +103,7 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
         codes[(ids < 0) & np.isin(status, chosen)] = len(cast.names) + k
     width = len(cast.names) + len(kinds)
     counts = np.array([np.bincount(row, minlength=width) for row in codes])
-    labels = [*(palette.letter(i) for i in range(len(cast.names))), *kinds]
+    labels = [*(letter(i) for i in range(len(cast.names))), *kinds]
     names = [*cast.names.values(), *kinds]
     branches = "branch" in start_dims(part)
     of = "branches" if branches else "initial states"
@@ -179,22 +173,22 @@ def _draw(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) ->
     floor = np.zeros(edges.size - 1)
     for band in bands:
         looks = {"facecolor": band.colour, "edgecolor": "none", "linewidth": 0.0}
-        mark = palette.letter(band.attractor) if band.attractor >= 0 else band.name
+        mark = letter(band.attractor) if band.attractor >= 0 else band.name
         style.fill_columns(ax, edges, floor, floor + band.height, looks, f"band:{mark}")
         floor = floor + band.height
-    codes = np.array([band.attractor for band in bands])
-    heights = np.array([band.height for band in bands])
-    rising = slice(None) if edges[-1] > edges[0] else slice(None, None, -1)
-    palette.write_letters(ax, _raster(edges[rising], codes, heights[:, rising]), codes[codes >= 0].tolist())
     ax.set_xlim(float(edges.min()), float(edges.max()))
     ax.set_ylim(0.0, 1.0)
-    # ticks inside would lie on the bands
-    ax.tick_params(which="both", direction="out", top=False, right=False)
-    ax.xaxis.set_minor_locator(AutoMinorLocator())
-    ax.yaxis.set_minor_locator(AutoMinorLocator(2))
-    ax.set_xlabel(style.parameter_label(data[parameter]), fontsize=style.LABEL_PT)
     label = "basin fraction" if "low" in data else "share of the branches"
-    ax.set_ylabel(label, fontsize=style.LABEL_PT)
+    style.label_axes(ax, labels.parameter_label(data[parameter]), label)
+
+
+def _write_letters(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) -> None:
+    edges = style.edges(data[parameter].values.astype(np.float64))
+    codes = np.array([band.attractor for band in bands], np.int32)
+    heights = np.array([band.height for band in bands])
+    rising = slice(None) if edges[-1] > edges[0] else slice(None, None, -1)
+    raster = _raster(edges[rising], codes, heights[:, rising], ax.get_xlim(), ax.get_ylim())
+    palette.write_letters(ax, raster, codes[codes >= 0].tolist())
 
 
 def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) -> None:
@@ -208,16 +202,32 @@ def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[
         low, high = binomial_interval(below, n)
         chosen = (band.height > 0) & (below < n)
         x = (limits[:-1] + np.diff(limits) * (k + 1) / len(bands))[chosen]
-        mark = palette.letter(band.attractor) if band.attractor >= 0 else band.name
+        mark = letter(band.attractor) if band.attractor >= 0 else band.name
         for looks in (_BAR | {"linewidth": 1.6, "color": "white"}, _BAR):
             ax.vlines(x, low[chosen], high[chosen], gid=f"interval:{mark}", **looks)
 
 
-def _raster(edges: np.ndarray, codes: np.ndarray, heights: np.ndarray) -> np.ndarray:
+def _raster(
+    edges: np.ndarray,
+    codes: np.ndarray,
+    heights: np.ndarray,
+    xlim: tuple[float, float],
+    ylim: tuple[float, float],
+) -> np.ndarray:
     """Code of the band at each place of the axes, 300 x 300 from below; -1 for none."""
     place = (np.arange(300) + 0.5) / 300
-    x = edges[0] + place * (edges[-1] - edges[0])
+    x, y = (low + place * (high - low) for low, high in (xlim, ylim))
     column = np.clip(np.searchsorted(edges, x) - 1, 0, heights.shape[1] - 1)
     tops = np.cumsum(heights, axis=0)[:, column]
-    band = (place[:, None, None] >= tops[None]).sum(axis=1)
-    return np.asarray(codes[np.minimum(band, len(codes) - 1)], np.int32)
+    band = (y[:, None, None] >= tops[None]).sum(axis=1)
+    raster = np.asarray(codes[np.minimum(band, len(codes) - 1)], np.int32)
+    raster[:, (x < edges[0]) | (x > edges[-1])] = -1
+    raster[(y < 0.0) | (y > 1.0)] = -1
+    return raster
+
+
+def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
+    """Draw the figure ``fractions`` of a run."""
+    at, notes = values_of(run, options)
+    found = attractors_of(run, options)
+    return noted(plot_fractions(found, at=at, frame=frame_of(options)), notes)

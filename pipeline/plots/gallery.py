@@ -1,26 +1,30 @@
-"""Gallery of attractors: portraits of both links, and the path of the moving magnet."""
+"""Gallery of attractors: phase portraits of each, and the path of a point of the model's drawing."""
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
-from matplotlib.ticker import AutoMinorLocator, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
-from pipeline.plots import palette, style
-from pipeline.plots.trajectory import on_circle, wrapped
+from pipeline.layout.letters import letter
+from pipeline.layout.vocabulary import model_of, parameters_of
+from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
+from pipeline.products.figures import AttractorFigureOptions
 
 MAX_ROWS = 8
-_LEFT_IN, _WIDTH_IN = (0.6, 2.85, 5.22), (1.65, 1.65, 1.65)
-_ROW_IN, _PANEL_IN, _BOTTOM_IN, _TOP_IN = 1.3, 0.88, 0.42, 0.5
+_PANEL_IN, _TITLE_IN, _LABEL_IN, _HEAD_IN = 0.9, 0.2, 0.44, 0.3
 
 
-def plot_gallery(attractors: xr.Dataset, portraits: xr.Dataset) -> style.DataFigure:
-    """Draw each attractor of one parameter point in a row: both phase portraits and the magnet's path.
+def plot_gallery(
+    attractors: xr.Dataset, portraits: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE
+) -> style.DataFigure:
+    """Draw each attractor of one parameter point: its phase portraits, and the path of a point of the model.
 
     Parameters
     ----------
@@ -28,32 +32,88 @@ def plot_gallery(attractors: xr.Dataset, portraits: xr.Dataset) -> style.DataFig
         Result of `pipeline.analysis.attractors.attractors.match`; gives colours and names.
     portraits
         Result of `pipeline.analysis.attractors.portraits.portraits` for a parameter point of it.
+    degrees
+        Degrees instead of radians.
+    frame
+        Width of the figure.
 
     Returns
     -------
     DataFigure
-        7 in wide. Lines are the motion, dots its stroboscopic section. The portrait of a link that turns
-        over is drawn on the circle, from -pi to pi. The `MAX_ROWS` attractors with the largest share are
+        Lines are the motion, dots its stroboscopic section. The portrait of an angle that turns over is
+        drawn on the circle, from -pi to pi. The `MAX_ROWS` attractors with the largest share are
         drawn, in the order of their ids. Its `data` are the portraits of these.
 
     Raises
     ------
     ValueError
-        If there is no attractor.
+        If there is no attractor, or if degrees are asked for of a model without angles.
     """
+    model = model_of(attractors)
+    labels.some_angle(model, degrees, "portraits")
     n = portraits.sizes["attractor"]
     if n == 0:
         raise ValueError("there is no attractor at this parameter point: nothing to draw")
     ranked = np.argsort(-portraits["share"].values, kind="stable")[:MAX_ROWS]
-    data = portraits.isel(attractor=np.sort(ranked))
+    data = portraits.isel(attractor=np.sort(ranked)).assign_attrs(
+        {k: v for k, v in attractors.attrs.items() if k in ("model", "parameters")}
+    )
     cast = palette.cast_of(attractors, _described(attractors, portraits))
-    rows = data.sizes["attractor"]
-    fig = style.new_data_figure(_TOP_IN + _BOTTOM_IN + rows * _ROW_IN - (_ROW_IN - _PANEL_IN), data)
-    for row in range(rows):
-        _draw_row(fig, row, data.isel(attractor=row), cast, last=row == rows - 1)
-    _head(fig, data, portraits, n)
-    style.style_text(fig)
+    each = len(model.portraits) + (model.drawing is not None)
+    layout = _Layout.of(frame, data.sizes["attractor"], each)
+    fig = style.new_figure(layout.height, data, frame, arranged=False, exact=True)
+    shown: set[str] = set()
+    for k in range(data.sizes["attractor"]):
+        shown |= _draw_one(fig, layout, k, data.isel(attractor=k), cast, degrees)
+    _head(fig, data, portraits, n, shown)
+    style.finish(fig)
     return fig
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Places of the panels [in]: so many attractors beside one another, each with so many panels."""
+
+    frame: style.Frame
+    rows: int
+    beside: int
+    each: int
+
+    @classmethod
+    def of(cls, frame: style.Frame, n: int, each: int) -> _Layout:
+        beside = min(n, max(1, (2 if frame.compact else 3) // each))
+        return cls(frame, -(-n // beside), beside, each)
+
+    @property
+    def left(self) -> float:
+        return 0.5 if self.frame.compact else 0.58
+
+    @property
+    def pitch(self) -> float:
+        return self.frame.width_in / (self.each * self.beside)
+
+    @property
+    def panel(self) -> tuple[float, float]:
+        height = _PANEL_IN if self.each * self.beside > 2 else 1.35
+        return self.pitch - self.left - 0.08, height
+
+    @property
+    def row(self) -> float:
+        return self.panel[1] + _TITLE_IN + _LABEL_IN
+
+    @property
+    def height(self) -> float:
+        return _HEAD_IN * (2 if self.frame.compact else 1) + self.rows * self.row
+
+    def axes(self, fig: style.DataFigure, k: int, column: int) -> Axes:
+        """Axes of a panel of the k-th attractor."""
+        width, height = self.panel
+        x = self.left + ((k % self.beside) * self.each + column) * self.pitch
+        y = (self.rows - 1 - k // self.beside) * self.row + _LABEL_IN
+        size = fig.get_size_inches()
+        ax = fig.add_axes((x / size[0], y / size[1], width / size[0], height / size[1]))
+        style.style_axes(ax)
+        return ax
 
 
 def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
@@ -64,92 +124,68 @@ def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
     return attractors.sel(at)
 
 
-def _draw_row(fig: style.DataFigure, row: int, one: xr.Dataset, cast: palette.Cast, *, last: bool) -> None:
-    width, height = fig.get_size_inches()
-    bottom = height - _TOP_IN - row * _ROW_IN - _PANEL_IN
-    number = int(one["attractor"])
-    colour = cast.colours[number]
-    letter = palette.letter(number)
-    axes = []
-    for left, panel in zip(_LEFT_IN, _WIDTH_IN, strict=True):
-        ax = fig.add_axes((left / width, bottom / height, panel / width, _PANEL_IN / height))
-        style.style_axes(ax)
-        axes.append(ax)
+def _draw_one(
+    fig: style.DataFigure, layout: _Layout, k: int, one: xr.Dataset, cast: palette.Cast, degrees: bool
+) -> set[str]:
+    model, number = model_of(one), int(one["attractor"])
+    motion = Motion(
+        {name: one["orbit"].sel(state=name).values for name in model.state_names},
+        {name: one["attractor_points"].sel(state=name).values for name in model.state_names},
+        cast.colours[number], letter(number),
+    )  # fmt: skip
+    axes = [layout.axes(fig, k, column) for column in range(layout.each)]
     share = palette.percent(float(one["share"]))
     axes[0].text(
-        0.0, 1.05, f"{cast.names[number]}, {share} of the cells", transform=axes[0].transAxes,
-        fontsize=style.LEGEND_PT,
+        0.0, 1.04, f"{cast.names[number]}, {share} of the cells", transform=axes[0].transAxes,
+        fontsize=fig.look.legend, va="bottom",
     )  # fmt: skip
-    for ax, link in zip(axes, "12", strict=False):
-        _portrait(ax, one, link, colour, letter)
-        ax.set_ylabel(style.state_label(f"psi{link}_dot"), fontsize=style.LEGEND_PT, labelpad=1.0)
-        if last:
-            ax.set_xlabel(style.state_label(f"psi{link}"), fontsize=style.LABEL_PT, labelpad=2.0)
-    _path(axes[2], one, colour, letter)
-    axes[2].set_ylabel("$y$ [m]", fontsize=style.LEGEND_PT)
-    axes[2].yaxis.set_label_coords(-0.31, 0.5)
-    if last:
-        axes[2].set_xlabel("$x$ [m]", fontsize=style.LABEL_PT, labelpad=2.0)
+    for ax, pair in zip(axes, model.portraits, strict=False):
+        draw_portrait(ax, one, pair, motion, degrees=degrees)
+    shown: list[str] = []
+    if model.drawing is not None:
+        shown = draw_path(axes[-1], model.drawing, _parameters(one), motion)
+        equalise(axes[-1])
+    if layout.panel[0] < 0.8:
+        for ax in axes:
+            ax.xaxis.set_major_locator(MaxNLocator(2))
+    return set(shown)
 
 
-def _portrait(ax: Axes, one: xr.Dataset, link: str, colour: str, letter: str) -> None:
-    names = (f"psi{link}", f"psi{link}_dot")
-    angle, rate = (one["orbit"].sel(state=name).values for name in names)
-    there = np.isfinite(angle)
-    angle, rate = angle[there], rate[there]
-    points, rates = (one["attractor_points"].sel(state=name).values for name in names)
-    turns = np.ptp(angle) >= 2.0 * math.pi
-    x, y = on_circle(angle, rate) if turns else (angle, rate)
-    dots = (
-        wrapped(points)
-        if turns
-        else points + 2.0 * math.pi * np.round((np.mean(angle) - points) / (2.0 * math.pi))
-    )
-    ax.plot(x, y, color=colour, linewidth=0.7, gid=f"orbit:{letter}:psi{link}")
-    ax.plot(
-        dots, rates, linestyle="none", marker="o", markersize=2.6, color="black", markeredgecolor="white",
-        markeredgewidth=0.4, zorder=3, gid=f"section:{letter}:psi{link}",
-    )  # fmt: skip
-    ax.margins(0.08)
-    if turns:
-        ax.set_xlim(-math.pi, math.pi)
-    style.set_angle_ticks(ax, *ax.get_xlim(), degrees=False, axis="x")
-    ax.yaxis.set_major_locator(MaxNLocator(4))
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_minor_locator(AutoMinorLocator(2))
+def _parameters(one: xr.Dataset) -> dict[str, float]:
+    """Values of the parameters at the point of a portrait."""
+    values = parameters_of(one).as_dict()
+    return {name: float(one[name]) if name in one.coords else value for name, value in values.items()}
 
 
-def _path(ax: Axes, one: xr.Dataset, colour: str, letter: str) -> None:
-    x, y = (one["magnet"].sel(axis=name).values for name in "xy")
-    ax.plot(x, y, color=colour, linewidth=0.7, gid=f"path:{letter}")
-    ax.plot(
-        [0.0], [one.attrs["fixed_magnet_y"]], linestyle="none", marker="s", markersize=4.0, color="0.2",
-        markeredgewidth=0.0, gid="fixed_magnet", clip_on=False,
-    )  # fmt: skip
-    # a metre is as long along both axes, and the magnets' vertical is in the middle
-    low, high = min(float(np.nanmin(y)), one.attrs["fixed_magnet_y"]), float(np.nanmax(y))
-    scale = 1.16 * max(2.0 * float(np.nanmax(np.abs(x))) / _WIDTH_IN[2], (high - low) / _PANEL_IN)
-    middle = 0.5 * (low + high)
-    ax.set_xlim(-0.5 * scale * _WIDTH_IN[2], 0.5 * scale * _WIDTH_IN[2])
-    ax.set_ylim(middle - 0.5 * scale * _PANEL_IN, middle + 0.5 * scale * _PANEL_IN)
-    ax.xaxis.set_major_locator(MaxNLocator(4))
-    ax.yaxis.set_major_locator(MaxNLocator(4))
-
-
-def _head(fig: style.DataFigure, data: xr.Dataset, portraits: xr.Dataset, n: int) -> None:
+def _head(fig: style.DataFigure, data: xr.Dataset, portraits: xr.Dataset, n: int, shown: set[str]) -> None:
     width, height = fig.get_size_inches()
-    text = palette.caption(portraits, with_start=False)
+    text = labels.caption(portraits.assign_attrs(data.attrs), with_start=False)
     if (rest := n - data.sizes["attractor"]) > 0:
         share = palette.percent(float(portraits["share"].sum() - data["share"].sum()))
         text += f"; {rest} more attractors, {share} of the cells, are not shown"
-    fig.text(0.62 / width, 1.0 - 0.16 / height, text, fontsize=style.LEGEND_PT, va="center")
-    dots: dict[str, Any] = {"linestyle": "none", "markeredgewidth": 0.0}
-    handles: list[Any] = [
-        Line2D([], [], marker="o", markersize=3.0, color="black", label="once per drive period", **dots),
-        Line2D([], [], marker="s", markersize=4.0, color="0.2", label="fixed magnet", **dots),
-    ]  # fmt: skip
+    size = fig.look.legend
+    room = width - 0.2 if fig.frame.compact else 0.62 * width
+    fig.text(0.08 / width, 1.0 - 0.06 / height, style.folded(text, room, size), fontsize=size, va="top")
+    handles: list[Any] = [style.dot("once per drive period", "black", 3.0), *_fixed_handles(data, shown)]
     fig.legend(
-        handles=handles, loc="center right", bbox_to_anchor=(6.95 / width, 1.0 - 0.16 / height), ncols=2,
-        frameon=False, fontsize=style.LEGEND_PT, borderpad=0.0, borderaxespad=0.0, handletextpad=0.2,
+        handles=handles, loc="upper right" if not fig.frame.compact else "upper left", frameon=False,
+        bbox_to_anchor=(1.0 - 0.05 / width, 1.0 - 0.04 / height)
+        if not fig.frame.compact else (0.04 / width, 1.0 - (0.04 + _HEAD_IN * 0.6) / height),
+        ncols=len(handles), fontsize=size, borderpad=0.0, borderaxespad=0.0, handletextpad=0.2,
         columnspacing=1.0, handlelength=1.2,
     )  # fmt: skip
+
+
+def _fixed_handles(data: xr.Dataset, shown: set[str]) -> list[Any]:
+    drawing = model_of(data).drawing
+    return [] if drawing is None else fixed_handles(drawing, _parameters(data), shown)
+
+
+def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
+    """Draw the figure ``gallery`` of a run; integrates the portraits."""
+    from pipeline.analysis.attractors.portraits import portraits
+
+    at, notes = values_of(run, options)
+    found = attractors_of(run, options)
+    figure = plot_gallery(found, portraits(found, at=at), degrees=options.degrees, frame=frame_of(options))
+    return noted(figure, notes)

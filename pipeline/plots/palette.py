@@ -9,23 +9,20 @@ Comput. Graph. 15, 2009). Letters tell attractors apart where colours do not.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.legend import Legend
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.analysis.sides import Side
 from pipeline.layout import vocabulary
+from pipeline.layout.letters import letter
+from pipeline.layout.vocabulary import model_of
 from pipeline.plots import style
 
 COLOURS = (
@@ -43,12 +40,6 @@ UNASSIGNED: dict[str, tuple[int, ...]] = {
 """What a cell without an attractor is called, by its status."""
 
 GREYS = {"undecided": "0.75", "diverged": "0.0", "failed": "0.45", "pending": "0.95"}
-
-
-_LETTERS_PER_IN = 17.5
-_LINE_IN, _GAP_IN = 0.192, 0.045
-_LETTER_IN = 0.11
-"""Half the height of a letter with some air around it [in]."""
 
 
 @dataclass(frozen=True)
@@ -70,14 +61,9 @@ class Cast:
     main: tuple[int, ...]
 
 
-def letter(attractor: int) -> str:
-    """Letter of an id: A to Z, then AA and on."""
-    text = ""
-    attractor += 1
-    while attractor:
-        attractor, digit = divmod(attractor - 1, 26)
-        text = chr(ord("A") + digit) + text
-    return text
+def colour_of(attractors: xr.Dataset) -> dict[int, str]:
+    """Colour by id, for tables and other figures of the same run; see `cast_of`."""
+    return cast_of(attractors).colours
 
 
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
@@ -100,13 +86,12 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
 
 
 def describe(one: xr.Dataset) -> str:
-    """Describe an attractor: its periods and sides wherever it is present, and its turns if it rotates."""
+    """Describe an attractor: its periods and motions where it is present, and its turns if it rotates."""
     present = one["kind"].values.ravel() > 0
     if not present.any():
         return "absent"
-    periods = one["orbit_period"].values.ravel()[present]
-    sides = one["side"].values.ravel()[present]
-    return ", ".join(part for part in (_periods(periods), _sides(sides) + _turns(one, sides)) if part)
+    words = _words(one, one["side"].values.ravel()[present]) if "side" in one else ""
+    return style.join([_periods(one["orbit_period"].values.ravel()[present]), words + _turns(one, present)])
 
 
 def _periods(periods: np.ndarray) -> str:
@@ -120,21 +105,24 @@ def _periods(periods: np.ndarray) -> str:
     return " or ".join(parts)
 
 
-def _sides(sides: np.ndarray) -> str:
-    found = sorted({int(s) for s in sides} - {int(Side.UNKNOWN), int(Side.UNDECIDED)})
-    return " or ".join(Side(s).name.lower() for s in found)
-
-
-def _turns(one: xr.Dataset, sides: np.ndarray) -> str:
-    """Mean turns per drive period, where the motion rotates at every point and always alike."""
-    if not (sides == Side.ROTATING).all():
+def _words(one: xr.Dataset, codes: np.ndarray) -> str:
+    classifier = model_of(one).classifier
+    if classifier is None:
         return ""
-    links = one["rotation"].transpose(..., "link").values.reshape(-1, one.sizes["link"])
-    links = links[one["kind"].values.ravel() > 0]
-    if np.ptp(links, axis=0).max() > 0.05:
+    found = sorted({int(c) for c in codes} - {0, *classifier.neutral})
+    return " or ".join(classifier.words[c] for c in found)
+
+
+def _turns(one: xr.Dataset, present: np.ndarray) -> str:
+    """Mean turns per drive period, where the motion rotates at every point and always alike."""
+    dim = model_of(one).angle_dim
+    if "rotation" not in one or dim not in one["rotation"].dims:
+        return ""
+    turns = one["rotation"].transpose(..., dim).values.reshape(-1, one.sizes[dim])[present]
+    if np.abs(turns).max(axis=1).min() < 0.05 or not np.ptp(turns, axis=0).max() <= 0.05:
         return ""
     # no-break spaces: a legend's line is not folded here
-    return "\u00a0({})".format(",\u00a0".join(_signed(x) for x in links.mean(axis=0)))
+    return "\u00a0({})".format(",\u00a0".join(_signed(x) for x in turns.mean(axis=0)))
 
 
 def _signed(turns: float) -> str:
@@ -148,32 +136,54 @@ Entry = tuple[str, str] | Artist
 """Line of a legend: a text and the colour of its patch, or an artist with a label."""
 
 
-def legend_column(fig: Figure, entries: Sequence[Entry], left_in: float, top_in: float) -> Legend:
-    """Put a legend into the space right of the axes, its corner given from the left and the top [in]."""
-    width, height = fig.get_size_inches()
-    handles: list[Any] = [
-        entry
-        if isinstance(entry, Artist)
-        else Patch(facecolor=entry[1], edgecolor="0.4", linewidth=0.3, label=_folded(entry[0], left_in))
-        for entry in entries
-    ]
-    return fig.legend(
-        handles=handles, loc="upper left", bbox_to_anchor=(left_in / width, 1.0 - top_in / height),
-        frameon=False, fontsize=style.LEGEND_PT, borderpad=0.0, borderaxespad=0.0, handlelength=1.1,
-        handleheight=0.9, handletextpad=0.5, labelspacing=0.42,
-    )  # fmt: skip
+def new_panel(
+    data: xr.Dataset, entries: Sequence[Entry], frame: style.Frame, height: float = 4.3
+) -> tuple[style.DataFigure, Axes]:
+    """Make a figure with one panel and a legend: beside it, or below in a narrow figure.
+
+    Parameters
+    ----------
+    data
+        What is drawn.
+    entries
+        Lines of the legend.
+    frame
+        Width of the figure.
+    height
+        Least height [in] at full width; it grows with the legend.
+    """
+    look = style.look_at(frame)
+    room = frame.width_in * (1.0 if frame.compact else 0.33) - 0.35
+    lines = [style.folded(_text(e), room, look.legend, "   ") for e in entries]
+    line = 1.55 * look.legend / 72.0
+    if frame.compact:
+        columns = style.columns(frame, lines, look.legend)
+        rows = -(-len(lines) // columns) if all("\n" not in t for t in lines) else len(lines)
+        needed = 0.66 * height + line * rows
+    else:
+        needed = max(height, sum(line * (1 + t.count("\n")) for t in lines) + 0.4)
+    fig = style.new_figure(needed, data, frame, exact=True)
+    ax = fig.add_subplot()
+    style.style_axes(ax, inside=False)
+    handles = [_handle(entry, text) for entry, text in zip(entries, lines, strict=True)]
+    if frame.compact:
+        style.legend_below(fig, handles)
+    elif handles:
+        fig.legend(
+            handles=handles, loc="outside right upper", frameon=False, fontsize=look.legend, borderpad=0.0,
+            borderaxespad=0.2, handlelength=1.1, handleheight=0.9, handletextpad=0.5, labelspacing=0.42,
+        )  # fmt: skip
+    return fig, ax
 
 
-def column_height(entries: Sequence[Entry], left_in: float) -> float:
-    """Height [in] that a legend column will take."""
-    texts = [str(e.get_label()) if isinstance(e, Artist) else _folded(e[0], left_in) for e in entries]
-    lines = [1 + text.count("\n") for text in texts]
-    return sum(_LINE_IN * n + (_GAP_IN if n > 1 else 0.0) for n in lines)
+def _text(entry: Entry) -> str:
+    return str(entry.get_label()) if isinstance(entry, Artist) else entry[0]
 
 
-def _folded(text: str, left_in: float) -> str:
-    letters = int((style.WIDTH_IN - left_in - 0.35) * _LETTERS_PER_IN)
-    return textwrap.fill(text, letters, subsequent_indent="   ", break_long_words=False)
+def _handle(entry: Entry, text: str) -> Artist:
+    if isinstance(entry, Artist):
+        return entry
+    return Patch(facecolor=entry[1], edgecolor="0.4", linewidth=0.3, label=text)
 
 
 def percent(share: float) -> str:
@@ -188,7 +198,7 @@ def write_letters(ax: Axes, codes: np.ndarray, attractors: Iterable[int]) -> Non
     Parameters
     ----------
     ax
-        Axes that the codes fill.
+        Axes that the codes fill, at their final place.
     codes
         Ids on a raster of equal cells, rows from below; some 400 each way are enough.
     attractors
@@ -197,31 +207,13 @@ def write_letters(ax: Axes, codes: np.ndarray, attractors: Iterable[int]) -> Non
     box = ax.get_window_extent()
     sampling = np.array([box.height / codes.shape[0], box.width / codes.shape[1]]) / ax.figure.dpi
     padded = np.pad(codes, 1, constant_values=np.iinfo(np.int32).min)
+    size = style.look_of(ax).label
     for number in attractors:
         depth = distance_transform_edt(padded == number, sampling=sampling)[1:-1, 1:-1]
         row, column = np.unravel_index(int(depth.argmax()), depth.shape)
-        if depth[row, column] >= _LETTER_IN:
+        if depth[row, column] >= 0.011 * size:
             ax.text(
                 (column + 0.5) / codes.shape[1], (row + 0.5) / codes.shape[0], letter(number),
-                transform=ax.transAxes, ha="center", va="center", fontsize=style.LABEL_PT,
+                transform=ax.transAxes, ha="center", va="center", fontsize=size, fontfamily=style.FONT,
                 path_effects=[withStroke(linewidth=2.0, foreground="white")],
             )  # fmt: skip
-
-
-def caption(ds: xr.Dataset, *, with_start: bool = True) -> str:
-    """Name the values at which a selection was made: of parameters, and of the initial state."""
-    parts = []
-    # parameters first, then the initial state
-    for name in sorted(map(str, ds.coords), key=lambda name: name.endswith("_0")):
-        coordinate = ds.coords[name]
-        if coordinate.ndim or coordinate.dtype.kind != "f" or (name.endswith("_0") and not with_start):
-            continue
-        symbol = "$f$" if name == "frequency" else _start_symbol(name)
-        unit = coordinate.attrs.get("units", "Hz" if name == "frequency" else "1")
-        parts.append(f"{symbol} = {float(coordinate):.6g}" + (f" {unit}" if unit != "1" else ""))
-    return ", ".join(parts)
-
-
-def _start_symbol(name: str) -> str:
-    state = name.removesuffix("_0")
-    return f"{style.STATE_SYMBOLS[state]}(0)" if state in style.STATE_SYMBOLS else name

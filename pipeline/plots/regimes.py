@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -9,23 +10,34 @@ from typing import Any
 import matplotlib
 import numpy as np
 import xarray as xr
-from matplotlib.colors import ListedColormap, to_hex
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex, to_rgb
 from matplotlib.lines import Line2D
-from matplotlib.ticker import AutoMinorLocator
 
 from pipeline.analysis.basins.basins import outcomes
 from pipeline.analysis.basins.numbers import basin_fractions, binomial_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
-from pipeline.plots import palette, style
-from pipeline.plots.fractions import new_panel
+from pipeline.layout.letters import letter
+from pipeline.plots import labels, palette, style
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.products.figures import RegimeOptions
 
 KINDS = ("periods", "attractors", "number")
 SHARE_LIMIT = 0.05
 """Share of cells without an attractor from which a point of the map is marked."""
 
+_NEITHER = "not periodic"
+_CROSS: dict[str, Any] = {
+    "marker": "x", "markersize": 3.0, "markeredgewidth": 0.6, "color": "black", "linestyle": "none",
+}  # fmt: skip
+
 
 def plot_regimes(
-    attractors: xr.Dataset, *, show: str = "periods", at: Mapping[str, float] | None = None
+    attractors: xr.Dataset,
+    *,
+    show: str = "periods",
+    at: Mapping[str, float] | None = None,
+    frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
     """Draw what coexists at each point of two swept parameters.
 
@@ -37,18 +49,22 @@ def plot_regimes(
         ``periods``: which periods [drive periods] and whether motions that are not periodic coexist;
         ``attractors``: which ids do; ``number``: how many attractors.
     at
-        Values of further swept parameters; the nearest ones are drawn.
+        Values of further swept parameters.
+    frame
+        Width of the figure and ranges of its axes.
 
     Returns
     -------
     DataFigure
-        7 in wide. Of more than twelve regimes the most frequent have own colours. A cross marks points
-        where more than `SHARE_LIMIT` of the cells have no attractor, so that one may be missing. Its
-        `data` hold ``regime`` (index of the names in ``label``), ``n_attractors``, ``share_without``, and
-        ``share`` of each attractor. Of a sweep also ``low`` and ``high``, the 95 % Wilson interval of each
-        share, and ``unseen_high``: a basin larger than this shows in one of the cells whose outcome is
-        known with a probability of 95 % or more. The largest such bound, points with a cross left out,
-        stands above the map.
+        Up to twelve regimes have a colour each in one map. More are not told apart by colours: then each
+        period, or each attractor, has a map of its own, dark where it is met, with the share of the cells
+        as its depth. A cross marks points where more than `SHARE_LIMIT` of the cells have no attractor, so
+        that one may be missing. Its `data` hold ``regime`` (index of the names in ``label``),
+        ``n_attractors``, ``share_without``, ``share`` of each attractor, and ``share_of`` each ``member``
+        of the regimes. Of a sweep also ``low`` and ``high``, the 95 % Wilson interval of each share, and
+        ``unseen_high``: a basin larger than this shows in one of the cells whose outcome is known with a
+        probability of 95 % or more. The largest such bound, points with a cross left out, stands above
+        the map.
 
     Raises
     ------
@@ -57,42 +73,96 @@ def plot_regimes(
     """
     style.check_choice("show", show, KINDS)
     x, y = _axes(attractors, at)
-    part = choose(
-        attractors, at, (x, y, *start_dims(attractors)), f"a map of regimes has the axes {x} and {y}"
-    )
+    keep = (x, y, *start_dims(attractors))
+    part = choose(attractors, at, keep, f"a map of regimes has the axes {x} and {y}")
     data = _regimes(part, x, y, show)
+    titles = {"periods": "periods of the coexisting attractors", "attractors": "coexisting attractors"}
+    fixed = labels.caption(part, drop=[x, y])
+    text = style.join([titles.get(show, "number of attractors"), fixed, _about(data)])
+    several = show != "number" and np.unique(data["regime"]).size > len(palette.COLOURS)
+    if several:
+        return _draw_multiples(data, x, y, show, text, frame, palette.cast_of(attractors, part))
+    return _draw_one(data, x, y, show, text, frame)
+
+
+def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame) -> style.DataFigure:
+    """Draw one map with a colour for each regime."""
     colours, entries = _looks(data, show)
-    row, column = np.nonzero(data["share_without"].values > SHARE_LIMIT)
-    cross: dict[str, Any] = {
-        "marker": "x",
-        "markersize": 3.0,
-        "markeredgewidth": 0.6,
-        "color": "black",
-        "linestyle": "none",
-    }
-    if row.size:
+    if (data["share_without"] > SHARE_LIMIT).any():
         label = f"over {100 * SHARE_LIMIT:g} % of the cells\nwithout an attractor"
-        entries.append(Line2D([], [], label=label, **cross))
-    fig, ax = new_panel(data, entries)
+        entries.append(Line2D([], [], label=label, **_CROSS))
+    fig, ax = palette.new_panel(data, entries, frame)
     edges = [style.edges(data[d].values.astype(np.float64)) for d in (x, y)]
     ax.pcolormesh(
         *edges, data["regime"].values, cmap=ListedColormap(colours), vmin=-0.5, vmax=len(colours) - 0.5,
         rasterized=True, gid="regimes",
     )  # fmt: skip
-    if row.size:
-        ax.plot(data[x].values[column], data[y].values[row], gid="without", **cross)
-    ax.tick_params(which="both", direction="out", top=False, right=False)
-    ax.set_xlim(*sorted((float(edges[0][0]), float(edges[0][-1]))))
-    ax.set_ylim(*sorted((float(edges[1][0]), float(edges[1][-1]))))
-    ax.xaxis.set_minor_locator(AutoMinorLocator())
-    ax.yaxis.set_minor_locator(AutoMinorLocator())
-    ax.set_xlabel(style.parameter_label(data[x]), fontsize=style.LABEL_PT)
-    ax.set_ylabel(style.parameter_label(data[y]), fontsize=style.LABEL_PT, labelpad=2.0)
-    titles = {"periods": "periods of the coexisting attractors", "attractors": "coexisting attractors"}
-    parts = [titles.get(show, "number of attractors"), palette.caption(part), _about(data)]
-    ax.text(0.0, 1.015, ", ".join(filter(None, parts)), transform=ax.transAxes, fontsize=style.LEGEND_PT)
-    style.style_text(fig)
+    _dress(ax, data, x, y, frame)
+    style.label_axes(ax, labels.parameter_label(data[x]), labels.parameter_label(data[y]))
+    style.caption(ax, text)
+    style.finish(fig)
     return fig
+
+
+def _draw_multiples(
+    data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame, cast: palette.Cast
+) -> style.DataFigure:
+    """Draw a map for each member of the regimes: where it is met, and by what share of the cells."""
+    most = len(palette.COLOURS)
+    total = data["share_of"].sum([x, y]).values
+    chosen = np.sort(np.argsort(-total, kind="stable")[:most])
+    columns = 2 if frame.compact else 4
+    rows = math.ceil(len(chosen) / columns)
+    width = frame.width_in / columns
+    fig = style.new_figure(rows * 0.86 * width + 0.75, data, frame, exact=True)
+    grid = fig.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    edges = [style.edges(data[d].values.astype(np.float64)) for d in (x, y)]
+    for k, ax in enumerate(grid.ravel()):
+        style.style_axes(ax, inside=False)
+        style.few_ticks(ax, 3, 4)
+        if k >= len(chosen):
+            ax.set_visible(False)
+            continue
+        member = str(data["member"].values[chosen[k]])
+        colour = _member_colour(member, show, cast)
+        ramp = LinearSegmentedColormap.from_list("share", [style.tinted(colour, 0.75), to_rgb(colour)])
+        share = np.ma.masked_equal(data["share_of"].values[..., chosen[k]], 0.0)
+        mesh = ax.pcolormesh(*edges, share, cmap=ramp, vmin=0.0, vmax=1.0, rasterized=True)
+        mesh.set_gid(f"member:{member}")
+        _dress(ax, data, x, y, frame)
+        ax.set_title(_member_name(member, show, cast), fontsize=fig.look.legend, loc="left", pad=2.5)
+    fig.supxlabel(labels.parameter_label(data[x]), fontsize=fig.look.label)
+    fig.supylabel(labels.parameter_label(data[y]), fontsize=fig.look.label)
+    rest = data.sizes["member"] - len(chosen)
+    met = palette.percent(float(1.0 - total[chosen].sum() / total.sum())) if rest else ""
+    more = f"{rest} more, met by {met} of the cells, are not shown" if rest else ""
+    note = style.join([text, "depth of colour: share of the cells", more])
+    fig.suptitle(
+        style.folded(note, frame.width_in - 0.3, fig.look.legend), fontsize=fig.look.legend, x=0.01, ha="left"
+    )
+    style.finish(fig)
+    return fig
+
+
+def _member_name(member: str, show: str, cast: palette.Cast) -> str:
+    if show == "attractors":
+        name = next(n for n in cast.names.values() if n.startswith(f"{member}:"))
+        return style.folded(name, 1.6, 8.0).partition("\n")[0].rstrip(",")
+    return member if member == _NEITHER else f"period {member}"
+
+
+def _member_colour(member: str, show: str, cast: palette.Cast) -> str:
+    if show == "attractors":
+        return next(cast.colours[i] for i in cast.colours if letter(i) == member)
+    return style.VERMILLION if member == _NEITHER else style.BLUE
+
+
+def _dress(ax: Axes, data: xr.Dataset, x: str, y: str, frame: style.Frame) -> None:
+    """Mark points where an attractor may be missing, and set the ranges."""
+    row, column = np.nonzero(data["share_without"].values > SHARE_LIMIT)
+    if row.size:
+        ax.plot(data[x].values[column], data[y].values[row], gid="without", **_CROSS)
+    style.limits(ax, frame, style.span(data[x].values), style.span(data[y].values))
 
 
 def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, str]:
@@ -115,18 +185,18 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
     """Regime of each point, the most frequent first."""
     present = part["kind"].transpose(y, x, "attractor").values > 0
     periods = part["orbit_period"].transpose(y, x, "attractor").values
-    labels = np.empty(present.shape[:2], object)
-    for index in np.ndindex(labels.shape):
-        labels[index] = _label(np.flatnonzero(present[index]), periods[index], show)
-    counts = Counter(labels.ravel().tolist())
+    values = np.empty(present.shape[:2], object)
+    for index in np.ndindex(values.shape):
+        values[index] = _label(np.flatnonzero(present[index]), periods[index], show)
+    counts = Counter(values.ravel().tolist())
     names = sorted(counts, key=lambda name: (-counts[name], name))
     if show == "number":
         names.sort(key=int)
     without = (part["attractor_id"] < 0).mean(start_dims(part)).transpose(y, x)
     number = {name: i for i, name in enumerate(names)}
-    regime = np.array([number[label] for label in labels.ravel()], np.int32).reshape(labels.shape)
+    regime = np.array([number[label] for label in values.ravel()], np.int32).reshape(values.shape)
     attrs = {"units": "1", "long_name": "regime, an index of label"}
-    return xr.Dataset(
+    data = xr.Dataset(
         {
             "regime": ((y, x), regime, attrs),
             "n_attractors": ((y, x), present.sum(axis=-1).astype(np.int32), {"units": "1"}),
@@ -136,6 +206,28 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
         coords={x: part[x], y: part[y], "label": ("label", names)},
         attrs={"title": "regimes", "show": show},
     )  # fmt: skip
+    return (
+        data if show == "number" else data.merge(_members(present, periods, data["share"].values, x, y, show))
+    )
+
+
+def _members(
+    present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str, y: str, show: str
+) -> xr.Dataset:
+    """Share of the cells on each attractor, or on all attractors of each period."""
+    if show == "attractors":
+        kinds = np.broadcast_to(np.arange(present.shape[-1]), present.shape)
+        names = {i: letter(i) for i in range(present.shape[-1])}
+    else:
+        kinds = periods
+        found = sorted({int(p) for p in periods[present]} - {0})
+        names = {p: str(p) for p in found} | ({0: _NEITHER} if (periods[present] == 0).any() else {})
+    tables = [np.where(present & (kinds == k), share, 0.0).sum(axis=-1) for k in names]
+    stacked = np.stack(tables, axis=-1) if tables else np.zeros((*present.shape[:2], 0))
+    attrs = {"units": "1", "long_name": "share of all cells on attractors of this kind"}
+    return xr.Dataset(
+        {"share_of": ((y, x, "member"), stacked, attrs)}, coords={"member": ("member", list(names.values()))}
+    )
 
 
 def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
@@ -168,25 +260,29 @@ def _label(present: np.ndarray, periods: np.ndarray, show: str) -> str:
     if not present.size:
         return "none"
     if show == "attractors":
-        return " + ".join(palette.letter(int(i)) for i in present)
+        return " + ".join(letter(int(i)) for i in present)
     found = sorted({int(p) for p in periods[present]} - {0})
-    words = [str(p) for p in found] + (["not periodic"] if (periods[present] == 0).any() else [])
+    words = [str(p) for p in found] + ([_NEITHER] if (periods[present] == 0).any() else [])
     return " + ".join(words)
 
 
 def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]:
     """Colour of each regime, and the legend."""
-    labels = [str(v) for v in data["label"].values]
+    names = [str(v) for v in data["label"].values]
     if show == "number":
         ramp = matplotlib.colormaps["cividis"]
-        shades = {label: to_hex(ramp(i / max(len(labels) - 1, 1))) for i, label in enumerate(labels)}
+        shades = {name: to_hex(ramp(i / max(len(names) - 1, 1))) for i, name in enumerate(names)}
         shades |= {"0": palette.GREYS["pending"]} if "0" in shades else {}
         return list(shades.values()), list(shades.items())
-    own = [label for label in labels if label != "none"][: len(palette.COLOURS)]
-    colours = dict(zip(own, palette.COLOURS, strict=False))
-    rest = [label for label in labels if label not in colours and label != "none"]
-    colours |= dict.fromkeys(rest, palette.OTHERS) | {"none": palette.GREYS["pending"]}
-    entries: list[palette.Entry] = [(label, colours[label]) for label in own]
-    entries += [(f"{len(rest)} others", palette.OTHERS)] if rest else []
-    entries += [("none", colours["none"])] if "none" in labels else []
-    return [colours[label] for label in labels], entries
+    own = [name for name in names if name != "none"]
+    colours = {**dict(zip(own, palette.COLOURS, strict=False)), "none": palette.GREYS["pending"]}
+    return [colours[name] for name in names], [
+        (name, colours[name]) for name in [*own, *(["none"] if "none" in names else [])]
+    ]
+
+
+def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
+    """Draw the figure ``regimes`` of a run."""
+    at, notes = values_of(run, options)
+    found = attractors_of(run, options)
+    return noted(plot_regimes(found, show=options.show, at=at, frame=frame_of(options)), notes)

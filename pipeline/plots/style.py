@@ -1,4 +1,4 @@
-"""Common look of the figures, and how they become files.
+"""Common look of the figures: sizes, fonts, colours, and the parts that most of them have.
 
 The look is set on each object, never through `matplotlib.rcParams`: these are shared by all threads.
 """
@@ -6,51 +6,83 @@ The look is set on each object, never through `matplotlib.rcParams`: these are s
 from __future__ import annotations
 
 import difflib
-import io
 import math
 import threading
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
-import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
-from matplotlib.ticker import Formatter, FuncFormatter, MultipleLocator
+from matplotlib.ticker import AutoMinorLocator, MaxNLocator
 
-WIDTH_IN = 7.0
-"""Width of a figure [in]: two columns of a journal page."""
+TEXT_LOCK = threading.Lock()
+"""Held while texts are measured or drawn: matplotlib parses mathematics with one parser for all threads."""
+
+MM = 1.0 / 25.4
+"""Inches per millimetre."""
+
+WIDE_MM, COLUMN_MM = 178.0, 85.0
+"""Widths of two columns and of one of a journal's page."""
+
+COMPACT_MM = 130.0
+"""Figures narrower than this have smaller letters, and legends below instead of beside."""
 
 DPI = 200
-VECTOR_DPI = 400
-"""Resolution of the images inside PDF and SVG files, which get magnified."""
-
 FONT, MATH_FONT = "STIXGeneral", "stix"
-LABEL_PT, TICK_PT, LEGEND_PT = 10.0, 9.0, 9.0
 LINE_PT = 0.7
 
 # Okabe & Ito, https://jfly.uni-koeln.de/color/
 BLUE, VERMILLION, GREEN, PURPLE, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00"
-GREY = "#7F7F7F"
+SKY, GREY = "#56B4E9", "#7F7F7F"
 
-STATE_SYMBOLS = {
-    "psi1": r"$\psi_1$",
-    "psi2": r"$\psi_2$",
-    "psi1_dot": r"$\dot{\psi}_1$",
-    "psi2_dot": r"$\dot{\psi}_2$",
-}
 
-SUFFIXES = (".png", ".pdf", ".svg")
-_METADATA: dict[str, dict[str, Any]] = {
-    ".png": {},
-    ".pdf": {"CreationDate": None},
-    ".svg": {"Date": None},
-}
-_svg_lock = threading.Lock()
+@dataclass(frozen=True)
+class Frame:
+    """How large a figure is, and what part of its plane it shows.
+
+    Attributes
+    ----------
+    width : float
+        [mm]; 85 is a journal's column.
+    xlim, ylim : tuple of float, optional
+        Range of the axes, in the units on them; by default what is there.
+    """
+
+    width: float = WIDE_MM
+    xlim: tuple[float, float] | None = None
+    ylim: tuple[float, float] | None = None
+
+    @property
+    def compact(self) -> bool:
+        """Whether there is no room for a legend beside the axes."""
+        return self.width < COMPACT_MM
+
+    @property
+    def width_in(self) -> float:
+        """Width [in]."""
+        return self.width * MM
+
+
+WIDE = Frame()
+
+
+@dataclass(frozen=True)
+class Look:
+    """Sizes of letters [pt]."""
+
+    label: float
+    tick: float
+    legend: float
+
+
+_LOOKS = {False: Look(10.0, 9.0, 9.0), True: Look(8.0, 7.0, 7.0)}
 
 
 class DataFigure(Figure):
@@ -60,57 +92,192 @@ class DataFigure(Figure):
     ----------
     data : Dataset
         The numbers drawn, after every selection.
+    frame : Frame
+    look : Look
+    notes : list of str
+        What whoever asked for the figure must know beside it.
     """
 
     data: xr.Dataset
+    frame: Frame
+    look: Look
+    notes: list[str]
 
 
-def new_figure(height_in: float) -> Figure:
-    """Make an empty figure of the common width and resolution."""
-    return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, facecolor="white")
+def new_figure(
+    height: float, data: xr.Dataset, frame: Frame = WIDE, *, arranged: bool = True, exact: bool = False
+) -> DataFigure:
+    """Make an empty figure that carries the data to be drawn in it.
+
+    Parameters
+    ----------
+    height
+        [in] of a figure of full width; narrow ones are lower, but not in proportion.
+    data
+        What will be drawn.
+    frame
+        Its width.
+    arranged
+        Whether `finish` finds the places of axes, labels and legends.
+    exact
+        Whether the height holds whatever the width.
+    """
+    share = 1.0 if exact else min(frame.width / WIDE_MM, 1.0)
+    figure = DataFigure(
+        figsize=(frame.width_in, height * (share + 0.3 * (1.0 - share))),
+        dpi=DPI, facecolor="white", layout="constrained" if arranged else None,
+    )  # fmt: skip
+    figure.data, figure.frame, figure.look, figure.notes = data, frame, _LOOKS[frame.compact], []
+    engine: Any = figure.get_layout_engine()
+    if arranged:
+        engine.set(w_pad=0.04, h_pad=0.04, hspace=0.02, wspace=0.02)
+    return figure
 
 
-def new_data_figure(height_in: float, data: xr.Dataset) -> DataFigure:
-    """Make an empty figure that carries the data to be drawn in it."""
-    fig = DataFigure(figsize=(WIDTH_IN, height_in), dpi=DPI, facecolor="white")
-    fig.data = data
-    return fig
+def look_at(frame: Frame) -> Look:
+    """Sizes of letters of a figure of this width."""
+    return _LOOKS[frame.compact]
 
 
-def style_axes(ax: Axes) -> None:
-    """Give axes the common lines, ticks and fonts."""
-    ax.tick_params(
-        which="both",
-        direction="in",
-        top=True,
-        right=True,
-        width=LINE_PT,
-        labelsize=TICK_PT,
-        labelfontfamily=FONT,
-    )
-    ax.tick_params(which="major", length=4.0)
-    ax.tick_params(which="minor", length=2.2)
-    for spine in ax.spines.values():
-        spine.set_linewidth(LINE_PT)
+def figure_of(ax: Axes) -> DataFigure:
+    """Return the figure that axes are in."""
+    figure = ax.figure
+    assert isinstance(figure, DataFigure)
+    return figure
 
 
-def style_text(fig: Figure) -> None:
-    """Give every text that is in the figure by now the common font."""
-    for text in fig.findobj(Text):
+def look_of(ax: Axes) -> Look:
+    """Sizes of letters of the figure that the axes are in."""
+    return figure_of(ax).look
+
+
+def finish(figure: DataFigure) -> None:
+    """Give every text the common font, find the places of everything, and leave them there."""
+    for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_fontfamily(FONT)
         text.set_math_fontfamily(MATH_FONT)
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        with TEXT_LOCK:
+            engine.execute(figure)
+        figure.set_layout_engine("none")
 
 
-def is_angle(state: str) -> bool:
-    """Say whether a state is an angle, and not a rate."""
-    return not state.endswith("_dot")
+def style_axes(ax: Axes, *, inside: bool = True, minor: bool = True) -> None:
+    """Give axes the common lines, ticks and fonts.
+
+    Parameters
+    ----------
+    ax
+        The axes.
+    inside
+        Ticks inside, on all four sides; else outside, where they do not lie on an image.
+    minor
+        Whether to have ticks between the ticks.
+    """
+    look = look_of(ax)
+    ax.tick_params(
+        which="both", direction="in" if inside else "out", top=inside, right=inside, width=LINE_PT,
+        labelsize=look.tick, labelfontfamily=FONT,
+    )  # fmt: skip
+    ax.tick_params(which="major", length=4.0 if look.tick > 8.0 else 3.0)
+    ax.tick_params(which="minor", length=2.2 if look.tick > 8.0 else 1.7)
+    for spine in ax.spines.values():
+        spine.set_linewidth(LINE_PT)
+    if minor:
+        ax.xaxis.set_minor_locator(AutoMinorLocator())
+        ax.yaxis.set_minor_locator(AutoMinorLocator(2))
 
 
-def state_label(state: str, degrees: bool = False) -> str:
-    """Axis label of a state: symbol and unit."""
-    unit = "deg" if degrees else "rad"
-    return f"{STATE_SYMBOLS[state]} [{unit if is_angle(state) else unit + '/s'}]"
+def few_ticks(ax: Axes, x: int = 4, y: int = 4) -> None:
+    """Put at most so many ticks on small axes."""
+    ax.xaxis.set_major_locator(MaxNLocator(x))
+    ax.yaxis.set_major_locator(MaxNLocator(y))
+
+
+def label_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
+    """Write the labels of the axes."""
+    size = look_of(ax).label
+    if x is not None:
+        ax.set_xlabel(x, fontsize=size, labelpad=2.0)
+    if y is not None:
+        ax.set_ylabel(y, fontsize=size, labelpad=3.5)
+
+
+def caption(ax: Axes, text: str) -> None:
+    """Write a line above the axes, folded where the figure ends."""
+    if text:
+        look = look_of(ax)
+        width = figure_of(ax).frame.width_in - 0.6
+        ax.set_title(folded(text, width, look.legend), fontsize=look.legend, loc="left", pad=4.0)
+
+
+def folded(text: str, width: float, size: float, indent: str = "") -> str:
+    """Break a text into lines of a width [in] between its words; letters of mathematics count as one each."""
+    lines: list[str] = []
+    for word in text.split(" "):
+        if lines and _width(lines[-1] + " " + word, size) <= width:
+            lines[-1] += " " + word
+        else:
+            lines.append(indent + word if lines else word)
+    return "\n".join(lines)
+
+
+def _width(text: str, size: float) -> float:
+    """Width of a text [in], roughly: 0.48 of the size a letter."""
+    plain = text.replace("$", "").replace("\\", "").replace("{", "").replace("}", "")
+    return 0.48 * size / 72.0 * len(plain)
+
+
+def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | None = None) -> None:
+    """Put a legend above everything, on the right, in as few rows as its width allows."""
+    if not handles:
+        return
+    size = figure.look.legend if size is None else size
+    texts = [str(h.get_label()) for h in handles]
+    figure.legend(
+        handles=list(handles), loc="outside upper right", ncols=columns(figure.frame, texts, size),
+        frameon=False, fontsize=size, handletextpad=0.35, columnspacing=1.1, borderpad=0.1, handlelength=1.4,
+        borderaxespad=0.1,
+    )  # fmt: skip
+
+
+def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
+    """Put a legend below everything, on the left."""
+    if handles:
+        size = figure.look.legend
+        texts = [str(h.get_label()) for h in handles]
+        figure.legend(
+            handles=list(handles), loc="outside lower left", ncols=columns(figure.frame, texts, size),
+            frameon=False, fontsize=size, handletextpad=0.4, columnspacing=1.1, borderpad=0.1,
+            handlelength=1.2, borderaxespad=0.1,
+        )  # fmt: skip
+
+
+def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
+    """Most columns of a legend that fit into the figure's width; each is as wide as its widest text."""
+    width = frame.width_in - 0.15
+    for rows in range(1, len(texts)):
+        n = math.ceil(len(texts) / rows)
+        widest = [max(_width(t, size) for t in column) for column in np.array_split(np.array(texts), n)]
+        if sum(widest) + n * 3.1 * size / 72.0 <= width:
+            return n
+    return 1
+
+
+def dot(label: str, colour: Any, size: float = 5.0, *, face: Any = None, marker: str = "o") -> Line2D:
+    """Handle of a legend for points."""
+    return Line2D(
+        [], [], linestyle="none", marker=marker, markersize=size, markeredgewidth=0.6 if face else 0.0,
+        color=colour, markerfacecolor=colour if face is None else face, label=label,
+    )  # fmt: skip
+
+
+def tinted(colour: str, tint: float) -> tuple[float, float, float]:
+    """Mix a colour with a share of white."""
+    red, green, blue = (float(c) + (1.0 - float(c)) * tint for c in to_rgb(colour))
+    return red, green, blue
 
 
 def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
@@ -128,48 +295,28 @@ def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
     raise ValueError(f"unknown {what} {value!r}. {hint}Allowed: {', '.join(allowed)}.")
 
 
-def set_angle_ticks(ax: Axes, low: float, high: float, *, degrees: bool, axis: str = "y") -> None:
-    """Put ticks at round angles: multiples of pi for wide ranges in rad, of 15, 30 ... for degrees."""
-    span = high - low
-    most = 8.5 if axis == "y" else 4.5
-    if degrees and span > 0.5:
-        _set_step(ax, axis, _step(span, most, (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 45, 90, 180, 360)), None)
-    elif not degrees and span > 0.75 * math.pi:
-        step = _step(span / math.pi, most, [0.125 * 2**k for k in range(24)])
-        _set_step(ax, axis, step * math.pi, FuncFormatter(pi_fraction))
+def limits(
+    ax: Axes, frame: Frame, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None
+) -> None:
+    """Set the ranges of the axes: what was asked for, else what is given here, else as they are.
+
+    Raises
+    ------
+    ValueError
+        If a range is empty.
+    """
+    for axis, asked, own in (("x", frame.xlim, x), ("y", frame.ylim, y)):
+        chosen = asked or own
+        if chosen is not None:
+            (ax.set_xlim if axis == "x" else ax.set_ylim)(*check_range(f"{axis}lim", chosen))
 
 
-def _step(span: float, most: float, steps: Sequence[float]) -> float:
-    """Smallest step that gives at most so many intervals, or the largest one on offer."""
-    return next((step for step in steps if span / step <= most), steps[-1])
-
-
-def _set_step(ax: Axes, axis: str, step: float, formatter: Formatter | None) -> None:
-    target = ax.yaxis if axis == "y" else ax.xaxis
-    target.set_major_locator(MultipleLocator(step))
-    if formatter is not None:
-        target.set_major_formatter(formatter)
-
-
-def pi_fraction(value: float, _position: int | None = None) -> str:
-    """Write a multiple of pi/8 as a fraction of pi."""
-    eighths = round(8.0 * value / math.pi)
-    if eighths == 0:
-        return "0"
-    divisor = math.gcd(eighths, 8)
-    numerator, denominator = abs(eighths) // divisor, 8 // divisor
-    sign = "\N{MINUS SIGN}" if eighths < 0 else ""
-    factor = "" if numerator == 1 else str(numerator)
-    return f"{sign}{factor}π" + ("" if denominator == 1 else f"/{denominator}")
-
-
-def parameter_label(coordinate: xr.DataArray) -> str:
-    """Axis label of a parameter: what it is, and its unit."""
-    if coordinate.name == "frequency":
-        return "drive frequency [Hz]"
-    name = str(coordinate.attrs.get("long_name", coordinate.name))
-    unit = coordinate.attrs.get("units", "")
-    return f"{name} [{unit}]" if unit else name
+def check_range(name: Literal["xlim", "ylim"] | str, range_: tuple[float, float]) -> tuple[float, float]:
+    """Return a range of two different finite numbers; raises ValueError if it is none."""
+    low, high = (float(v) for v in range_)
+    if not (math.isfinite(low) and math.isfinite(high) and low != high):
+        raise ValueError(f"{name} = {low:g}, {high:g}: must be two different finite numbers")
+    return low, high
 
 
 def edges(x: np.ndarray) -> np.ndarray:
@@ -179,6 +326,12 @@ def edges(x: np.ndarray) -> np.ndarray:
         return np.array([x[0] - width, x[0] + width])
     middle = 0.5 * (x[1:] + x[:-1])
     return np.concatenate([[1.5 * x[0] - 0.5 * x[1]], middle, [1.5 * x[-1] - 0.5 * x[-2]]])
+
+
+def span(x: np.ndarray) -> tuple[float, float]:
+    """Range that the columns of a parameter's values fill."""
+    limits = edges(np.asarray(x, dtype=np.float64))
+    return float(limits.min()), float(limits.max())
 
 
 def fill_columns(
@@ -196,68 +349,6 @@ def fill_columns(
     return area
 
 
-def save_figure(fig: Figure, path: str | Path) -> Path:
-    """Write a figure as PNG, PDF or SVG, by the suffix of the path.
-
-    The file holds no time stamp and no random identifier: the same figure gives the same bytes with the
-    same version of matplotlib. It is written only once it has been drawn completely.
-
-    Parameters
-    ----------
-    fig
-        The figure.
-    path
-        Where to write; the folder must exist. An existing file is replaced.
-
-    Returns
-    -------
-    Path
-        The file written.
-
-    Raises
-    ------
-    ValueError
-        If the suffix is none of .png, .pdf, .svg.
-    """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(
-            f"cannot write a figure as {str(path)!r}: "
-            f"the suffix {path.suffix!r} is not one of {', '.join(SUFFIXES)}"
-        )
-    buffer = io.BytesIO()
-    options: dict[str, Any] = {
-        "format": suffix[1:],
-        "dpi": DPI if suffix == ".png" else VECTOR_DPI,
-        "metadata": _METADATA[suffix],
-        "facecolor": "white",
-    }
-    if suffix == ".svg":
-        _save_svg(fig, buffer, options)
-    else:
-        fig.savefig(buffer, **options)
-    path.write_bytes(buffer.getvalue())
-    return path
-
-
-def save_data(fig: DataFigure, path: str | Path) -> Path:
-    """Write the data of a figure as NetCDF beside it: the same path with the suffix ``.nc``."""
-    target = Path(path).with_suffix(".nc")
-    fig.data.to_netcdf(target, engine="scipy", format="NETCDF3_64BIT")
-    return target
-
-
-def _save_svg(fig: Figure, buffer: io.BytesIO, options: dict[str, Any]) -> None:
-    """Save with identifiers that do not change from run to run.
-
-    matplotlib takes their salt from the shared settings alone; this one key is set while the lock is
-    held, and all others are left as they are.
-    """
-    with _svg_lock:
-        before = matplotlib.rcParams["svg.hashsalt"]
-        matplotlib.rcParams["svg.hashsalt"] = "magpend"
-        try:
-            fig.savefig(buffer, **options)
-        finally:
-            matplotlib.rcParams["svg.hashsalt"] = before
+def join(parts: Iterable[str]) -> str:
+    """Join what there is with commas."""
+    return ", ".join(part for part in parts if part)

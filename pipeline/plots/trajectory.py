@@ -1,72 +1,146 @@
-"""Time series and phase portraits of one trajectory."""
+"""Time series of one trajectory, its phase portraits, and the path of a point of the model."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec, SubplotSpec
 from matplotlib.lines import Line2D
-from matplotlib.ticker import AutoMinorLocator
 
-from pipeline.plots import style
+from magpend_core.models.model import Drawing, Model
+from pipeline.layout.vocabulary import model_of, parameters_of
+from pipeline.plots import labels, style
+from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
 
-_COLOURS = {"1": style.BLUE, "2": style.VERMILLION}
-_STATES = ("psi1", "psi2", "psi1_dot", "psi2_dot")
+MOST_PANELS, MOST_LINES = 3, 2
+"""Most panels of variables that are no states, and most lines in each."""
+
+COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY)
+"""Of the pairs of states that portraits show; a seventh begins again."""
 
 
-def plot_trajectory(ds: xr.Dataset) -> Figure:
-    """Draw the time series of a trajectory, and a phase portrait of each link.
+def plot_trajectory(
+    ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE
+) -> style.DataFigure:
+    """Draw the time series of a trajectory, a phase portrait of each pair of states, and a path.
 
     Parameters
     ----------
     ds
-        `psi1`, `psi2` [rad] and `psi1_dot`, `psi2_dot` [rad/s] over `time` [s], with steps that are short
-        against a turn; `torque` [N m] of the drive is drawn if it is there. The stroboscopic section is
-        marked at the coordinate or variable `section_times` [s] or, without it, at the whole periods of
-        the attribute `frequency_hz`; without either, it is not marked.
+        The states of the model over `time` [s], angles with steps that are short against a turn; further
+        variables over `time` get a panel each. The stroboscopic section is marked at the coordinate or
+        variable `section_times` [s] or, without it, at the whole periods of the attribute `frequency_hz`;
+        without either, it is not marked. With the attribute ``parameters`` the path of the point that the
+        model's drawing traces is drawn, too.
+    degrees
+        Degrees instead of radians.
+    frame
+        Width of the figure, and the range of time.
 
     Returns
     -------
-    Figure
-        7 in wide. The portrait of a link that turns over is drawn on the circle, from -pi to pi.
+    DataFigure
+        States of one unit share a panel; the two of a portrait have one colour. The portrait of an angle
+        that turns over is drawn on the circle, from -pi to pi. Its `data` are `ds` and the path, as
+        ``path`` over ``time`` and ``axis``.
 
     Raises
     ------
     ValueError
-        If a state is missing, or there are no two points of time.
+        If a state is missing, there are no two points of time, or degrees are asked for without an angle.
     """
-    _check(ds)
+    model = model_of(ds)
+    labels.some_angle(model, degrees, "trajectories")
+    _check(ds, model)
     time = np.asarray(ds["time"].values, dtype=np.float64)
-    series = {name: np.asarray(ds[name].values, dtype=np.float64) for name in _STATES}
-    for name in ("psi1", "psi2"):
-        series[name] = np.unwrap(series[name])
+    series = {s.name: _values(ds, s.name, s.on_circle) for s in model.states}
     strobe = _section_times(ds, time)
-    fig = style.new_figure(4.6)
-    rows = 3 if "torque" in ds else 2
-    grid = fig.add_gridspec(
-        1, 2, width_ratios=[1.35, 1.0], left=0.085, right=0.985, bottom=0.1, top=0.93, wspace=0.24
-    )
-    left = grid[0].subgridspec(rows, 1, hspace=0.07, height_ratios=[1.0, 1.0, 0.5][:rows])
-    right = grid[1].subgridspec(2, 1, hspace=0.32)
-    _draw_series([fig.add_subplot(left[i]) for i in range(rows)], ds, time, series)
-    for i, link in enumerate("12"):
-        _draw_portrait(fig.add_subplot(right[i]), link, time, series, strobe)
-    _legend(fig, bool(strobe.size))
-    style.style_text(fig)
+    section = {name: np.interp(strobe, time, values) for name, values in series.items()}
+    drawing = model.drawing if "parameters" in ds.attrs else None
+    rows = [*_units(model), *_others(ds, model)]
+    n_panels = len(model.portraits) + (drawing is not None)
+    height = max(4.0, 1.25 * len(rows) + 0.8, 1.6 * n_panels + 0.8)
+    fig = style.new_figure(height, _data(ds, series, drawing), frame)
+    left, right = _grids(fig, len(rows), n_panels)
+    axes = [fig.add_subplot(spec) for spec in left]
+    _draw_series(axes, ds, time, series, rows, degrees)
+    for k, pair in enumerate(model.portraits):
+        ax = fig.add_subplot(right[k])
+        style.style_axes(ax)
+        draw_portrait(ax, ds, pair, Motion(series, section, _colour(k)), degrees=degrees)
+    handles = _handles(ds, model, bool(strobe.size))
+    path = fig.add_subplot(right[-1]) if drawing is not None else None
+    if drawing is not None and path is not None:
+        handles += _draw_path(path, ds, drawing, Motion(series, section, "0.35"))
+    if frame.xlim:
+        axes[-1].set_xlim(*style.check_range("xlim", frame.xlim))
+    style.caption(axes[0], _place(ds))
+    style.legend_above(fig, handles)
+    fig.align_ylabels(axes)
+    style.finish(fig)
+    if path is not None:
+        equalise(path)
     return fig
 
 
-def _check(ds: xr.Dataset) -> None:
-    missing = [name for name in (*_STATES, "time") if name not in ds]
+def _draw_path(ax: Axes, ds: xr.Dataset, drawing: Drawing, motion: Motion) -> list[Any]:
+    """Draw the path of the traced point; return handles for a legend."""
+    style.style_axes(ax)
+    parameters = parameters_of(ds).as_dict()
+    shown = draw_path(ax, drawing, parameters, motion)
+    line = Line2D([], [], color=motion.colour, linewidth=1.2, label=f"path of the {drawing.trace}")
+    return [line, *fixed_handles(drawing, parameters, shown)]
+
+
+def _place(ds: xr.Dataset) -> str:
+    frequency = ds.attrs.get("frequency_hz")
+    return f"$f$ = {float(frequency):.6g}\u00a0Hz" if frequency is not None else ""
+
+
+def _grids(fig: style.DataFigure, n_rows: int, n_panels: int) -> tuple[list[SubplotSpec], list[SubplotSpec]]:
+    """Places of the series, and of the portraits: beside one another, or below in a narrow figure."""
+    if not fig.frame.compact:
+        outer = fig.add_gridspec(1, 2, width_ratios=[1.35, 1.0])
+        left, right = outer[0].subgridspec(n_rows, 1), outer[1].subgridspec(n_panels, 1)
+        return [left[i] for i in range(n_rows)], [right[i] for i in range(n_panels)]
+    rows = math.ceil(n_panels / 2)
+    fig.set_size_inches(fig.frame.width_in, 0.85 * n_rows + 1.25 * rows + 0.9)
+    both: GridSpec = fig.add_gridspec(2, 1, height_ratios=[0.85 * n_rows, 1.25 * rows])
+    top, bottom = both[0].subgridspec(n_rows, 1), both[1].subgridspec(rows, 2)
+    last = [bottom[i // 2, i % 2] for i in range(n_panels)]
+    if n_panels % 2:
+        last[-1] = bottom[rows - 1, :]
+    return [top[i] for i in range(n_rows)], last
+
+
+def _check(ds: xr.Dataset, model: Model) -> None:
+    needed = (*model.state_names, "time")
+    missing = [name for name in needed if name not in ds]
     if missing:
-        raise ValueError(f"a trajectory needs {', '.join((*_STATES, 'time'))}; missing: {', '.join(missing)}")
+        raise ValueError(f"a trajectory needs {', '.join(needed)}; missing: {', '.join(missing)}")
     if ds.sizes["time"] < 2:
         raise ValueError(
             f"a trajectory needs at least two points of time, and this one has {ds.sizes['time']}"
         )
+
+
+def _values(ds: xr.Dataset, name: str, on_circle: bool) -> np.ndarray:
+    values = np.asarray(ds[name].values, dtype=np.float64)
+    return np.unwrap(values) if on_circle else values
+
+
+def _data(ds: xr.Dataset, series: dict[str, np.ndarray], drawing: Drawing | None) -> xr.Dataset:
+    if drawing is None:
+        return ds
+    states = np.stack(list(series.values()), axis=-1)
+    path = drawing.points(states, parameters_of(ds).as_dict())[drawing.trace]
+    attrs = {"units": drawing.unit, "long_name": f"path of the {drawing.trace}"}
+    return ds.assign(path=(("time", "axis"), path, attrs)).assign_coords(axis=["x", "y"])
 
 
 def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
@@ -84,89 +158,85 @@ def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
     return np.asarray(times[inside])
 
 
-def _draw_series(axes: list[Axes], ds: xr.Dataset, time: np.ndarray, series: dict[str, np.ndarray]) -> None:
-    for ax, suffix, label in zip(axes, ("", "_dot"), ("angle [rad]", "rate [rad/s]"), strict=False):
-        for link, colour in _COLOURS.items():
-            ax.plot(
-                time,
-                series[f"psi{link}{suffix}"],
-                color=colour,
-                linewidth=0.8,
-                gid=f"series:psi{link}{suffix}",
-            )
-        ax.set_ylabel(label, fontsize=style.LABEL_PT)
-    if "torque" in ds:
-        torque = np.asarray(ds["torque"].values, dtype=np.float64)
-        axes[-1].plot(time, torque, color="0.2", linewidth=0.8, gid="series:torque")
-        axes[-1].set_ylabel("torque [N m]", fontsize=style.LABEL_PT)
-    for ax in axes:
+def _units(model: Model) -> list[tuple[str, ...]]:
+    """States that share a panel: those of one unit, angles and what else has it apart."""
+    kinds: dict[tuple[str, bool], tuple[str, ...]] = {}
+    for s in model.states:
+        key = (s.unit, s.on_circle) if s.unit != "1" else (s.name, False)
+        kinds[key] = (*kinds.get(key, ()), s.name)
+    return list(kinds.values())
+
+
+def _others(ds: xr.Dataset, model: Model) -> list[tuple[str, ...]]:
+    """Further variables, a panel for each unit: the first few of each of the first few units."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name, values in ds.data_vars.items():
+        if values.dims == ("time",) and str(name) not in (*model.state_names, "section_times"):
+            unit = str(values.attrs.get("units", ""))
+            found[unit] = (*found.get(unit, ()), str(name))[:MOST_LINES]
+    return list(found.values())[:MOST_PANELS]
+
+
+def _colour(pair: int) -> str:
+    return COLOURS[pair % len(COLOURS)]
+
+
+def _colours(model: Model) -> dict[str, str]:
+    """Colour by state: that of the first portrait that it is in."""
+    found: dict[str, str] = {}
+    for k, pair in enumerate(model.portraits):
+        for name in pair:
+            found.setdefault(name, _colour(k))
+    return found
+
+
+def _draw_series(
+    axes: Sequence[Axes], ds: xr.Dataset, time: np.ndarray, series: dict[str, np.ndarray],
+    rows: Sequence[tuple[str, ...]], degrees: bool,
+) -> None:  # fmt: skip
+    model = model_of(ds)
+    colours = _colours(model)
+    for ax, names in zip(axes, rows, strict=True):
+        if ax is not axes[-1]:
+            ax.sharex(axes[-1])
+            ax.tick_params(labelbottom=False)
         style.style_axes(ax)
         ax.set_xlim(float(time[0]), float(time[-1]))
         ax.margins(y=0.08)
-        ax.xaxis.set_minor_locator(AutoMinorLocator())
-        ax.yaxis.set_minor_locator(AutoMinorLocator(2))
-        ax.tick_params(labelbottom=ax is axes[-1])
-    low, high = axes[0].get_ylim()
-    style.set_angle_ticks(axes[0], low, high, degrees=False)
-    axes[-1].set_xlabel("time [s]", fontsize=style.LABEL_PT)
-    axes[0].figure.align_ylabels(axes)
+        if names[0] not in model.state_names:
+            _draw_others(ax, ds, time, names)
+            continue
+        turn = degrees and model.state(names[0]).unit.startswith("rad")
+        measures = [labels.state_measure(ds, name, turn) for name in names]
+        for m in measures:
+            ax.plot(time, m.shown(series[m.name]), color=colours.get(m.name, "0.2"), linewidth=0.8,
+                    gid=f"series:{m.name}")  # fmt: skip
+        style.label_axes(ax, y=labels.with_unit(", ".join(m.symbol for m in measures), measures[0].unit))
+        labels.angle_ticks(ax, measures[0], most=5.0)
+    style.label_axes(axes[-1], x="time [s]")
 
 
-def _draw_portrait(
-    ax: Axes, link: str, time: np.ndarray, series: dict[str, np.ndarray], strobe: np.ndarray
-) -> None:
-    angle, rate = series[f"psi{link}"], series[f"psi{link}_dot"]
-    points = np.interp(strobe, time, angle), np.interp(strobe, time, rate)
-    turns = bool(np.ptp(angle) >= 2.0 * math.pi)
-    line = on_circle(angle, rate) if turns else (angle, rate)
-    ax.plot(*line, color=_COLOURS[link], linewidth=0.7, gid=f"portrait:psi{link}")
-    if strobe.size:
-        ax.plot(
-            wrapped(points[0]) if turns else points[0], points[1],
-            linestyle="none", marker="o", markersize=3.6, color="black",
-            markeredgecolor="white", markeredgewidth=0.5, gid=f"section:psi{link}", zorder=3,
-        )  # fmt: skip
-    if turns:
-        ax.set_xlim(-math.pi, math.pi)
-    style.style_axes(ax)
-    ax.margins(0.06)
-    low, high = ax.get_xlim()
-    style.set_angle_ticks(ax, low, high, degrees=False, axis="x")
-    ax.set_xlabel(style.state_label(f"psi{link}"), fontsize=style.LABEL_PT, labelpad=2.0)
-    ax.set_ylabel(style.state_label(f"psi{link}_dot"), fontsize=style.LABEL_PT, labelpad=2.0)
-    ax.xaxis.set_minor_locator(AutoMinorLocator(2))
-    ax.yaxis.set_minor_locator(AutoMinorLocator(2))
+def _draw_others(ax: Axes, ds: xr.Dataset, time: np.ndarray, names: Sequence[str]) -> None:
+    """Draw variables that are no states, with a legend of their own if there are several."""
+    quantities = {q.name: q.symbol for q in model_of(ds).quantities}
+    symbols = [f"${quantities[n]}$" if quantities.get(n) else n.replace("_", " ") for n in names]
+    for name, symbol, look in zip(names, symbols, ("0.15", style.ORANGE), strict=False):
+        values = np.asarray(ds[name].values, dtype=np.float64)
+        ax.plot(time, values, color=look, linewidth=0.8, gid=f"series:{name}", label=symbol)
+    unit = str(ds[names[0]].attrs.get("units", ""))
+    style.label_axes(ax, y=labels.with_unit(", ".join(symbols), unit))
+    if len(names) > 1:
+        ax.legend(loc="upper right", ncols=len(names), fontsize=style.look_of(ax).tick - 1.0, borderpad=0.2,
+                  handlelength=1.0, framealpha=0.8, edgecolor="none", columnspacing=0.8,
+                  handletextpad=0.3)  # fmt: skip
 
 
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Bring angles to [-pi, pi)."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-def on_circle(angle: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Wrap the angle and break the line where it leaves one edge and enters at the other."""
-    folded = wrapped(angle)
-    jumps = np.flatnonzero(np.abs(np.diff(folded)) > math.pi) + 1
-    return np.insert(folded, jumps, np.nan), np.insert(rate, jumps, np.nan)
-
-
-def _legend(fig: Figure, with_section: bool) -> None:
-    handles = [
-        Line2D([], [], color=colour, linewidth=1.2, label=f"link {link}") for link, colour in _COLOURS.items()
-    ]
+def _handles(ds: xr.Dataset, model: Model, with_section: bool) -> list[Any]:
+    handles: list[Any] = []
+    if len(model.portraits) > 1:
+        for k, pair in enumerate(model.portraits):
+            text = ", ".join(labels.state_measure(ds, name).symbol for name in pair)
+            handles.append(Line2D([], [], color=_colour(k), linewidth=1.2, label=text))
     if with_section:
-        handles.append(
-            Line2D(
-                [],
-                [],
-                linestyle="none",
-                marker="o",
-                markersize=3.6,
-                color="black",
-                label="once per drive period",
-            )
-        )
-    fig.legend(
-        handles=handles, loc="lower right", bbox_to_anchor=(0.99, 0.93), ncols=3, frameon=False,
-        fontsize=style.LEGEND_PT, borderpad=0.2, handlelength=1.6, columnspacing=1.2,
-    )  # fmt: skip
+        handles.append(style.dot("once per drive period", "black", 3.6))
+    return handles

@@ -68,7 +68,7 @@ ATTRACTORS = Analysis(
     which it exists. Shares are those of the cells whose outcome is known, with 95 % intervals.""",
     AttractorOptions,
     compute=f"{_ROOM}:attractors",
-    table=f"{_ROOM}:attractors_table",
+    table="pipeline.analysis.attractors.table:attractors_table",
     builds_on=("identified",),
     figure="attractors",
 )
@@ -78,7 +78,7 @@ HYSTERESIS = Analysis(
     "Say where a continuation meets other attractors going up than going down, and where it jumps.",
     AttractorOptions,
     compute=f"{_ROOM}:hysteresis",
-    table=f"{_ROOM}:hysteresis_table",
+    table="pipeline.analysis.attractors.hysteresis_table:hysteresis_table",
     needs=f"{_ROOM}:needs_directions",
     builds_on=("attractors",),
     figure="attractors",
@@ -91,6 +91,6 @@ SETTLING = Analysis(
     This integrates, for minutes if there are many sets. Lifetimes are in drive periods.""",
     SettlingOptions,
     compute=f"{_ROOM}:settling",
-    table=f"{_ROOM}:settling_table",
+    table="pipeline.analysis.attractors.settling_table:settling_table",
     builds_on=("attractors",),
 )

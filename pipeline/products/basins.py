@@ -33,7 +33,7 @@ BASINS = Analysis(
     The last three need starts on a grid.""",
     BasinOptions,
     compute=f"{_ROOM}:basins",
-    table=f"{_ROOM}:basins_table",
+    table="pipeline.analysis.basins.table:basins_table",
     needs=f"{_ROOM}:needs_starts",
     builds_on=("attractors",),
     figure="basins",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from pipeline.products.product import Analysis, Options, option
+from pipeline.products.attractors import AttractorOptions, SettlingOptions
+from pipeline.products.product import Analysis, option
 
 _ROOM = "pipeline.analysis.chaos.product"
 
 
-class ChaosOptions(Options):
+class ChaosOptions(AttractorOptions):
     """When motion counts as chaotic."""
 
     n_sigma: float = option(3.0, "Standard errors by which an exponent differs from 0.", gt=0.0)
@@ -15,39 +16,48 @@ class ChaosOptions(Options):
     n_frequencies: int = option(100, "0-1 test: number of frequencies.", ge=10)
     stride: int = option(1, "0-1 test: use every so many-th section.", ge=1)
     seed: int = option(0, "0-1 test: seed of the frequencies.", ge=0)
+    n_max: int = option(
+        2000,
+        "Most section points of a correlation dimension; 0 leaves it out.",
+        ge=0,
+    )
 
 
-class DimensionOptions(Options):
+class DimensionOptions(SettlingOptions):
     """How a correlation dimension is fitted."""
 
     at: dict[str, float] = option({}, "Value of a swept parameter; by default all its values.")
     theiler: int = option(1, "Pairs of sections at most so far apart in time are left out.", ge=0)
-    n_max: int = option(10_000, "Most section points used of a parameter point.", ge=100)
+    n_max: int = option(10_000, "Most section points used of an attractor.", ge=100)
     floor: float = option(1e-6, "Scaled distance (1 rad, 10 rad/s) that is not resolved.", gt=0.0)
 
 
 CHAOS = Analysis(
     "chaos",
-    """Tell regular from chaotic cells: Lyapunov exponents, Kaplan-Yorke dimension, 0-1 test.
+    """Tell regular from chaotic attractors: exponents, multipliers, dimensions, 0-1 test.
 
-    A table per parameter point, or with more than six points the ranges in which each kind of motion
-    occurs. Exponents need [products] lyapunov in the run's specification, the 0-1 test 200 sections.""",
+    A line per attractor, or with more than six points the ranges in which each kind of motion occurs.
+    Exponents of orbits are those of their multipliers; those of bounded sets need [products] lyapunov in the
+    run's specification, the 0-1 test 200 sections.""",
     ChaosOptions,
     compute=f"{_ROOM}:chaos",
-    table=f"{_ROOM}:chaos_table",
+    table="pipeline.analysis.chaos.table:chaos_table",
     needs=f"{_ROOM}:needs_chaos",
+    builds_on=("attractors",),
     figure="lyapunov",
 )
 
 DIMENSION = Analysis(
     "dimension",
-    """Measure the correlation dimension of the chaotic sections of a parameter point, pooled.
+    """Measure the correlation dimension of each bounded set that stays.
 
-    Takes seconds per point, and thousands of sections for two digits.""",
+    A sample of each is run on first, as `settling` does: transients and motions that are still closing have
+    no dimension. Takes seconds per point, and thousands of sections for two digits.""",
     DimensionOptions,
     compute=f"{_ROOM}:dimension",
-    table=f"{_ROOM}:dimension_table",
+    table="pipeline.analysis.chaos.table:dimension_table",
     needs=f"{_ROOM}:needs_dimension",
     settle=f"{_ROOM}:settle_dimension",
+    builds_on=("attractors",),
     figure="dimension",
 )

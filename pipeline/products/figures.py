@@ -12,10 +12,33 @@ from pipeline.products.product import Figure, FigureOptions, StateOptions, optio
 Per = Literal["s", "period"]
 
 
+def _without(options: StateOptions, name: str) -> str:
+    """The label of options as if one of them were as by default."""
+    return FigureOptions.label(options.model_copy(update={name: ""}))
+
+
 class BifurcationOptions(StateOptions):
     """A bifurcation diagram."""
 
+    quantity: str = option(
+        "",
+        "Instead of a state at the sections, a quantity over each kept period: NAME.min, NAME.max or "
+        "NAME.mean; the run needs the product extremes.",
+    )
     layout: Literal["overlay", "side"] = option("overlay", "Both directions in one panel, or a panel each.")
+
+    def label(self) -> str:
+        """What the file's name says; no state where a quantity is drawn."""
+        return super().label() if not self.quantity else _without(self, "state")
+
+
+class SectionOptions(AttractorOptions, StateOptions):
+    """Section points of one parameter point."""
+
+    against: str = option("", "State that is drawn upwards; by default the rate of the other, or the next.")
+    colour: Literal["motion", "attractor"] = option(
+        "motion", "What has a colour: the kind of motion, or each attractor, which are found first."
+    )
 
 
 class AttractorFigureOptions(AttractorOptions, FigureOptions):
@@ -81,6 +104,15 @@ BIFURCATION = Figure(
     "pipeline.plots.bifurcation:draw",
 )
 
+SECTION = Figure(
+    "section",
+    """Draw the stroboscopic section of one parameter point in the plane of two states.
+
+    Parts of it with --xlim and --ylim; many points are counted on pixels.""",
+    SectionOptions,
+    "pipeline.plots.section:draw",
+)
+
 ATTRACTORS = Figure(
     "attractors",
     "Draw all coexisting attractors over the swept parameter, with the hysteresis of a continuation.",
@@ -129,33 +161,33 @@ CONVERGENCE = Figure(
     "convergence",
     "Draw how the Lyapunov exponents of the cells of one parameter point converge.",
     ConvergenceOptions,
-    "pipeline.plots.chaos:draw_convergence",
+    "pipeline.plots.convergence:draw",
 )
 
 DIMENSION = Figure(
     "dimension",
     "Draw the correlation sum of the chaotic sections of one parameter point, with fit and local slope.",
     DimensionFigureOptions,
-    "pipeline.plots.chaos:draw_dimension",
+    "pipeline.plots.dimension:draw",
 )
 
 BRANCHES = Figure(
     "branches",
     "Draw branches of periodic orbits over the bifurcation diagram: solid stable, dashed unstable.",
     BranchFigureOptions,
-    "pipeline.plots.branches:draw_branches",
+    "pipeline.plots.branches:draw",
 )
 
 MULTIPLIERS = Figure(
     "multipliers",
     "Draw the Floquet multipliers along a branch in the complex plane, with the unit circle.",
     MultiplierOptions,
-    "pipeline.plots.branches:draw_multipliers",
+    "pipeline.plots.multipliers:draw_multipliers",
 )
 
 CURVES = Figure(
     "curves",
     "Draw curves of folds, period doublings and Neimark-Sacker points in the plane of two parameters.",
     CurveFigureOptions,
-    "pipeline.plots.branches:draw_curves",
+    "pipeline.plots.multipliers:draw_curves",
 )

@@ -184,8 +184,10 @@ class Analysis:
 class FigureOptions(Options):
     """Options that every figure has."""
 
-    at: dict[str, float] = option(
-        {}, "Value of an axis that the figure has no room for; the nearest stored one is drawn and stated."
+    at: dict[str, float] = option({}, "Value of an axis that the figure has no room for.")
+    nearest: bool = option(
+        False,
+        "Take the nearest values that the axes have for --at, and say which; otherwise others are refused.",
     )
     degrees: bool = option(False, "Degrees instead of radians.")
     width: float = option(
@@ -217,14 +219,15 @@ def _words(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return name if value else f"no_{name}"
     if isinstance(value, dict):
-        return "_".join(f"{key}_{number:g}" for key, number in value.items())
+        return "_".join(f"{key}_{_word(number)}" for key, number in value.items())
     if isinstance(value, list):
         return "_".join([name, *(_word(part) for part in value)])
     return _word(value) if name in _SPEAKS_FOR_ITSELF else f"{name}_{_word(value)}"
 
 
 def _word(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value).replace("/", "-")
+    # all digits: values that differ are other pictures
+    return f"{value:.15g}" if isinstance(value, float) else str(value).replace("/", "-")
 
 
 @dataclass(frozen=True)

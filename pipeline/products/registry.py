@@ -67,7 +67,7 @@ FIGURES: Registry[Figure] = Registry(
     {
         name: f"pipeline.products.figures:{name.upper()}"
         for name in (
-            "bifurcation", "attractors", "gallery", "basins", "fractions", "regimes", "lyapunov",
+            "bifurcation", "section", "attractors", "gallery", "basins", "fractions", "regimes", "lyapunov",
             "convergence", "dimension", "branches", "multipliers", "curves",
         )
     },

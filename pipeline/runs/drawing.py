@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from pipeline.products.product import FigureOptions, function_of
+from pipeline.products.product import FigureOptions
 from pipeline.products.registry import FIGURES
 from pipeline.runs.derive import AnalysedRun, Echo, Source, prepared, refused
 from pipeline.spec.problems import SpecError, unknown_name, validated
@@ -66,6 +66,7 @@ def ready(
 
 def drawn(run: AnalysedRun, name: str, options: FigureOptions) -> DataFigure:
     """Draw a figure with options that are settled."""
+    from pipeline.plots import draw_figure
+
     with refused(run.directory):
-        found: DataFigure = function_of(FIGURES[name].draw)(run, options)
-    return found
+        return draw_figure(run, name, options)

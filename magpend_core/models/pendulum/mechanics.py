@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magpend_core.models.parameters import Parameters
+from magpend_core.models.pendulum.models import STATES
 from magpend_core.pointwise import evaluate, rates
 from magpend_core.validation import check_states
 
@@ -120,7 +121,7 @@ def energy(state: np.ndarray, parameters: Parameters) -> np.ndarray:
     ValueError
         If a state is not finite or has the wrong shape.
     """
-    states = check_states(state, tuple(range(1, np.ndim(state) + 1)))
+    states = check_states(state, tuple(range(1, np.ndim(state) + 1)), len(STATES))
     psi1, psi2, w1, w2 = np.moveaxis(states, -1, 0)
     p = parameters
     b1 = p["J1"] + p["e1"] ** 2 * p["m1"] + p["l1"] ** 2 * p["m2"]

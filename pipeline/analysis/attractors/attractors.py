@@ -10,8 +10,8 @@ Schema
 ------
 `identify` and `match` return a Dataset of the same form. Dims: the *parameter dims* of the cube
 (``frequency`` and others, in the order of the cube; none if nothing is swept), its *start dims*
-(``initial_condition``, the grid's ``psi1_0`` ..., or ``branch``), and ``attractor``, ``point``,
-``state``, ``link``, ``multiplier``. Coordinates are those of the cube.
+(``initial_condition``, the grid's ``<state>_0``, or ``branch``), and ``attractor``, ``point``, ``state``,
+``multiplier``, and the model's dim of angles. Coordinates are those of the cube.
 
 ======================== ===================================== ============ ==================================
 variable                 dims                                  dtype, fill  meaning
@@ -26,11 +26,11 @@ variable                 dims                                  dtype, fill  mean
 ``share``                parameter dims, attractor             float64, 0   of all cells of the point
 ``attractor_points``     parameter dims, attractor, point,     float64, NaN section points, below
                          state
-``rotation``             parameter dims, attractor, link       float64, NaN mean turns per drive period
-``side``                 parameter dims, attractor             int8, 0      codes of `sides.Side`
-``state_min``,           parameter dims, attractor, state      float64, NaN range [rad, rad/s], below
+``rotation``             parameter dims, attractor, angle      float64, NaN mean turns per drive period
+``side``                 parameter dims, attractor             int8, 0      codes of the model's classifier
+``state_min``,           parameter dims, attractor, state      float64, NaN range, below
 ``state_max``
-``energy_min``,          parameter dims, attractor             float64, NaN range of the energy [J], below
+``energy_min``,          parameter dims, attractor             float64, NaN range of the model's energy, below
 ``energy_max``
 ``mirror_partner``       parameter dims, attractor             int32, -1    attractor that is its image
 ``mirror_distance``      parameter dims, attractor             float64, NaN nearest attractor to the image
@@ -45,21 +45,25 @@ variable                 dims                                  dtype, fill  mean
 ======================== ===================================== ============ ==================================
 
 `attractor_points` are NaN beyond the attractor's own: a closed orbit's points in the order of time, or a
-sample of a bounded set. Ranges of a polished orbit are those over its full period, angles as they run on
-from the first point and -pi to pi for a link that rotates; all others are those of the kept sections, and
+sample of a bounded set. What the model does not have (angles, a classifier, an energy, a symmetry) has no
+variable. Ranges of a polished orbit are those over its full period, angles as they run on from the first
+point and -pi to pi for one that rotates; all others are those of the kept sections, and
 the energy of a bounded set that of its stored points.
 
-Distances are in units of the states' scales (1 rad, 10 rad/s for the pendulum), angles on their circle.
+Distances are in units of the states' scales (1 rad, 10 rad/s for the pendulum), angles on their circle;
+states are in the units of the coordinate ``state_units``.
 From `identify` an id numbers the attractors of one parameter point (attribute ``matched`` 0), in
 lexicographic order of the least section point; from `match` it follows an attractor (``matched`` 1), and
 where that attractor is absent its row holds the fill values.
 
 `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the orbit, 3 approaching the
-orbit, 4 one of the set, 5 ended on the orbit when it was run on; `orbits.decide` has the criteria. A cell
+orbit, 4 one of the set, 5 ended on the orbit when it was run on; `deciding.decide` has the criteria. A cell
 that is not bounded (diverged, step limit, pending, unreached) has the id -1, and its own `status`; a
-bounded one that belongs to nothing found (see `bounded.Rule`) has the id -1 and `decision` 0. A spiral too
-far from its orbit to be told, and a chaotic transient, look like bounded sets here: what they become takes
-a longer run, or `lifetimes`. An unstable orbit (`is_stable` 0) is listed only if a cell closed on it.
+bounded one that belongs to nothing found (see `bounded.Rule`) has the id -1 and `decision` 0. Before a
+bounded set is named, the cells that come back near (`spirals`) and that no orbit accounts for are run on,
+2048 drive periods at most: a slow spiral is its orbit's, no set. A chaotic transient looks like a bounded
+set here: what it becomes takes a longer run, or `lifetimes`. An unstable orbit (`is_stable` 0) is listed
+only if a cell closed on it.
 
 A run with a loose `closure_tolerance` (1e-3 and more) is short, and its closed cells say little: sections
 recur within a few per cent near unstable orbits too, and near a period doubling with half the period.
@@ -71,7 +75,6 @@ loose closure alone, and the periods are the orbits' own.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -79,40 +82,31 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
-from pipeline.analysis.attractors.bounded import Rule
-from pipeline.analysis.attractors.features import Features
+from pipeline.analysis.attractors.deciding import DECISIONS
+from pipeline.analysis.attractors.features import ENERGY, Features
 from pipeline.analysis.attractors.hysteresis import hysteresis
-from pipeline.analysis.attractors.identify import (
-    BUDGET,
-    Found,
-    Options,
-    engine_inputs,
-    search_all,
-    slabs,
-)
+from pipeline.analysis.attractors.labelling import Found, conclude
 from pipeline.analysis.attractors.lifetimes import lifetimes
 from pipeline.analysis.attractors.matching import match
-from pipeline.analysis.attractors.orbits import DECISIONS
-from pipeline.analysis.sides import Side
-from pipeline.layout.vocabulary import BOUNDED_SET, parameters_of, split_dims
-from pipeline.products.lyapunov import LyapunovFlag
+from pipeline.analysis.attractors.points import BUDGET, Dynamics, slabs
+from pipeline.analysis.attractors.searching import Search, search_all
+from pipeline.analysis.chaos.lyapunov import on_attractor
+from pipeline.analysis.sides import flags_of
+from pipeline.layout.vocabulary import BOUNDED_SET, split_dims
+from pipeline.products.attractors import IdentifyOptions
+from pipeline.products.chaos import ChaosOptions
 
-__all__ = ["Rule", "hysteresis", "identify", "lifetimes", "match", "parameters_of"]
+__all__ = ["hysteresis", "identify", "lifetimes", "match"]
 
 
 def identify(
     ds: xr.Dataset,
+    options: IdentifyOptions | None = None,
     *,
     parameters: Parameters | np.ndarray | None = None,
-    tolerance: float | None = None,
-    polish: bool = True,
-    residual: float = 1e-10,
-    max_orbit_period: int = 16,
-    rule: Rule | None = None,
-    n_points: int = 64,
-    mirror_threshold: float = 0.3,
     system: System | None = None,
     block_bytes: int = BUDGET,
+    **changes: Any,
 ) -> xr.Dataset:
     """Find the attractors at each parameter point of a cube and assign the cells to them.
 
@@ -120,31 +114,22 @@ def identify(
     ----------
     ds
         Cube with `section`, `status`, `orbit_period`, and `turns` if there is rotation.
+    options
+        By default those of `IdentifyOptions`. Its `tolerance` of 0 stands for ten times the attribute
+        ``closure_tolerance`` of `ds`, and 1e-4 at least: a slow spiral can be eight times the closure
+        tolerance away (`magpend_core.engine.observers.closed_period`). Above 1e-3 the run is taken as
+        loosely closed, see the text of this module. Without `polish` closed cells are grouped by distance
+        alone, no spiral is recognised, and features that need integration are missing.
     parameters
         What was integrated; by default as `ds.attrs` say. Axes of the cube replace the values of the
         same name. With another `system`, its packed vector.
-    tolerance
-        Scaled distance within which a closed cell belongs to an orbit; by default ten times the
-        attribute ``closure_tolerance`` of `ds`, and 1e-4 at least: a slow spiral can be eight times
-        the closure tolerance away (`magpend_core.engine.observers.closed_period`). Above 1e-3 the run is
-        taken as loosely closed, see `pipeline.analysis.attractors.attractors`.
-    polish
-        Whether to run Newton's method. Without it closed cells are grouped by distance alone, no
-        spiral is recognised, and features that need integration are missing.
-    residual
-        Scaled residual that Newton's method is to reach.
-    max_orbit_period
-        Longest period guessed for cells that are not closed [drive periods].
-    rule
-        When bounded sets are the same.
-    n_points
-        Stored points per attractor, more if an orbit has more.
-    mirror_threshold
-        Largest distance of a mirror partner from the image.
     system
-        By default the pendulum.
+        By default that of the run's model. With one of its own there is neither energy nor mirror image nor
+        side.
     block_bytes
         Sections held in memory at once [bytes]; changes nothing in the result.
+    changes
+        Fields of the options, instead of `options`.
 
     Returns
     -------
@@ -154,24 +139,20 @@ def identify(
     Raises
     ------
     ValueError
-        If a variable or the parameters are missing.
+        If a variable or the parameters are missing, or an option is out of bounds.
     """
-    if tolerance is None:
-        tolerance = max(1e-4, 10.0 * float(ds.attrs.get("closure_tolerance", 1e-5)))
-    elif not tolerance > 0.0:
-        raise ValueError(f"tolerance = {tolerance!r} is out of bounds: it must be greater than 0.")
+    options = options or IdentifyOptions(**changes)
     missing = [name for name in ("section", "status", "orbit_period") if name not in ds]
     if missing:
         raise ValueError(f"The dataset has no {', '.join(missing)}; give the dataset of pipeline.open_run.")
-    base, system = engine_inputs(ds, parameters, system, needed=polish)
-    options = Options(
-        tolerance, polish, residual, max_orbit_period, rule or Rule(), n_points, mirror_threshold
-    )
-    _, start_dims = split_dims(ds["status"])
-    found = {}
-    for points in slabs(ds, start_dims, base, system, block_bytes):
-        found.update(search_all(points, options, system))
-    return _with_exponents(_dataset(ds, start_dims, found, options), ds)
+    tolerance = options.tolerance or max(1e-4, 10.0 * float(ds.attrs.get("closure_tolerance", 1e-5)))
+    dynamics = Dynamics.of(ds, parameters, system, needed=options.polish)
+    search = Search(options, tolerance, dynamics)
+    found: dict[tuple[int, ...], Found] = {}
+    for points in slabs(ds, dynamics, block_bytes):
+        states = search_all(points, search)
+        found |= {index: conclude(points[index], states[index], search) for index in points}
+    return _with_exponents(_dataset(ds, found, search), ds)
 
 
 # ---- result ------------------------------------------------------------------------------------
@@ -182,14 +163,11 @@ def _flags(words: str) -> dict[str, Any]:
     return {"flag_values": np.arange(n, dtype=np.int8), "flag_meanings": words}
 
 
-def _dataset(
-    ds: xr.Dataset, start_dims: tuple[str, ...], found: Mapping[tuple[int, ...], Found], options: Options
-) -> xr.Dataset:
+def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Search) -> xr.Dataset:
     """Result of `identify`, in the schema of the module."""
-    dims, _ = split_dims(ds["status"])
+    dims, start_dims = split_dims(ds["status"])
     shape = tuple(ds.sizes[d] for d in dims)
-    table = _filled(ds, dims, shape, found, options)
-    n = table.n
+    table = _filled(ds, dims, shape, found, search)
     result = xr.Dataset(table.variables())
     cell_dims = (*dims, *start_dims)
     cell_shape = (*shape, *(ds.sizes[d] for d in start_dims))
@@ -198,46 +176,33 @@ def _dataset(
         ids[index] = one.label.reshape(cell_shape[len(dims) :])
         decisions[index] = one.decision.reshape(cell_shape[len(dims) :])
     result["attractor_id"] = (cell_dims, ids, {"units": "1", "long_name": "attractor of the cell, -1 none"})
-    result["decision"] = (
-        cell_dims,
-        decisions,
-        {"units": "1", "long_name": "how the cell was decided", **_flags(" ".join(DECISIONS))},
-    )
+    how = {"units": "1", "long_name": "how the cell was decided", **_flags(" ".join(DECISIONS))}
+    result["decision"] = (cell_dims, decisions, how)
     about = {"units": "1", "long_name": "what became of the cell", **ds["status"].attrs}
     result["status"] = (cell_dims, ds["status"].transpose(*cell_dims).values, about)
-    keep = {k: v for k, v in ds.coords.items() if set(v.dims) <= set(cell_dims) | {"state", "link"}}
-    result = result.assign_coords(keep).assign_coords(
-        attractor=("attractor", np.arange(n, dtype=np.int32), {"units": "1", "long_name": "attractor"})
-    )
+    own = {*cell_dims, "state", table.angle_dim}
+    number = ("attractor", np.arange(table.n, dtype=np.int32), {"units": "1", "long_name": "attractor"})
+    result = result.assign_coords({k: v for k, v in ds.coords.items() if set(v.dims) <= own})
+    plain = {**search.options.plain(), "tolerance": search.tolerance}
+    settings = {f"identify_{k}": int(v) if isinstance(v, bool) else v for k, v in plain.items()}
     kept = {k: v for k, v in ds.attrs.items() if k != "title"}
-    settings = {**asdict(options), **{f"rule_{k}": v for k, v in asdict(options.rule).items()}}
-    settings = {
-        f"identify_{k}": int(v) if isinstance(v, bool) else v for k, v in settings.items() if k != "rule"
-    }
-    return result.assign_attrs({**kept, **settings, "matched": 0})
+    return result.assign_coords(attractor=number).assign_attrs({**kept, **settings, "matched": 0})
 
 
 def _filled(
     ds: xr.Dataset, dims: tuple[str, ...], shape: tuple[int, ...],
-    found: Mapping[tuple[int, ...], Found], options: Options,
+    found: Mapping[tuple[int, ...], Found], search: Search,
 ) -> _Table:  # fmt: skip
     """Table of the attractors of all parameter points."""
     n = max((len(f.features) for f in found.values()), default=0)
     longest = max((len(x.points) for f in found.values() for x in f.features), default=0)
-    n_points = max(options.n_points, longest)
-    names = (
-        [str(s) for s in ds["state"].values]
-        if "state" in ds.coords
-        else [str(i) for i in range(ds.sizes["state"])]
-    )
-    n_links = next((x.rotation.shape[0] for f in found.values() for x in f.features), ds.sizes.get("link", 0))
-    table = _Table(
-        dims, shape, n, {"point": n_points, "state": len(names), "link": n_links, "multiplier": len(names)}
-    )
+    n_states = ds.sizes["state"]
+    sizes = {"point": max(search.options.n_points, longest), "state": n_states, "multiplier": n_states,
+             "angle": search.dynamics.n_angles}  # fmt: skip
+    table = _Table(dims, shape, n, sizes, search.dynamics)
     for index, one in found.items():
-        total = one.label.size
         for i, x in enumerate(one.features):
-            table.fill((*index, i), x, one.counts[i], total)
+            table.fill((*index, i), x, one.counts[i], one.label.size)
     return table
 
 
@@ -245,32 +210,32 @@ def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
     """Fill in the largest exponent of bounded sets, the mean over their cells, where the cube has it."""
     if "lyapunov" not in ds:
         return result
-    dims = result["attractor_id"].dims
+    dims, signs = result["attractor_id"].dims, ChaosOptions()
     rate = ds["lyapunov"].isel(exponent=0, drop=True).transpose(*dims).values
-    good = ds["lyapunov_flag"].transpose(*dims).values == LyapunovFlag.GOOD
+    counts = on_attractor(ds, n_sigma=signs.n_sigma, least=signs.least).transpose(*dims).values
     ids, kind = result["attractor_id"].values, result["kind"].values
     for index in np.argwhere(kind == BOUNDED_SET):
         point, i = tuple(index[:-1]), index[-1]
-        own = rate[point][(ids[point] == i) & good[point]]
+        own = rate[point][(ids[point] == i) & counts[point]]
         if own.size:  # in rising order, so that the last bit does not depend on that of the cells
             result["lyapunov_max"].values[tuple(index)] = np.sort(own).mean()
     return result
 
 
-_STATE_UNITS = "rad, rad, rad/s, rad/s"
+_BY_STATE = "see state_units"
 
 _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "kind": ((), "int8", 0, "1", "kind of attractor"),
     "orbit_period": ((), "int32", 0, "1", "period in drive periods, 0 if bounded or absent"),
     "n_cells": ((), "int64", 0, "1", "cells on the attractor"),
     "share": ((), "float64", 0.0, "1", "share of all cells of the parameter point"),
-    "attractor_points": (("point", "state"), "float64", np.nan, _STATE_UNITS, "section points"),
-    "rotation": (("link",), "float64", np.nan, "1", "mean rotation of the link, turns per drive period"),
-    "side": ((), "int8", 0, "1", "side of the fixed magnet on which the motion stays"),
-    "state_min": (("state",), "float64", np.nan, _STATE_UNITS, "least value of the state"),
-    "state_max": (("state",), "float64", np.nan, _STATE_UNITS, "largest value of the state"),
-    "energy_min": ((), "float64", np.nan, "J", "least mechanical energy"),
-    "energy_max": ((), "float64", np.nan, "J", "largest mechanical energy"),
+    "attractor_points": (("point", "state"), "float64", np.nan, _BY_STATE, "section points"),
+    "rotation": (("angle",), "float64", np.nan, "1", "mean rotation, turns per drive period"),
+    "side": ((), "int8", 0, "1", "what the model calls the motion"),
+    "state_min": (("state",), "float64", np.nan, _BY_STATE, "least value of the state"),
+    "state_max": (("state",), "float64", np.nan, _BY_STATE, "largest value of the state"),
+    "energy_min": ((), "float64", np.nan, "1", "least energy"),
+    "energy_max": ((), "float64", np.nan, "1", "largest energy"),
     "mirror_partner": ((), "int32", -1, "1", "attractor that is the mirror image, -1 none"),
     "mirror_distance": ((), "float64", np.nan, "1", "distance from the mirror image"),
     "multiplier_real": (("multiplier",), "float64", np.nan, "1", "Floquet multipliers, real part"),
@@ -283,17 +248,36 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
 """Own dims, dtype, fill, units and long name of the variables per attractor."""
 
 
+_ELSEWHERE = ("n_cells", "share", "attractor_points", "multiplier_real", "multiplier_imag")
+"""Variables that are no attribute of `Features`."""
+
+
+def _names(dynamics: Dynamics) -> list[str]:
+    """Names of the variables: what the model does not know is left out."""
+    model = dynamics.model
+    has_energy = model is not None and any(q.name == ENERGY for q in model.quantities)
+    left_out = {
+        "energy_": not has_energy,
+        "mirror_": model is None or model.mirror is None,
+        "side": model is None or model.classifier is None,
+        "rotation": not dynamics.n_angles,
+    }
+    return [name for name in _TABLE if not any(name.startswith(k) and out for k, out in left_out.items())]
+
+
 class _Table:
     """Arrays of the variables per attractor."""
 
     def __init__(
-        self, dims: tuple[str, ...], shape: tuple[int, ...], n: int, sizes: Mapping[str, int]
-    ) -> None:
-        self._dims, self.n = (*dims, "attractor"), n
-        self.arrays = {
-            name: np.full((*shape, n, *(sizes[d] for d in own)), fill, dtype)
-            for name, (own, dtype, fill, _, _) in _TABLE.items()
-        }
+        self, dims: tuple[str, ...], shape: tuple[int, ...], n: int, sizes: Mapping[str, int],
+        dynamics: Dynamics,
+    ) -> None:  # fmt: skip
+        self._dims, self.n, self._dynamics = (*dims, "attractor"), n, dynamics
+        self.angle_dim = dynamics.model.angle_dim if dynamics.model is not None else "angle"
+        self.arrays = {}
+        for name in _names(dynamics):
+            own, dtype, fill, _, _ = _TABLE[name]
+            self.arrays[name] = np.full((*shape, n, *(sizes[d] for d in own)), fill, dtype)
 
     def fill(self, at: tuple[int, ...], x: Features, n_cells: int, total: int) -> None:
         """Write one attractor."""
@@ -301,28 +285,25 @@ class _Table:
         arrays["n_cells"][at], arrays["share"][at] = n_cells, n_cells / total
         arrays["attractor_points"][at][: len(x.points)] = x.points
         if x.multipliers is not None:
-            arrays["multiplier_real"][at], arrays["multiplier_imag"][at] = (
-                x.multipliers.real,
-                x.multipliers.imag,
-            )
-        for name in arrays.keys() - {
-            "n_cells",
-            "share",
-            "attractor_points",
-            "multiplier_real",
-            "multiplier_imag",
-        }:
+            arrays["multiplier_real"][at] = x.multipliers.real
+            arrays["multiplier_imag"][at] = x.multipliers.imag
+        for name in arrays.keys() - set(_ELSEWHERE):
             arrays[name][at] = getattr(x, name)
 
     def variables(self) -> dict[str, Any]:
         """As xarray takes them."""
-        sides = " ".join(s.name.lower() for s in Side)
-        more = {"kind": _flags("absent closed_orbit bounded_set"), "side": _flags(sides)}
-        return {
-            name: (
-                (*self._dims, *own),
-                self.arrays[name],
-                {"units": units, "long_name": text, **more.get(name, {})},
-            )
-            for name, (own, _, _, units, text) in _TABLE.items()
-        }
+        more: dict[str, dict[str, Any]] = {"kind": _flags("absent closed_orbit bounded_set")}
+        model = self._dynamics.model
+        if "side" in self.arrays and model is not None and model.classifier is not None:
+            more["side"] = flags_of(model.classifier)
+        if "energy_min" in self.arrays and model is not None:
+            of_energy = {"units": model.quantity(ENERGY).unit}
+            more |= {"energy_min": of_energy, "energy_max": of_energy}
+        found = {}
+        for name, values in self.arrays.items():
+            own = tuple(self.angle_dim if d == "angle" else d for d in _TABLE[name][0])
+            units, text = _TABLE[name][3:]
+            found[name] = (
+                (*self._dims, *own), values, {"units": units, "long_name": text, **more.get(name, {})}
+            )  # fmt: skip
+        return found

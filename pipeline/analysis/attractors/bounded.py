@@ -12,12 +12,13 @@ square.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from pipeline.analysis.sets import TWO_PI, Geometry, groups, hashes
+from pipeline.products.attractors import IdentifyOptions
 
 
 @dataclass(frozen=True)
@@ -31,18 +32,23 @@ class Rule:
     same_share : float
         Least share of boxes in common, seen from either side.
     rotation : float
-        Largest difference of the mean rotation of a link [turns per drive period].
+        Largest difference of the mean rotation of an angle [turns per drive period].
     n_anchors : int
         Cells compared with each other in one round.
     n_rounds : int
         Rounds; what is left after the last belongs to no set.
     """
 
-    box: float = 0.1
-    same_share: float = 0.5
-    rotation: float = 0.2
-    n_anchors: int = 192
-    n_rounds: int = 4
+    box: float
+    same_share: float
+    rotation: float
+    n_anchors: int
+    n_rounds: int
+
+    @classmethod
+    def of(cls, options: IdentifyOptions) -> Rule:
+        """Rule that options of the search ask for."""
+        return cls(**{f.name: getattr(options, f"rule_{f.name}") for f in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class Clouds:
     mark : ndarray of uint64, (cell,)
         Hash of each cell's sections.
     boxes : ndarray, (cell, period_index, state)
-    rotation : ndarray, (cell, link)
+    rotation : ndarray, (cell, angle)
         Mean rotation [turns per drive period].
     """
 
@@ -86,7 +92,7 @@ class Clouds:
 
 
 def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Mean rotation of each link over the kept sections [turns per drive period], shape (cell, link)."""
+    """Mean rotation of each angle over the kept sections [turns per drive period], shape (cell, angle)."""
     angles = np.asarray(geometry.is_angle)
     change = section[:, -1, angles] - section[:, 0, angles]
     n = max(section.shape[1] - 1, 1)
@@ -114,7 +120,7 @@ class Sets:
     keys : ndarray of uint64, (box,)
     reached : csr_array, (set, box)
         Which of them each set occupies or touches.
-    rotation : ndarray, (set, link)
+    rotation : ndarray, (set, angle)
         Mean of the anchors.
     """
 
@@ -148,7 +154,7 @@ def _shares(part: csr_array, whole: csr_array) -> np.ndarray:
 
 
 def _agree(a: np.ndarray, b: np.ndarray, tolerance: float) -> np.ndarray:
-    return np.asarray(np.abs(a[:, None] - b[None]).max(axis=-1) <= tolerance)
+    return np.asarray((np.abs(a[:, None] - b[None]) <= tolerance).all(axis=-1))
 
 
 def find_sets(anchors: Clouds, geometry: Geometry, rule: Rule) -> Sets:

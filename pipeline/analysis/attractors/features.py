@@ -2,13 +2,13 @@
 
 Half a drive period
 -------------------
-The drive with a duty cycle of one half changes its sign after half a period, and with it the pendulum
-has the symmetry ``psi(t) -> -psi(t + T/2)``. On the section (t = 0) the image of a point x is
-therefore minus the state that the motion from x has at t = T/2, not minus x itself. The image of a
-closed orbit is found in this way from its polished orbit, that of a bounded set from its stored points;
-the mirror partner is the attractor nearest to the image whose rotation is opposite. A motion that is its
-own image is its own partner. With the preset's duty cycle of 0.4927 and its magnets' fit the symmetry
-is approximate; `mirror_distance` says how well it holds.
+A drive whose second half is minus its first gives many systems a symmetry that takes half a period:
+``x(t) -> -x(t + T/2)``. On the section (t = 0) the image of a
+point x is therefore minus the state that the motion from x has at t = T/2, not minus x itself. The model says
+what its symmetry is. The image of a closed orbit is found in this way from its polished orbit, that of a
+bounded set from its stored points; the mirror partner is the attractor nearest to the image whose rotation
+agrees with the image's. A motion that is its own image is its own partner. Where the symmetry is approximate,
+`mirror_distance` says how well it holds.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import xarray as xr
 
+from magpend_core.models.model import Mirror
 from magpend_core.models.parameters import Parameters
-from magpend_core.models.pendulum.mechanics import energy
-from magpend_core.status import Status
+from magpend_core.pointwise import evaluate
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.bounded import mean_rotation
-from pipeline.analysis.attractors.orbits import Block
+from pipeline.analysis.attractors.cells import Block
 from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points
-from pipeline.analysis.sides import Side, side
+from pipeline.analysis.sides import UNKNOWN
+
+ENERGY = "energy"
+"""Quantity of a model of which attractors have ranges."""
 
 SAMPLES = 256
 """Times per drive period at which a polished orbit is sampled for its ranges; even."""
@@ -44,10 +46,12 @@ class Cells:
         Cells.
     low, high : ndarray, (state,)
         Range of the kept sections.
-    rotation : ndarray, (link,)
-        Sum over cells of the mean rotation.
-    sides : ndarray, (len(Side),)
-        Cells by side.
+    rotations : list of ndarray, (cell, angle)
+        Mean rotation of the cells.
+    turns : list of ndarray, (cell, angle)
+        Full turns of the cells over their sections.
+    sides : dict
+        Cells by the classifier's code.
     points : ndarray, (m, state)
         Section points of least hash.
     """
@@ -57,18 +61,21 @@ class Cells:
     low: np.ndarray = field(default_factory=lambda: np.full(1, np.inf))
     high: np.ndarray = field(default_factory=lambda: np.full(1, -np.inf))
     rotations: list[np.ndarray] = field(default_factory=list)
-    sides: np.ndarray = field(default_factory=lambda: np.zeros(len(Side), np.int64))
+    turns: list[np.ndarray] = field(default_factory=list)
+    sides: dict[int, int] = field(default_factory=dict)
     points: np.ndarray | None = None
 
     def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
-        """Take in some cells of a block; `labels` are the codes of `Side` of all its cells."""
+        """Take in some cells of a block; `labels` are the codes of the classifier for all its cells."""
         section = block.section[cells]
         self.n += len(cells)
         flat = section.reshape(-1, section.shape[-1])
         self.low = np.minimum(self.low, flat.min(axis=0))
         self.high = np.maximum(self.high, flat.max(axis=0))
         self.rotations.append(mean_rotation(section, block.turns[cells], geometry))
-        self.sides += np.bincount(labels[cells], minlength=len(Side))
+        self.turns.append(np.abs(block.turns[cells]))
+        for code, count in zip(*np.unique(labels[cells], return_counts=True), strict=True):
+            self.sides[int(code)] = self.sides.get(int(code), 0) + int(count)
         both = flat if self.points is None else np.concatenate([self.points, flat])
         least = np.unique(hashes(both), return_index=True)[1][: self.n_points]
         self.points = both[least]
@@ -78,15 +85,17 @@ class Cells:
         """Mean over cells; summed in rising order, so that the last bit does not depend on theirs."""
         return np.asarray(np.sort(np.concatenate(self.rotations), axis=0).mean(axis=0))
 
-    @property
-    def side(self) -> int:
-        """Side of the set: that of all its cells, or rotating if most rotate, or straddling."""
-        known = self.sides.copy()
-        known[Side.UNKNOWN] = 0
-        present = np.flatnonzero(known)
-        if len(present) <= 1:
-            return int(present[0]) if len(present) else int(Side.UNKNOWN)
-        return int(Side.ROTATING if 2 * known[Side.ROTATING] > known.sum() else Side.STRADDLING)
+    def side(self, parameters: Parameters, frequency: float) -> int:
+        """Code of the set: that of all its cells, or else that of their points together.
+
+        The set turns if most of its cells do.
+        """
+        known = [code for code in self.sides if code != UNKNOWN]
+        if len(known) <= 1:
+            return known[0] if known else UNKNOWN
+        assert self.points is not None
+        turns = np.median(np.concatenate(self.turns), axis=0).astype(np.int64)
+        return int(sides_of(self.points[None], turns[None], frequency, parameters)[0])
 
 
 @dataclass
@@ -115,19 +124,15 @@ class Features:
     mirror_distance: float = np.nan
 
 
-def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, names: tuple[str, ...]) -> np.ndarray:
-    """Codes of `Side` for rows of sections, by the rule of `pipeline.analysis.sides`."""
-    if not {"psi1", "psi2"} <= set(names):
-        return np.full(len(section), Side.UNKNOWN, np.int64)
-    ds = xr.Dataset(
-        {
-            "section": (("cell", "period_index", "state"), section),
-            "turns": (("cell", "link"), turns),
-            "status": ("cell", np.full(len(section), Status.PERIODIC, np.int8)),
-        },
-        coords={"state": list(names), "frequency": frequency},
-    )
-    return np.asarray(side(ds).values, np.int64)
+def sides_of(
+    section: np.ndarray, turns: np.ndarray, frequency: float, parameters: Parameters | None
+) -> np.ndarray:
+    """Codes of the model's classifier for rows of sections; unknown where it has none, or a state is NaN."""
+    classifier = parameters.model.classifier if parameters is not None else None
+    if classifier is None or parameters is None:
+        return np.full(len(section), UNKNOWN, np.int64)
+    code = classifier.classify(np.nan_to_num(section), turns, np.asarray(frequency), parameters)
+    return np.where(np.isfinite(section).all(axis=(1, 2)), code, UNKNOWN).astype(np.int64)
 
 
 def follow_orbit(found: Features, parameters: Parameters, frequency: float, geometry: Geometry) -> None:
@@ -140,27 +145,50 @@ def follow_orbit(found: Features, parameters: Parameters, frequency: float, geom
     found.rotation = turns / p + 0.0  # no -0.0
     found.state_min, found.state_max = states.min(axis=0), states.max(axis=0)
     found.state_min[angles[turns != 0]], found.state_max[angles[turns != 0]] = -np.pi, np.pi
-    energies = energy(states, parameters)
-    found.energy_min, found.energy_max = float(energies.min()), float(energies.max())
-    found.image = -states[SAMPLES // 2 :: SAMPLES]
+    _fill_energy(found, times, states, parameters, frequency)
+    mirror = parameters.model.mirror
+    if mirror is not None:
+        first = SAMPLES // 2 if mirror.half_period else 0
+        found.image = states[first : p * SAMPLES : SAMPLES] * np.array(mirror.signs)
 
 
 def follow_points(found: Features, parameters: Parameters, frequency: float) -> None:
     """Fill in energy and image of a set from its stored points."""
-    times = np.array([0.5 / frequency])
-    ends = [trajectory(parameters, frequency, x, times, rtol=RTOL, atol=RTOL)[0] for x in found.points]
-    found.image = -np.array(ends)
-    energies = energy(found.points, parameters)
-    found.energy_min, found.energy_max = float(energies.min()), float(energies.max())
+    _fill_energy(found, np.zeros(len(found.points)), found.points, parameters, frequency)
+    mirror = parameters.model.mirror
+    if mirror is None:
+        return
+    ends = found.points
+    if mirror.half_period:
+        times = np.array([0.5 / frequency])
+        ends = np.array(
+            [trajectory(parameters, frequency, x, times, rtol=RTOL, atol=RTOL)[0] for x in found.points]
+        )
+    found.image = ends * np.array(mirror.signs)
 
 
-def pair_mirrors(found: list[Features], threshold: float, geometry: Geometry) -> None:
+def has_energy(parameters: Parameters) -> bool:
+    """Whether the model names an energy among its quantities."""
+    return any(quantity.name == ENERGY for quantity in parameters.model.quantities)
+
+
+def _fill_energy(
+    found: Features, times: np.ndarray, states: np.ndarray, parameters: Parameters, frequency: float
+) -> None:
+    if has_energy(parameters):
+        energies = evaluate([ENERGY], times, states, parameters, frequency)
+        found.energy_min, found.energy_max = float(energies.min()), float(energies.max())
+
+
+def pair_mirrors(found: list[Features], mirror: Mirror, threshold: float, geometry: Geometry) -> None:
     """Fill in the mirror partners: the attractor nearest to the image, if within `threshold`."""
+    turned = np.array(mirror.signs)[list(geometry.is_angle)]
     for a in found:
         if a.image is None:
             continue
         distances = [
-            mean_distance(a.image, b.points, geometry) + float(np.abs(a.rotation + b.rotation).max())
+            mean_distance(a.image, b.points, geometry)
+            + float(np.abs(turned * a.rotation - b.rotation).max(initial=0.0))
             for b in found
         ]
         nearest = int(np.argmin(distances))

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from magpend_core.models.parameters import Parameters
 from magpend_core.trajectory import trajectory
-from pipeline.analysis.attractors.attractors import parameters_of
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.vocabulary import CLOSED_ORBIT
+from pipeline.layout.vocabulary import CLOSED_ORBIT, FREQUENCY_DIM, parameters_of
 
 RTOL = 1e-9
 
@@ -44,11 +42,12 @@ def portraits(
     Returns
     -------
     Dataset
-        Dim ``attractor`` runs over those present at the point. ``orbit`` (attractor, sample, state): states
-        [rad, rad/s], angles not wrapped, every 1 / (`n_samples` f) from a section on, NaN beyond the end;
-        ``magnet`` (attractor, sample, axis): place of the moving magnet [m] from the upper joint, ``x`` to
-        the right, ``y`` upwards; ``attractor_points``, ``share``, ``n_cells``, ``orbit_period``, ``kind`` and
-        ``side`` as given; the attribute ``fixed_magnet_y`` [m], on the vertical through the joint.
+        Dim ``attractor`` runs over those present at the point. ``orbit`` (attractor, sample, state): states,
+        angles not wrapped, every 1 / (`n_samples` f) from a section on, NaN beyond the end; ``points``
+        (attractor, sample, place, axis): the moving points of the model's drawing, ``x`` to the right, ``y``
+        upwards, in its unit, and ``fixed`` (fixed_place, axis), those that do not move, both absent if the
+        model has no drawing; ``attractor_points``, ``share``, ``n_cells``, ``orbit_period``, ``kind`` and, if
+        there, ``side`` as given.
 
     Raises
     ------
@@ -62,12 +61,11 @@ def portraits(
     part = choose(attractors, at, tuple(start_dims(attractors)), "portraits are those of one parameter point")
     here = part.isel(attractor=np.flatnonzero(part["kind"].values > 0))
     values = {str(k): float(v) for k, v in here.coords.items() if not v.ndim and v.dtype.kind == "f"}
-    frequency = values.get("frequency")
+    frequency = values.get(FREQUENCY_DIM)
     if frequency is None:
         raise ValueError("the dataset has no coordinate 'frequency' [Hz]; assign the drive frequency")
     base = parameters_of(attractors) if parameters is None else parameters
-    names = base.as_dict()
-    base = base.replace(**{k: v for k, v in values.items() if k in names})
+    base = base.replace(**{k: v for k, v in values.items() if k in base})
     orbits = [
         _orbit(here.isel(attractor=i), base, frequency, n_samples, n_periods)
         for i in range(here.sizes["attractor"])
@@ -85,30 +83,39 @@ def _orbit(
     return trajectory(parameters, frequency, start, times, rtol=RTOL, atol=RTOL)
 
 
-def magnet_path(orbit: np.ndarray, parameters: Parameters) -> np.ndarray:
-    """Place of the moving magnet (..., 2) [m]: right of and above the upper joint, from states (..., 4)."""
-    names = parameters.as_dict()
-    lengths = np.array([names["l1"], names["l2"]])
-    angles = orbit[..., :2]
-    return np.stack([np.sin(angles) @ lengths, -(np.cos(angles) @ lengths)], axis=-1)
-
-
 def _dataset(
     here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters, frequency: float, n_samples: int
 ) -> xr.Dataset:
     length = max((len(o) for o in orbits), default=0)
-    table = np.full((len(orbits), length, 4), np.nan)
+    table = np.full((len(orbits), length, len(parameters.model.states)), np.nan)
     for row, orbit in zip(table, orbits, strict=True):
         row[: len(orbit)] = orbit
-    units: dict[str, Any] = {"units": "rad, rad, rad/s, rad/s", "long_name": "motion on the attractor"}
-    path = {"units": "m", "long_name": "moving magnet, from the upper joint"}
     keep = ["attractor_points", "share", "n_cells", "orbit_period", "kind", "side"]
-    result = here[keep].assign(
-        orbit=(("attractor", "sample", "state"), table, units),
-        magnet=(("attractor", "sample", "axis"), magnet_path(table, parameters), path),
-    )
-    result.attrs = {"fixed_magnet_y": -parameters.as_dict()["h"], "title": "portraits of attractors"}
-    return result.assign_coords(
-        time=("sample", np.arange(length) / (n_samples * frequency), {"units": "s", "long_name": "time"}),
-        axis=["x", "y"],
-    )
+    result = here[[name for name in keep if name in here]].assign(
+        orbit=(("attractor", "sample", "state"), table,
+               {"units": "see state_units", "long_name": "motion on the attractor"}),
+    )  # fmt: skip
+    time = np.arange(length) / (n_samples * frequency)
+    result = result.assign_coords(time=("sample", time, {"units": "s", "long_name": "time"}))
+    result.attrs = {
+        **{name: here.attrs[name] for name in ("model", "parameters") if name in here.attrs},
+        "title": "portraits of attractors",
+    }
+    return _drawn(result, table, parameters)
+
+
+def _drawn(result: xr.Dataset, table: np.ndarray, parameters: Parameters) -> xr.Dataset:
+    """With the places of the model's points."""
+    drawing = parameters.model.drawing
+    if drawing is None:
+        return result
+    moving, fixed = drawing.points(table, parameters), drawing.fixed(parameters)
+    about = {"units": drawing.unit, "long_name": "place, to the right and upwards"}
+    places = np.stack([moving[name] for name in moving], axis=-2)
+    result = result.assign(points=(("attractor", "sample", "place", "axis"), places, about))
+    result = result.assign_coords(place=list(moving), axis=["x", "y"])
+    if fixed:
+        still = np.stack([np.asarray(fixed[name], np.float64) for name in fixed])
+        result = result.assign(fixed=(("fixed_place", "axis"), still, about))
+        result = result.assign_coords(fixed_place=list(fixed))
+    return result

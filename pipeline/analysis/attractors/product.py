@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from pipeline.products.attractors import AttractorOptions, IdentifyOptions, SettlingOptions
-from pipeline.products.product import Table
 
 if TYPE_CHECKING:
     from pipeline.store.run import Run
@@ -15,13 +14,9 @@ if TYPE_CHECKING:
 
 def identified(run: Run, options: IdentifyOptions) -> xr.Dataset:
     """Attractors of each parameter point by itself: all that integrates."""
-    from pipeline.analysis.attractors.attractors import Rule, identify
+    from pipeline.analysis.attractors.attractors import identify
 
-    plain = options.plain()
-    rule = {name.removeprefix("rule_"): plain.pop(name) for name in list(plain) if name.startswith("rule_")}
-    if not plain["tolerance"]:
-        del plain["tolerance"]
-    return identify(run.cube(), rule=Rule(**rule), **plain)
+    return identify(run.cube(), options)
 
 
 def attractors(run: Any, options: AttractorOptions) -> xr.Dataset:
@@ -30,14 +25,6 @@ def attractors(run: Any, options: AttractorOptions) -> xr.Dataset:
 
     found = run.derive("identified", **options.part(IdentifyOptions))
     return match(found, threshold=options.threshold, look_back=options.look_back, connect=options.connect)
-
-
-def attractors_table(ds: xr.Dataset) -> Table:
-    """Table of the attractors, per parameter point or per id."""
-    from pipeline.analysis import tables
-
-    rows = tables.attractor_rows(ds)
-    return Table(rows, tables.attractor_lines(ds, rows))
 
 
 def needs_directions(run: Run, options: AttractorOptions) -> None:
@@ -54,29 +41,9 @@ def hysteresis(run: Any, options: AttractorOptions) -> xr.Dataset:
     return compute(run.cube(), run.derive("attractors", **options.plain()))
 
 
-def hysteresis_table(ds: xr.Dataset) -> Table:
-    """Table of the jumps, and lines of the loops."""
-    from pipeline.analysis import tables
-
-    rows = tables.jump_rows(ds)
-    return Table(rows, tables.hysteresis_lines(ds, rows))
-
-
 def settling(run: Any, options: SettlingOptions) -> xr.Dataset:
     """Transient or attractor: a sample of every bounded set is run on."""
     from pipeline.analysis.attractors.lifetimes import lifetimes
 
     found = run.derive("attractors", **options.part(AttractorOptions))
-    return lifetimes(
-        run.cube(), found, n_sample=options.n_sample, n_periods=options.n_periods,
-        confidence=options.confidence, max_orbit_period=options.max_orbit_period, residual=options.residual,
-        rtol=options.rtol, atol=options.atol,
-    )  # fmt: skip
-
-
-def settling_table(ds: xr.Dataset) -> Table:
-    """Table of the bounded sets."""
-    from pipeline.analysis import tables
-
-    rows = tables.settling_rows(ds)
-    return Table(rows, tables.settling_lines(ds, rows))
+    return lifetimes(run.cube(), found, options)

@@ -8,7 +8,6 @@ import xarray as xr
 
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.basins import BasinOptions
-from pipeline.products.product import Table
 
 if TYPE_CHECKING:
     from pipeline.store.run import Run
@@ -28,11 +27,3 @@ def basins(run: Any, options: BasinOptions) -> xr.Dataset:
     shared = options.part(AttractorOptions)
     own = {name: value for name, value in options.plain().items() if name not in shared}
     return compute(run.cube(), run.derive("attractors", **shared), **own)
-
-
-def basins_table(ds: xr.Dataset) -> Table:
-    """Table of the fractions, and lines of the boundaries' numbers."""
-    from pipeline.analysis import tables
-
-    rows = tables.basin_rows(ds)
-    return Table(rows, tables.basin_lines(ds, rows))

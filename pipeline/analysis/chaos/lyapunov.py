@@ -19,8 +19,10 @@ from pipeline.products.lyapunov import LyapunovFlag
 
 Floats = npt.NDArray[np.float64]
 
-GOOD = int(LyapunovFlag.GOOD)
-"""Value of `lyapunov_flag` without objection."""
+GOOD, UNRESOLVED, FAILED = LyapunovFlag.GOOD, LyapunovFlag.UNRESOLVED, LyapunovFlag.FAILED
+
+FEWEST_BLOCKS = 12
+"""Blocks from which a transient can be told: three in each quarter, so that they have errors."""
 
 
 class Motion(IntEnum):
@@ -58,7 +60,13 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
         ``motion``
             Codes of `Motion`: chaotic if the largest exponent is positive, hyperchaotic if the second
             is too, regular if the largest is negative (or the orbit closed), undecided in between. A
-            continuous quasi-periodic motion, whose largest exponent of the section map is 0, is undecided.
+            continuous quasi-periodic motion, whose largest exponent of the section map is 0, is undecided,
+            and so is a cell that closed and yet has a positive exponent.
+        ``contradicts``
+            1 for such a cell: its sections closed within the run's tolerance, on an unstable orbit or by
+            chance, and its neighbours leave it. Else 0.
+        ``is_transient``
+            See `transients`.
         ``drift``
             Largest exponent of the later half of the blocks minus that of the earlier [1/s], and
             ``drift_sigma``, the same in standard errors: a transient that ends within the blocks shows as a
@@ -82,7 +90,8 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
             "lyapunov_per_period": (rate / frequency).transpose(*rate.dims),
             "lyapunov_per_period_stderr": (error / frequency).transpose(*rate.dims),
             "lyapunov_running": _running(ds["lyapunov_blocks"]),
-            "motion": _motion(ds, n_sigma, least),
+            **_motion(ds, n_sigma, least),
+            "is_transient": transients(ds, n_sigma=n_sigma, least=least),
             **_drift(ds["lyapunov_blocks"]),
             "audit": _audit(ds),
         }
@@ -96,28 +105,80 @@ def _running(blocks: xr.DataArray) -> xr.DataArray:
     return mean.assign_attrs(units="1/s", long_name="mean growth rate up to this block")
 
 
-def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> xr.DataArray:
+def is_closed(ds: xr.Dataset) -> xr.DataArray:
+    """Cells whose sections closed."""
+    return (ds["status"] == PERIODIC) | (ds["orbit_period"] > 0)
+
+
+def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> dict[str, xr.DataArray]:
     margin = np.maximum(n_sigma * ds["lyapunov_stderr"], least)
     rate = ds["lyapunov"]
     sign = (rate > margin).astype(np.int8) - (rate < -margin).astype(np.int8)
     first = sign.isel(exponent=0, drop=True)
+    closed = is_closed(ds)
+    known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != FAILED)
     motion = xr.full_like(ds["lyapunov_flag"], Motion.UNDECIDED)
-    closed = (ds["status"] == PERIODIC) | (ds["orbit_period"] > 0)
-    motion = motion.where(~((first < 0) | closed), np.int8(Motion.REGULAR))
+    motion = motion.where(~((first < 0) | (closed & (first <= 0))), np.int8(Motion.REGULAR))
     motion = motion.where(~((first > 0) & ~closed), np.int8(Motion.CHAOTIC))
     if ds.sizes["exponent"] > 1:
         second = sign.isel(exponent=1, drop=True)
         resolved = ds["lyapunov_flag"] != LyapunovFlag.UNRESOLVED
         hyper = (first > 0) & (second > 0) & resolved & ~closed
         motion = motion.where(~hyper, np.int8(Motion.HYPERCHAOTIC))
-    known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != LyapunovFlag.FAILED)
     motion = motion.where(known, np.int8(Motion.UNKNOWN))
-    return motion.assign_attrs(
-        units="1",
-        long_name="kind of motion by its exponents",
-        flag_values=np.array(list(Motion), np.int8),
-        flag_meanings=" ".join(m.name.lower() for m in Motion),
-    )
+    contradicts = (known & closed & (first > 0)).astype(np.int8)
+    about = {"units": "1", "long_name": "closed, and yet with a positive exponent"}
+    return {
+        "motion": motion.assign_attrs(motion_attrs()),
+        "contradicts": contradicts.assign_attrs(about, flag_values=np.arange(2, dtype=np.int8),
+                                                flag_meanings="no yes"),
+    }  # fmt: skip
+
+
+def motion_attrs() -> dict[str, Any]:
+    """Attributes of an array of codes of `Motion`."""
+    return {
+        "units": "1", "long_name": "kind of motion by its exponents",
+        "flag_values": np.array(list(Motion), np.int8),
+        "flag_meanings": " ".join(m.name.lower() for m in Motion),
+    }  # fmt: skip
+
+
+def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
+    """Say which cells' chaos ended within the blocks of their exponents.
+
+    Returns
+    -------
+    DataArray of int8
+        1 if the mean of the largest exponent is above `least` over the first quarter of the blocks, below
+        ``-least`` over the last, and the two differ by `n_sigma` standard errors. 0 if not, or if the chaos
+        ended in the last quarter or early in the first; -1 if unknown (fewer than 12 blocks, or no
+        exponents).
+    """
+    known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != FAILED)
+    first = ds["lyapunov_blocks"].isel(exponent=0, drop=True)
+    attrs = {
+        "units": "1", "long_name": "the chaos ended within the blocks",
+        "flag_values": np.arange(-1, 2, dtype=np.int8), "flag_meanings": "unknown no yes",
+    }  # fmt: skip
+    quarter = first.sizes["block"] // 4
+    if first.sizes["block"] < FEWEST_BLOCKS:
+        return xr.full_like(known, -1, dtype=np.int8).assign_attrs(attrs)
+    early, late = first.isel(block=slice(quarter)), first.isel(block=slice(-quarter, None))
+    before, after = early.mean("block"), late.mean("block")
+    error = np.sqrt((early.var("block", ddof=1) + late.var("block", ddof=1)) / quarter)
+    # not each by its own error: the blocks of an orbit with complex multipliers swing widely
+    ended = (before > least) & (after < -least) & (before - after > n_sigma * error)
+    return ended.astype(np.int8).where(known, np.int8(-1)).assign_attrs(attrs)
+
+
+def on_attractor(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
+    """Cells of which the largest exponent says something of what they ended on.
+
+    Those without objection, those of which the first exponent alone is resolved, and no transients.
+    """
+    resolved = ds["lyapunov_flag"].isin((GOOD, UNRESOLVED))
+    return resolved & (transients(ds, n_sigma=n_sigma, least=least) != 1)
 
 
 def _drift(blocks: xr.DataArray) -> dict[str, xr.DataArray]:

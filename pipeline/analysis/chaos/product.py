@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from pipeline.products.attractors import AttractorOptions
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
-from pipeline.products.product import Table
 
 if TYPE_CHECKING:
     from pipeline.store.run import Run
@@ -17,29 +17,21 @@ def needs_chaos(run: Run, options: ChaosOptions) -> None:
     """Refuse a cube that has neither exponents nor sections enough."""
     from pipeline.analysis.chaos.chaos import check_chaos
 
-    check_chaos(run.cube(), **options.plain())
+    check_chaos(run.cube(), options)
 
 
-def chaos(run: Run, options: ChaosOptions) -> xr.Dataset:
-    """Exponents, dimension and 0-1 test of the cells, and their means by kind of motion."""
+def chaos(run: Any, options: ChaosOptions) -> xr.Dataset:
+    """Exponents, dimensions and 0-1 test of the cells and of each attractor."""
     from pipeline.analysis.chaos.chaos import chaos as compute
 
-    return compute(run.cube(), **options.plain())
-
-
-def chaos_table(ds: xr.Dataset) -> Table:
-    """Table of the kinds of motion."""
-    from pipeline.analysis import tables
-
-    rows = tables.chaos_rows(ds)
-    return Table(rows, tables.chaos_lines(ds, rows))
+    return compute(run.cube(), run.derive("attractors", **options.part(AttractorOptions)), options)
 
 
 def needs_dimension(run: Run, options: DimensionOptions) -> None:
     """Refuse axes and values that the cube does not have."""
-    from pipeline.analysis.chaos.chaos import check_dimension
+    from pipeline.analysis.selection import select_points
 
-    check_dimension(run.cube(), **options.plain())
+    select_points(run.cube(), options.at)
 
 
 def settle_dimension(run: Run, options: DimensionOptions) -> DimensionOptions:
@@ -50,16 +42,8 @@ def settle_dimension(run: Run, options: DimensionOptions) -> DimensionOptions:
     return options.model_copy(update={"at": {name: float(part[name].values[0]) for name in options.at}})
 
 
-def dimension(run: Run, options: DimensionOptions) -> xr.Dataset:
-    """Correlation dimension of the chaotic sections of each parameter point."""
-    from pipeline.analysis.chaos.chaos import section_dimension
+def dimension(run: Any, options: DimensionOptions) -> xr.Dataset:
+    """Correlation dimension of each bounded set that stays."""
+    from pipeline.analysis.chaos.staying import section_dimension
 
-    return section_dimension(run.cube(), **options.plain())
-
-
-def dimension_table(ds: xr.Dataset) -> Table:
-    """Table of the dimensions."""
-    from pipeline.analysis import tables
-
-    rows = tables.dimension_rows(ds)
-    return Table(rows, tables.dimension_lines(ds, rows))
+    return section_dimension(run.cube(), run.derive("attractors", **options.part(AttractorOptions)), options)

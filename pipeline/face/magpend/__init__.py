@@ -38,9 +38,8 @@ _HOMES = {
     "pipeline.runs.zoom": ("zoom",),
     "pipeline.runs.derive": ("derive", "prune"),
     "pipeline.runs.drawing": ("figure",),
-    "pipeline.analysis.chaos.indicators": (
-        "correlation_dimension", "kaplan_yorke_dimension", "zero_one_test",
-    ),
+    "pipeline.analysis.chaos.dimensions": ("correlation_dimension", "kaplan_yorke_dimension"),
+    "pipeline.analysis.chaos.zero_one": ("zero_one_test",),
     "pipeline.analysis.chaos.lyapunov": ("spectrum_of_jacobians",),
 }  # fmt: skip
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
@@ -84,10 +83,10 @@ def __getattr__(name: str) -> Any:
         return metadata.version("magpend")
     if name in _HOME_OF:
         value = getattr(import_module(_HOME_OF[name]), name)
-    elif name.startswith(("plot_", "save_")):
-        value = getattr(import_module("pipeline.plots"), name)
     elif not name.startswith("_") and name in _analyses():
         value = _analysis(name)
+    elif not name.startswith("_") and name in _plots():
+        value = getattr(import_module("pipeline.plots"), name)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value

@@ -341,7 +341,7 @@ def test_check_system__is_asked_by_trajectory(monkeypatch):
     asked = []
     module = importlib.import_module("magpend_core.trajectory")
     monkeypatch.setattr(module, "check_system", lambda *a: asked.append(a[0].name))
-    trajectory(load_preset(), 2.2, [0.1, 0.0, 0.0, 0.0], np.array([0.0]))
+    trajectory(load_preset(), 2.2, [0.1, 0.0, 0.0, 0.0], np.empty(0))
     assert asked == ["pendulum_fitted"]
 
 

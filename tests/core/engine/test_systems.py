@@ -1,14 +1,16 @@
 """The engine on another system: published points of linear and Duffing oscillators."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from magpend_core import Status, lyapunov_exponents, polish_orbits, run_branches
+from magpend_core.engine.entry import integrate
 from magpend_core.engine.jit import CACHE_FOLDER, inline, is_covered
 from magpend_core.engine.lanes import engine_of
-from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.observers import RECORD_LAST, Observer
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.engine.vecmath import TWO_PI, sincos
@@ -147,6 +149,15 @@ def test_system__fills_in_what_is_left_out():
     assert hash(dataclasses.replace(RELAXATION)) == hash(RELAXATION)
 
 
+def test_system__takes_lists_and_whole_numbers(duffing):
+    listed = dataclasses.replace(
+        duffing, state_names=["x", "v"], is_angle=[0, np.False_], scales=np.array([1, 1]), escape=[1000, 1000]
+    )
+    assert listed == duffing
+    assert hash(listed) == hash(duffing)
+    assert listed.label == duffing.label
+
+
 def test_one_state__section_multiplier_and_exponent_are_the_closed_forms():
     rate, omega = 0.5, 1.0
     packed, frequency = np.array([[rate]] * 2), np.full(2, UNIT_FREQUENCY)
@@ -199,3 +210,35 @@ def test_one_state__that_is_left_unbounded_fails_by_a_status():
         n_keep=1, rtol=1e-6, atol=1e-6,
     )  # fmt: skip
     assert result.status.item() == Status.DIVERGED
+
+
+# ---- an observer of one's own ------------------------------------------------------------------------
+
+
+class _Count(NamedTuple):
+    n: int
+
+
+def _count_positive(section, turns, i_period, memory, record, measures, settings):
+    measures[0] += section[0] > LEVEL  # noqa: F821
+    return BOUNDED if i_period == settings.n else PENDING  # noqa: F821
+
+
+@inline
+def _no_memory(settings, n_states):
+    return 0
+
+
+def test_observer__of_ones_own(duffing):
+    codes = {"PENDING": int(Status.PENDING), "BOUNDED": int(Status.BOUNDED), "LEVEL": 0.0}
+    observer = Observer("count_positive", _count_positive, _no_memory, codes)
+    # two wells: the attractors of the two starts lie on either side of 0
+    cells = integrate(
+        duffing, observer, _Count(7), parameters=np.tile([0.15, -1.0, 1.0, 0.2], (2, 1, 1)),
+        frequency_hz=np.full((2, 1), UNIT_FREQUENCY), initial_states=np.array([[-0.8, 0.0], [1.2, 0.0]]),
+        n_keep=0, n_measures=1, rtol=1e-7, atol=1e-7, max_steps_per_period=20_000,
+    )  # fmt: skip
+    assert cells.measures.ravel().tolist() == [0.0, 7.0]
+    assert cells.n_periods.ravel().tolist() == [7, 7]
+    assert (cells.status == Status.BOUNDED).all()
+    assert cells.section.shape == (2, 1, 0, 2)

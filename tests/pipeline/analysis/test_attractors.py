@@ -13,9 +13,9 @@ from magpend_core import load_preset, sections
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import sincos
+from magpend_core.models.pendulum.sides import Side
 from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.attractors import identify, match
-from pipeline.analysis.sides import Side
 
 ORBITS = json.loads((Path(__file__).parents[2] / "core" / "data" / "orbits.json").read_text("utf-8"))
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]

@@ -8,7 +8,9 @@ import xarray as xr
 
 from magpend_core import load_preset, sections
 from pipeline.analysis.attractors.attractors import identify
-from pipeline.analysis.attractors.orbits import CLOSED, RUN_ON, UNDECIDED, Block, Orbit, decide
+from pipeline.analysis.attractors.cells import Block
+from pipeline.analysis.attractors.deciding import CLOSED, RUN_ON, UNDECIDED, decide
+from pipeline.analysis.attractors.orbits import Orbit
 from pipeline.analysis.sets import Geometry
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]

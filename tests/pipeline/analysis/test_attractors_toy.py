@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.attractors.attractors import Rule, hysteresis, identify, match
+from pipeline.analysis.attractors.attractors import hysteresis, identify, match
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 K = 16
@@ -102,14 +102,13 @@ def test_identify__shuffled_cells_keep_their_ids(seed):
     cells += [on(A, noise=1e-6, rng=rng) for _ in range(20)]
     cells += [(cloud([1.5, s, 0, 0], rng), BOUNDED, 0, (0, 0)) for s in (1, -1) for _ in range(40)]
     ds = cube(cells)
-    rule = Rule(n_anchors=12)
     order = np.random.default_rng(seed).permutation(len(cells))
-    plain = identify(ds, polish=False, rule=rule)
-    shuffled = identify(ds.isel(initial_condition=order), polish=False, rule=rule)
+    plain = identify(ds, polish=False, rule_n_anchors=12)
+    shuffled = identify(ds.isel(initial_condition=order), polish=False, rule_n_anchors=12)
     assert np.array_equal(shuffled["attractor_id"].values, plain["attractor_id"].values[order])
     for name in ("attractor_points", "rotation", "state_min", "n_cells"):
         assert np.array_equal(shuffled[name].values, plain[name].values, equal_nan=True), name
-    blocks = identify(ds, polish=False, rule=rule, block_bytes=10 * K * 4 * 8)
+    blocks = identify(ds, polish=False, rule_n_anchors=12, block_bytes=10 * K * 4 * 8)
     assert np.array_equal(blocks["attractor_id"].values, plain["attractor_id"].values)
     assert np.array_equal(blocks["attractor_points"].values, plain["attractor_points"].values, equal_nan=True)
 
@@ -146,7 +145,7 @@ def test_identify__many_cells_few_anchors():
     rng = np.random.default_rng(3)
     cells = [(cloud([0, 0, 0, 0], rng), BOUNDED, 0, (0, 0)) for _ in range(200)]
     cells += [(cloud([2, 2, 0, 0], rng), BOUNDED, 0, (0, 0)) for _ in range(2)]
-    found = identify(cube(cells), polish=False, rule=Rule(n_anchors=20))
+    found = identify(cube(cells), polish=False, rule_n_anchors=20)
     assert sorted(found["n_cells"].values.tolist()) == [2, 200]
 
 
@@ -337,12 +336,10 @@ def test_identify__largest_exponent_of_bounded_sets_is_that_of_their_good_cells(
         },
         coords={"state": ["psi1", "psi2", "psi1_dot", "psi2_dot"], "frequency": 2.0},
     )
-    found = identify(ds, polish=False, rule=Rule(box=0.5))
+    found = identify(ds, polish=False, rule_box=0.5)
     assert found["attractor_id"].values.tolist() == [0, 0, 0, 1, 1, 1]
     assert found["lyapunov_max"].values == pytest.approx([0.2, 0.6])
-    assert np.isnan(
-        identify(ds.drop_vars("lyapunov"), polish=False, rule=Rule(box=0.5))["lyapunov_max"]
-    ).all()
+    assert np.isnan(identify(ds.drop_vars("lyapunov"), polish=False, rule_box=0.5)["lyapunov_max"]).all()
 
 
 @pytest.mark.parametrize(

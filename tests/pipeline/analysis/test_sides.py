@@ -1,4 +1,4 @@
-"""The rule that tells sides from sections."""
+"""What a model's classifier says of a cube's cells, by the parameters of the run."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.sides import Side, magnet_offset, side
+from magpend_core.models import load_model
+from magpend_core.models.pendulum.sides import Side, magnet_offset
+from pipeline.analysis.sides import classify
 
+PENDULUM = load_model("pendulum").load()
+ABOUT = {"model": "pendulum", "parameters": "\n".join(f"{k} = {v!r}" for k, v in PENDULUM.items())}
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 
 # Period-1 orbits of the preset, one section point each: frequency [Hz], side, state. The points were
@@ -32,6 +36,7 @@ def cells(sections, *, frequency=2.2, status=1, turns=None):
             "status": ("initial_condition", np.broadcast_to(np.int8(status), n).copy()),
         },
         coords={"state": STATES, "frequency": frequency},
+        attrs=ABOUT,
     )
     if turns is not None:
         ds["turns"] = (("initial_condition", "link"), np.asarray(turns, dtype=np.int32))
@@ -39,18 +44,18 @@ def cells(sections, *, frequency=2.2, status=1, turns=None):
 
 
 @pytest.mark.parametrize(("frequency", "expected", "state"), ORBITS)
-def test_side__reference_orbits(frequency, expected, state):
-    assert side(cells([[state] * 3], frequency=frequency)).item() == expected
+def test_classify__reference_orbits(frequency, expected, state):
+    assert classify(cells([[state] * 3], frequency=frequency)).item() == expected
 
 
-def test_side__classes():
+def test_classify__classes():
     sections = [
         [[-0.1, -0.1], [-0.2, 0.1]],
         [[0.1, 0.1], [-0.1, 0.3]],
         [[0.1, 0.1], [-0.1, -0.1]],
         [[0.1, 0.1], [0.1, 0.1]],
     ]
-    label = side(cells(sections, turns=[[0, 0], [0, 0], [0, 0], [0, -3]]))
+    label = classify(cells(sections, turns=[[0, 0], [0, 0], [0, 0], [0, -3]]))
     assert label.values.tolist() == [Side.LEFT, Side.RIGHT, Side.STRADDLING, Side.ROTATING]
     assert label.dtype == np.int8
     meanings = label.attrs["flag_meanings"].split()
@@ -59,50 +64,83 @@ def test_side__classes():
 
 
 @pytest.mark.parametrize("status", [0, 3, 4, 5, 6])
-def test_side__nothing_to_judge(status):
-    assert side(cells([[[0.1, 0.1]]], status=status)).item() == Side.UNKNOWN
+def test_classify__nothing_to_judge(status):
+    assert classify(cells([[[0.1, 0.1]]], status=status)).item() == Side.UNKNOWN
 
 
-def test_side__inferred_cell_is_judged_like_the_one_it_stands_for():
+def test_classify__inferred_cell_is_judged_like_the_one_it_stands_for():
     for section in ([0.1, 0.1], [-0.1, -0.1]):
-        assert side(cells([[section]], status=7)).item() == side(cells([[section]])).item() != Side.UNKNOWN
+        assert (
+            classify(cells([[section]], status=7)).item()
+            == classify(cells([[section]])).item()
+            != Side.UNKNOWN
+        )
 
 
-def test_side__nan_section_is_unknown():
-    assert side(cells([[[0.1, 0.1], [np.nan, 0.1]]])).item() == Side.UNKNOWN
+def test_classify__nan_section_is_unknown():
+    assert classify(cells([[[0.1, 0.1], [np.nan, 0.1]]])).item() == Side.UNKNOWN
 
 
-def test_side__slow_drive_is_undecided():
+def test_classify__slow_drive_is_undecided():
     sections = [[[0.1, 0.1], [0.1, 0.1]], [[0.1, 0.1], [-0.1, -0.1]], [[0.1, 0.1], [0.1, 0.1]]]
     ds = cells(sections, frequency=0.5, turns=[[0, 0], [0, 0], [1, 0]])
-    assert side(ds).values.tolist() == [Side.UNDECIDED, Side.STRADDLING, Side.ROTATING]
-    assert side(ds, slowest_hz=0.4).values[0] == Side.RIGHT
-    assert side(ds.drop_vars("frequency").assign_attrs(frequency_hz=0.5)).values[0] == Side.UNDECIDED
-    assert side(ds.drop_vars("frequency")).values[0] == Side.RIGHT
+    assert classify(ds).values.tolist() == [Side.UNDECIDED, Side.STRADDLING, Side.ROTATING]
+    assert classify(ds.drop_vars("frequency").assign_attrs(frequency_hz=0.5)).values[0] == Side.UNDECIDED
+    assert classify(ds.drop_vars("frequency")).values[0] == Side.RIGHT
 
 
-def test_side__mirror_image():
+def test_classify__mirror_image():
     rng = np.random.default_rng(3)
     ds = cells(rng.normal(0.1, 0.1, (60, 3, 2)))
-    mirrored = side(ds.assign(section=-ds["section"])).values
+    mirrored = classify(ds.assign(section=-ds["section"])).values
     swap = np.array([Side.UNKNOWN, Side.RIGHT, Side.LEFT, Side.STRADDLING])
     assert set(swap) > set(mirrored) - {Side.STRADDLING}
-    np.testing.assert_array_equal(swap[mirrored], side(ds).values)
+    np.testing.assert_array_equal(swap[mirrored], classify(ds).values)
 
 
-def test_side__whole_turns_do_not_matter():
+def test_classify__whole_turns_do_not_matter():
     ds = cells([[[0.1, 0.1]], [[-0.1, 0.0]]])
     shifted = ds["section"] + xr.DataArray([2 * np.pi, -2 * np.pi, 0.0, 0.0], dims="state")
-    np.testing.assert_array_equal(side(ds.assign(section=shifted)), side(ds))
+    np.testing.assert_array_equal(classify(ds.assign(section=shifted)), classify(ds))
 
 
-def test_side__lazy_cube_stays_lazy():
+def test_classify__lazy_cube_stays_lazy():
     ds = cells([[[0.1, 0.1]], [[-0.1, 0.0]]], turns=[[0, 0], [0, 0]])
-    label = side(ds.chunk(initial_condition=1))
+    label = classify(ds.chunk(initial_condition=1))
     assert label.chunks is not None
-    np.testing.assert_array_equal(label.compute(), side(ds))
+    np.testing.assert_array_equal(label.compute(), classify(ds))
+
+
+def test_classify__arm_lengths_of_the_run():
+    """With a second link twice as long as the preset's, psi2 decides."""
+    ds = cells([[[0.2, -0.15, 0, 0]]])
+    assert classify(ds).item() == Side.RIGHT
+    long = PENDULUM.replace(l2=2 * PENDULUM["l2"])
+    told = ds.assign_attrs(parameters="\n".join(f"{k} = {v!r}" for k, v in long.items()))
+    assert classify(told).item() == classify(ds, parameters=long).item() == Side.LEFT
+
+
+@pytest.mark.parametrize("lazy", [False, True])
+def test_classify__swept_arm_length(lazy):
+    ds = cells([[[0.2, -0.15, 0, 0]], [[0.2, 0.15, 0, 0]]])
+    swept = ds.expand_dims(l2=[PENDULUM["l2"], 2 * PENDULUM["l2"]]).transpose("initial_condition", "l2", ...)
+    label = classify(swept.chunk(l2=1) if lazy else swept)
+    assert label.dims == ("initial_condition", "l2")
+    assert (label.chunks is not None) == lazy
+    assert label.values.tolist() == [[Side.RIGHT, Side.LEFT], [Side.RIGHT, Side.RIGHT]]
+    assert classify(swept.isel(l2=1)).values.tolist() == [Side.LEFT, Side.RIGHT]
+
+
+def test_classify__heavier_links_are_slower():
+    """The frequency below which a side is undecided follows from the run's own links."""
+    ds = cells([[[0.1, 0.1, 0, 0]]], frequency=1.0)
+    assert classify(ds).item() == Side.RIGHT
+    assert classify(ds, parameters=PENDULUM.replace(g=20.0)).item() == Side.UNDECIDED
+
+
+def test_classify__model_without_a_classifier():
+    assert classify(cells([[[0.1, 0.1]]]).assign_attrs(model="duffing")) is None
 
 
 def test_magnet_offset__arms():
-    section = cells([[[np.pi / 2, -np.pi / 6]]])["section"]
-    assert magnet_offset(section, (2.0, 1.0)).item() == pytest.approx(1.5)
+    assert magnet_offset(np.array([np.pi / 2, -np.pi / 6]), {"l1": 2.0, "l2": 1.0}) == pytest.approx(1.5)

@@ -60,8 +60,12 @@ def test_configure__quiet_verbose_and_log(capsys, tmp_path):
 def test_work__says_how_far_and_how_long():
     work = Work("polishing orbits", started=0.0)
     assert work.line(3.0) == "polishing orbits: 3.0 s so far"
-    work.done, work.total = 5.0, 20.0
+    work.total, work.expected_s = 20.0, 60.0
+    assert work.line(10.0) == "polishing orbits: 0 of 20 (0 %), about 50 s left"
+    work.done, work.heard = 5.0, 10.0
     assert work.line(10.0) == "polishing orbits: 5 of 20 (25 %), 30 s left"
+    assert work.line(25.0) == "polishing orbits: 5 of 20 (25 %), 15 s left"
+    assert work.line(50.0) == "polishing orbits: 5 of 20 (25 %), 50 s so far"
     work.done = 20.0
     assert work.line(40.0) == "polishing orbits: 20 of 20 (100 %)"
 
@@ -78,7 +82,7 @@ def test_track__reports_each_item():
     with reporting(lambda *said: heard.append(said)):
         assert list(track([7, 8], "work")) == [7, 8]
         report("more", 1, 3)
-    assert heard == [("work", 0, 2), ("work", 1, 2), ("work", 2, 2), ("more", 1, 3)]
+    assert [said[:3] for said in heard] == [("work", 0, 2), ("work", 1, 2), ("work", 2, 2), ("more", 1, 3)]
     report("nobody listens", 0, 1)
     assert len(heard) == 4
 
@@ -143,6 +147,40 @@ def test_help__keeps_square_brackets_units_bounds_and_defaults(main):
 
 def test_completion__is_offered(main):
     assert "--install-completion" in main("--help")[1]
+
+
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("magpend analyse hy", "hysteresis"),
+        ("magpend plot ga", "gallery"),
+        ("magpend analyse basins --metric ch", "chessboard"),
+        ("magpend run quick", "quickstart"),
+        ("magpend models duff", "duffing"),
+    ],
+)
+def test_completion__completes_names(environment, line, word):
+    code = "import sys; sys.argv[0] = 'magpend'; from pipeline.cli.main import main; main()"
+    asked = {
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split()) - 1),
+        "_MAGPEND_COMPLETE": "complete_bash",
+    }
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**environment, **asked},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.stdout.split() == [word]
+
+
+def test_default_model__is_that_of_the_models():
+    from magpend_core.models import DEFAULT
+    from pipeline.cli import models
+
+    assert models.DEFAULT == DEFAULT
 
 
 def test_models__lists_states_parameters_and_presets(main):

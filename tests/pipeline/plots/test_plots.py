@@ -12,9 +12,20 @@ import xarray as xr
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from pipeline.plots import bifurcation, plot_bifurcation, plot_trajectory, save_figure, style
+from magpend_core.models import load_model
+from pipeline.plots import (
+    labels,
+    pixels,
+    plot_bifurcation,
+    plot_trajectory,
+    points,
+    save_figure,
+    style,
+)
 
+SYMBOLS = {s.name: f"${s.symbol}$" for s in load_model("pendulum").states}
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+PARAMETERS = "\n".join(f"{k} = {v!r}" for k, v in load_model("pendulum").load().as_dict().items())
 PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED = range(7)
 
 
@@ -43,6 +54,7 @@ def make_cube(n_frequencies=5, n_keep=3):
             "state": STATES,
             "direction": ("branch", ["up", "up", "down", "down"]),
         },
+        attrs={"parameters": PARAMETERS},
     )
 
 
@@ -83,11 +95,11 @@ def gids(fig):
 def test_status_codes_are_those_of_the_kernel():
     from magpend_core.status import Status
 
-    assert {Status.PERIODIC, Status.BOUNDED, Status.INFERRED} == set(bifurcation._DRAWN)
-    absent = [code for codes in bifurcation._ABSENT.values() for code in codes]
-    assert sorted([*bifurcation._DRAWN, *absent]) == sorted(Status)
-    assert bifurcation._ABSENT["pending"] == (Status.PENDING,)
-    assert bifurcation._ABSENT["not reached"] == (Status.UNREACHED,)
+    assert {Status.PERIODIC, Status.BOUNDED, Status.INFERRED} == set(points.DRAWN)
+    absent = [code for codes in points.ABSENT.values() for code in codes]
+    assert sorted([*points.DRAWN, *absent]) == sorted(Status)
+    assert points.ABSENT["pending"] == (Status.PENDING,)
+    assert points.ABSENT["not reached"] == (Status.UNREACHED,)
 
 
 def test_plot_bifurcation__each_class_has_its_points():
@@ -103,7 +115,7 @@ def test_plot_bifurcation__colours_and_legend():
     colours = {line.get_gid(): to_rgb(line.get_color()) for line in fig.axes[0].get_lines()}
     assert colours["points:up:left"] == to_rgb(style.BLUE)
     assert colours["points:up:right"] == to_rgb(style.VERMILLION)
-    assert colours["points:down:rotating"] == bifurcation._tinted(style.PURPLE, bifurcation._TINT)
+    assert colours["points:down:rotating"] == style.tinted(style.PURPLE, pixels.TINT)
     assert legend_labels(fig) == ["left", "right", "straddling", "rotating", "up", "down"]
 
 
@@ -117,8 +129,8 @@ def test_plot_bifurcation__state_and_degrees(state):
         np.testing.assert_allclose(drawn(radians)["up:right"], want)
         np.testing.assert_allclose(drawn(degrees)["up:right"], want * [1.0, 180.0 / np.pi])
     unit = "/s]" if state.endswith("_dot") else "]"
-    assert radians.axes[0].get_ylabel() == f"{style.STATE_SYMBOLS[state]} [rad{unit}"
-    assert degrees.axes[0].get_ylabel() == f"{style.STATE_SYMBOLS[state]} [deg{unit}"
+    assert radians.axes[0].get_ylabel() == f"{SYMBOLS[state]} [rad{unit}"
+    assert degrees.axes[0].get_ylabel() == f"{SYMBOLS[state]} [deg{unit}"
     assert radians.axes[0].get_xlabel() == "drive frequency [Hz]"
 
 
@@ -128,7 +140,7 @@ def test_plot_bifurcation__side_by_side():
     assert sorted(drawn(fig, 0)) == ["up:left", "up:right"]
     assert sorted(drawn(fig, 1)) == ["down:rotating", "down:straddling"]
     assert fig.axes[0].get_ylim() == fig.axes[1].get_ylim()
-    assert [ax.texts[0].get_text() for ax in fig.axes] == ["up", "down"]
+    assert [ax.texts[-1].get_text() for ax in fig.axes] == ["up", "down"]
     assert not {"up", "down"} & set(legend_labels(fig))
 
 
@@ -175,17 +187,17 @@ def test_plot_bifurcation__empty_cube_says_so():
     assert [t.get_text() for t in fig.axes[0].texts] == ["nothing to draw yet: all 20 cells are pending"]
     ds["status"][0] = DIVERGED
     fig = plot_bifurcation(ds, layout="side")
-    assert fig.axes[0].texts[-1].get_text() == "nothing to draw: of 20 cells, 15 pending, 5 failed"
+    assert fig.axes[0].texts[0].get_text() == "nothing to draw: of 20 cells, 15 pending, 5 failed"
 
 
 def test_plot_bifurcation__sweep_pools_initial_conditions():
     ds = make_cube().drop_vars("direction").rename(branch="initial_condition")
     found = drawn(plot_bifurcation(ds))
-    assert sorted(found) == [":left", ":right", ":rotating", ":straddling"]
-    np.testing.assert_allclose(found[":left"], expected(ds, 0))
+    assert sorted(found) == ["left", "right", "rotating", "straddling"]
+    np.testing.assert_allclose(found["left"], expected(ds, 0))
     grid = ds.isel(initial_condition=[0, 1]).rename(initial_condition="psi1_0")
     grid = xr.concat([grid, grid], "psi2_0").transpose("frequency", "psi1_0", "psi2_0", ...)
-    assert sorted(drawn(plot_bifurcation(grid))) == [":left", ":right"]
+    assert sorted(drawn(plot_bifurcation(grid))) == ["left", "right"]
 
 
 def test_plot_bifurcation__other_parameter():
@@ -204,7 +216,7 @@ def test_plot_bifurcation__falling_parameter():
 
 def test_plot_bifurcation__two_parameters_are_refused():
     ds = xr.concat([make_cube(), make_cube()], xr.DataArray([1.0, 1.5], dims="q", name="q"))
-    with pytest.raises(ValueError, match=r"frequency.*for instance ds\.sel\(q=1\.0\)"):
+    with pytest.raises(ValueError, match=r"frequency.*such as --at q=1"):
         plot_bifurcation(ds.transpose("branch", "frequency", "q", ...))
     plot_bifurcation(ds.sel(q=1.5))
 
@@ -235,7 +247,7 @@ def test_plot_bifurcation__side_by_side_needs_both_directions():
 def test_plot_bifurcation__blocks_do_not_matter(chunks, block_values, monkeypatch):
     ds = set_status(make_cube(), 3, 1, DIVERGED)
     want = drawn(plot_bifurcation(ds))
-    monkeypatch.setattr(bifurcation, "_BLOCK_VALUES", block_values)
+    monkeypatch.setattr(points, "BLOCK_VALUES", block_values)
     found = drawn(plot_bifurcation(ds.chunk(chunks)))
     assert sorted(found) == sorted(want)
     for kind in want:
@@ -243,10 +255,10 @@ def test_plot_bifurcation__blocks_do_not_matter(chunks, block_values, monkeypatc
 
 
 def test_plot_bifurcation__blocks_are_bounded_and_tile_the_cube(monkeypatch):
-    monkeypatch.setattr(bifurcation, "_BLOCK_VALUES", 60)
+    monkeypatch.setattr(points, "BLOCK_VALUES", 60)
     section = make_cube(7).chunk(branch=2)["section"]
     seen = np.zeros((4, 7), int)
-    for selection in bifurcation._selections(section):
+    for selection in points.selections(section):
         part = section.isel(selection)
         assert part.size <= 60
         seen[selection["branch"], selection["frequency"]] += 1
@@ -254,17 +266,17 @@ def test_plot_bifurcation__blocks_are_bounded_and_tile_the_cube(monkeypatch):
 
 
 def test_distinct__leaves_one_of_equal_points():
-    position = np.array([0, 0, 0, 1, 1])
+    position = np.array([0.0, 0.0, 1e-9, 1.0, 1.0])
     value = np.array([0.5, 0.5 + 1e-9, 0.6, 0.5, -0.5])
-    where, height = bifurcation._distinct(position, value, (-1.0, 1.0))
-    assert sorted(zip(where.tolist(), height.round(6).tolist(), strict=True)) == [
+    where, height = pixels.distinct(position, value, (0.0, 1.0), (-1.0, 1.0))
+    assert sorted(zip(where.round(6).tolist(), height.round(6).tolist(), strict=True)) == [
         (0, 0.5),
         (0, 0.6),
         (1, -0.5),
         (1, 0.5),
     ]
     positions, values = np.meshgrid(np.arange(10), np.linspace(-1.0, 1.0, 2000))
-    assert len(bifurcation._distinct(positions.ravel(), values.ravel(), (-1.0, 1.0))[0]) == 20_000
+    assert len(pixels.distinct(positions.ravel(), values.ravel(), (0.0, 9.0), (-1.0, 1.0))[0]) == 20_000
 
 
 def image_of(fig, axes=0):
@@ -288,7 +300,7 @@ def assert_ink(found, colour):
 
 
 def test_plot_bifurcation__image_has_the_same_points(monkeypatch):
-    monkeypatch.setattr(bifurcation, "MARKER_LIMIT", 0)
+    monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
     ds = set_status(make_cube(), 1, 2, PENDING)
     fig = plot_bifurcation(ds, layout="side")
     assert not drawn(fig)
@@ -304,19 +316,19 @@ def test_plot_bifurcation__image_has_the_same_points(monkeypatch):
 
 
 def test_plot_bifurcation__image_shows_up_over_down(monkeypatch):
-    monkeypatch.setattr(bifurcation, "MARKER_LIMIT", 0)
+    monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
     ds = make_cube().isel(branch=[0, 0], period_index=[0])
     ds["direction"] = ("branch", ["up", "down"])
     ds["section"][1, 3, :, :2] -= 0.02
     fig = plot_bifurcation(ds)
-    tint = bifurcation._tinted(style.BLUE, bifurcation._TINT)
+    tint = style.tinted(style.BLUE, pixels.TINT)
     np.testing.assert_allclose(pixel(fig, 2.1, -0.11), to_rgb(style.BLUE), atol=0.01)
     np.testing.assert_allclose(pixel(fig, 2.3, -0.13), to_rgb(style.BLUE), atol=0.01)
     np.testing.assert_allclose(pixel(fig, 2.3, -0.15), tint, atol=0.01)
 
 
 def test_plot_bifurcation__fuller_pixels_are_darker(monkeypatch):
-    monkeypatch.setattr(bifurcation, "MARKER_LIMIT", 0)
+    monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
     ds = make_cube(n_keep=40).isel(branch=[1])
     ds["section"][:, :, :30, :2] = 0.2
     ds["section"][:, :, 30:, :2] = 0.1 + 0.05 * (np.arange(10) % 2)[:, None]
@@ -345,8 +357,8 @@ def test_plots__import_neither_kernels_nor_executor():
 
     code = (
         "import sys, pipeline.plots; "
-        "print([m for m in ('numba', 'magpend_core', 'zarr', 'dask', 'distributed', 'matplotlib.pyplot', "
-        "'pipeline.compute.execute', 'pipeline.store.directory') if m in sys.modules])"
+        "print([m for m in ('numba', 'zarr', 'dask', 'distributed', 'matplotlib.pyplot', "
+        "'pipeline.compute.execute', 'pipeline.store.run') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -366,6 +378,7 @@ def test_plot_bifurcation__many_points_in_little_memory():
             "status": (("branch", "frequency"), np.full((n_branches, n_frequencies), BOUNDED, np.int8)),
         },
         coords={"frequency": np.linspace(2, 3, n_frequencies), "state": STATES},
+        attrs={"parameters": PARAMETERS},
     ).assign_coords(direction=("branch", ["up", "down"] * (n_branches // 2)))
     tracemalloc.start()
     fig = plot_bifurcation(ds)
@@ -419,14 +432,14 @@ def test_plot_trajectory__series_portraits_and_sections():
     found = lines(plot_trajectory(ds))
     for state in STATES:
         np.testing.assert_array_equal(found[f"series:{state}"], np.column_stack([ds["time"], ds[state]]))
-    np.testing.assert_array_equal(found["portrait:psi2"], np.column_stack([ds["psi2"], ds["psi2_dot"]]))
+    np.testing.assert_array_equal(found["orbit:psi2"], np.column_stack([ds["psi2"], ds["psi2_dot"]]))
     np.testing.assert_allclose(found["section:psi1"], [[0.1, 0.0]] * 5, atol=1e-12)
     assert "series:torque" not in found
 
 
 def test_plot_trajectory__torque_panel():
     ds = make_trajectory()
-    fig = plot_trajectory(ds.assign(torque=("time", np.sign(ds["psi1"].values))))
+    fig = plot_trajectory(ds.assign(torque=("time", np.sign(ds["psi1"].values), {"units": "N m"})))
     np.testing.assert_array_equal(lines(fig)["series:torque"][:, 1], np.sign(ds["psi1"]))
     assert "torque [N m]" in [ax.get_ylabel() for ax in fig.axes]
 
@@ -446,7 +459,7 @@ def test_plot_trajectory__rotation_is_drawn_on_the_circle(wrapped):
     shown = (turning + np.pi) % (2 * np.pi) - np.pi if wrapped else turning
     found = lines(plot_trajectory(ds.assign(psi2=("time", shown))))
     np.testing.assert_allclose(found["series:psi2"][:, 1], turning, atol=1e-12)
-    angle = found["portrait:psi2"][:, 0]
+    angle = found["orbit:psi2"][:, 0]
     assert np.nanmax(np.abs(angle)) <= np.pi
     assert np.isnan(angle).sum() == 2
     assert np.nanmax(np.abs(np.diff(angle))) < 0.1
@@ -486,7 +499,7 @@ def test_save_figure__unknown_suffix(tmp_path, name):
 
 def test_save_figure__width(tmp_path):
     data = save_figure(plot_bifurcation(make_cube()), tmp_path / "a.png").read_bytes()
-    assert int.from_bytes(data[16:20], "big") == 1400
+    assert int.from_bytes(data[16:20], "big") == 1401
 
 
 @pytest.mark.parametrize(
@@ -501,4 +514,4 @@ def test_save_figure__width(tmp_path):
     ],
 )
 def test_pi_fraction(value, text):
-    assert style.pi_fraction(value) == text
+    assert labels.pi_fraction(value) == text

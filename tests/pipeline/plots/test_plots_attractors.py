@@ -12,10 +12,12 @@ import pytest
 import xarray as xr
 from matplotlib.colors import to_rgb
 
+from magpend_core.models import load_model
+from magpend_core.models.pendulum.sides import Side
 from magpend_core.status import Status
 from pipeline.analysis.attractors.hysteresis import hysteresis
-from pipeline.analysis.sides import Side
 from pipeline.layout import vocabulary
+from pipeline.layout.letters import letter
 from pipeline.plots import (
     palette,
     plot_basins,
@@ -27,6 +29,8 @@ from pipeline.plots import (
     save_figure,
 )
 
+VALUES = load_model("pendulum").load().as_dict()
+PARAMETERS = "\n".join(f"{k} = {v!r}" for k, v in VALUES.items())
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 PENDING, PERIODIC, BOUNDED, DIVERGED = Status.PENDING, Status.PERIODIC, Status.BOUNDED, Status.DIVERGED
 STEP_LIMIT, INFERRED = Status.STEP_LIMIT, Status.INFERRED
@@ -57,7 +61,7 @@ def make_attractors(ids, dims, coords, n=None, status=None):
             "attractor_points": ((*per, "point", "state"), points),
         },
         coords={"state": STATES, "attractor": np.arange(n, dtype=np.int32), **coords},
-        attrs={"parameters": "q = 1.5"},
+        attrs={"parameters": PARAMETERS},
     )
     return ds if status is None else ds.assign(status=(dims, status))
 
@@ -89,6 +93,11 @@ def colours_of(fig):
     """RGB of the image's cells, shape (psi1, psi2, 3)."""
     (image,) = [im for ax in fig.axes for im in ax.get_images() if im.get_gid() == "basins"]
     return np.swapaxes(image.get_array() / 255.0, 0, 1)
+
+
+def caption_of(fig):
+    """The line above the axes, unfolded."""
+    return " ".join(fig.axes[0].get_title(loc="left").split())
 
 
 def legend_texts(fig):
@@ -188,11 +197,11 @@ def test_plot_basins__selection(grid):
         plot_basins(more, at={"q": 1.0})
     with pytest.raises(ValueError, match=r"frequency = 3 lies off its axis, which runs from 2\.2 to 2\.4"):
         plot_basins(more, at={"frequency": 3.0})
-    fig = plot_basins(more, at={"frequency": 2.39})
+    fig = plot_basins(more, at={"frequency": 2.4})
     np.testing.assert_array_equal(
         fig.data["attractor_id"].transpose(*GRID), more["attractor_id"].isel(frequency=1)
     )
-    assert "$f$ = 2.4 Hz" in [t.get_text() for t in fig.axes[0].texts]
+    assert caption_of(fig) == "$f$ = 2.4 Hz"
 
 
 def test_plot_basins__sample_is_no_grid(grid):
@@ -209,8 +218,8 @@ def test_plot_basins__third_start_axis_must_be_chosen(grid):
     with pytest.raises(ValueError, match=r"3 of the initial states are left.*such as psi1_dot_0=0"):
         plot_basins(more)
     assert plot_basins(more, at={"psi1_dot_0": 1.0}).axes[0].get_xlabel().startswith(r"$\psi_1")
-    assert r"\dot{\psi}_2" not in plot_basins(more, at={"psi2_0": 0.2}).axes[0].get_xlabel()
-    assert plot_basins(more, at={"psi2_0": 0.2}).axes[0].get_ylabel() == r"$\dot{\psi}_1(0)$ [rad/s]"
+    assert r"\dot{\psi}_2" not in plot_basins(more, at={"psi2_0": 0.25}).axes[0].get_xlabel()
+    assert plot_basins(more, at={"psi2_0": 0.25}).axes[0].get_ylabel() == r"$\dot{\psi}_1(0)$ [rad/s]"
 
 
 def test_plot_basins__data_beside_the_figure(grid, tmp_path):
@@ -250,7 +259,7 @@ def test_cast_of__most_cells_have_own_colours_and_selection_changes_none():
     part["kind"][5:] = 0
     assert palette.cast_of(ds, part).colours == cast.colours
     assert palette.cast_of(ds, part).names[20] == "U: absent"
-    assert [palette.letter(i) for i in (0, 25, 26, 51, 52, 701, 702)] == [
+    assert [letter(i) for i in (0, 25, 26, 51, 52, 701, 702)] == [
         "A",
         "Z",
         "AA",
@@ -360,7 +369,7 @@ def test_plot_fractions__other_parameters_must_be_chosen(sweep):
     more = xr.concat([sweep, sweep], "q").assign_coords(q=[1.4, 1.5])
     with pytest.raises(ValueError, match=r"2 are left of q, frequency; .* such as q=1\.4"):
         plot_fractions(more)
-    assert "q = 1.5" in plot_fractions(more, at={"q": 1.5}).axes[0].texts[-1].get_text()
+    assert "q = 1.5" in caption_of(plot_fractions(more, at={"q": 1.5}))
 
 
 def offsets(fig, gid):
@@ -495,12 +504,10 @@ def make_portraits(n, turning=()):
     return xr.Dataset(
         {
             "orbit": (("attractor", "sample", "state"), orbit),
-            "magnet": (("attractor", "sample", "axis"), orbit[..., :2] - [0.0, 0.35]),
             "attractor_points": (("attractor", "point", "state"), orbit[:, :1]),
             "share": ("attractor", 1.0 / (1.0 + np.arange(n)) / 10),
         },
-        coords={"attractor": np.arange(n), "state": STATES, "axis": ["x", "y"], "frequency": 2.2},
-        attrs={"fixed_magnet_y": -0.37},
+        coords={"attractor": np.arange(n), "state": STATES, "frequency": 2.2},
     )
 
 
@@ -514,15 +521,16 @@ def test_plot_gallery__orbits_sections_and_paths():
         np.testing.assert_allclose(lines[f"orbit:{mark}:psi1"].get_xydata(), orbit[:, [0, 2]])
         np.testing.assert_allclose(lines[f"orbit:{mark}:psi2"].get_xydata(), orbit[:, [1, 3]])
         np.testing.assert_allclose(lines[f"section:{mark}:psi2"].get_xydata(), orbit[:1, [1, 3]])
-        np.testing.assert_allclose(lines[f"path:{mark}"].get_xydata(), drawn["magnet"].values[i])
+        path = load_model("pendulum").drawing.points(orbit, VALUES)["magnet"]
+        np.testing.assert_allclose(lines[f"path:{mark}"].get_xydata(), path)
         assert to_rgb(lines[f"path:{mark}"].get_color()) == to_rgb(palette.cast_of(attractors).colours[i])
     # on the circle, broken where it passes pi
     angle = lines["orbit:C:psi2"].get_xdata()
     assert np.nanmin(angle) >= -np.pi
     assert np.nanmax(angle) <= np.pi
     assert np.isnan(angle).sum() == 1
-    magnets = [line for ax in fig.axes for line in ax.get_lines() if line.get_gid() == "fixed_magnet"]
-    assert [m.get_xydata().tolist() for m in magnets] == [[[0.0, -0.37]]] * 3
+    magnets = [line for ax in fig.axes for line in ax.get_lines() if line.get_gid() == "fixed:fixed magnet"]
+    assert [m.get_xydata().tolist() for m in magnets] == [[[0.0, -VALUES["h"]]]] * 3
     titles = [t.get_text().replace("\N{NO-BREAK SPACE}", " ") for ax in fig.axes for t in ax.texts]
     assert titles[0] == "A: period 1, left, 10.0 % of the cells"
 
@@ -537,7 +545,7 @@ def test_plot_gallery__scale_of_the_path_is_equal_and_holds_it():
             assert (right - left) / box.width == pytest.approx((top - bottom) / box.height)
             x, y = path[0].get_xydata().T
             assert left < x.min() < x.max() < right
-            assert bottom < min(y.min(), -0.37) < y.max() < top
+            assert bottom < min(y.min(), -VALUES["h"]) < y.max() < top
 
 
 def test_plot_gallery__largest_shares_are_drawn():
@@ -618,7 +626,8 @@ def test_plot_fractions__intervals(sweep):
     assert bars(fig, "B") == pytest.approx(expected)
     # the edge above A is none at the first frequency, where A reaches the top, nor at the last
     assert [x for x, *_ in bars(fig, "A")] == [2.09]
-    caption = next(t.get_text() for t in fig.axes[0].texts if "states" in t.get_text())
+    caption = caption_of(fig)
+    assert "states" in caption
     # five of ten cells have the widest interval
     assert caption.endswith(f"±{float(0.5 - b['low'][0]):.2g}")
     many = sweep.isel(frequency=np.tile(np.arange(3), 7)).assign_coords(frequency=2.0 + 0.1 * np.arange(21))
@@ -629,7 +638,7 @@ def test_plot_fractions__branches_are_no_sample(walk):
     fig = plot_fractions(walk)
     assert fig.axes[0].get_ylabel() == "share of the branches"
     assert "low" not in fig.data
-    assert any("branches each" in text.get_text() for text in fig.axes[0].texts)
+    assert "branches each" in caption_of(fig)
 
 
 def test_plot_regimes__shares_and_what_may_be_missing(map_of_two):
@@ -641,4 +650,4 @@ def test_plot_regimes__shares_and_what_may_be_missing(map_of_two):
     # (1 - p)^n = 0.05 with n decided cells; nothing is known where none is
     assert unseen[:, :2] == pytest.approx(1 - 0.05 ** (1 / 4))
     assert unseen[:, 2].tolist() == pytest.approx([1 - 0.05 ** (1 / 3), 1.0])
-    assert "basins below 52.7" in fig.axes[0].texts[0].get_text()
+    assert "basins below 52.7" in caption_of(fig)

@@ -1,0 +1,188 @@
+"""Cells of one parameter point in blocks, and the guesses of closed orbits that they make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from magpend_core.status import Status
+from pipeline.analysis.sets import Geometry, groups, hashes
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some cells of one parameter point.
+
+    Attributes
+    ----------
+    cells : slice
+        Their places among all cells of the point.
+    section : ndarray, (cell, period_index, state)
+    status, orbit_period : ndarray, (cell,)
+    turns : ndarray, (cell, angle)
+    """
+
+    cells: slice
+    section: np.ndarray
+    status: np.ndarray
+    orbit_period: np.ndarray
+    turns: np.ndarray
+
+    def take(self, rows: np.ndarray) -> Block:
+        """Cells by row; their places are no longer those of `cells`."""
+        return Block(
+            self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows]
+        )
+
+    @property
+    def is_closed(self) -> np.ndarray:
+        """Cells whose sections close, or that were inferred to lie among such cells."""
+        closed = np.isin(self.status, (Status.PERIODIC, Status.INFERRED))
+        return np.asarray(closed & (self.orbit_period > 0) & self._finite)
+
+    @property
+    def is_bounded(self) -> np.ndarray:
+        """Cells that were computed to the end and do not close."""
+        computed = np.isin(self.status, (Status.PERIODIC, Status.BOUNDED))
+        return np.asarray(computed & self._finite & ~self.is_closed)
+
+    @property
+    def _finite(self) -> np.ndarray:
+        return np.asarray(np.isfinite(self.section).all(axis=(1, 2)))
+
+
+@dataclass(frozen=True)
+class Guesses:
+    """Cells that may lie on an orbit: the best one of each box.
+
+    Attributes
+    ----------
+    key : ndarray of uint64
+        The box.
+    score : ndarray
+        The smaller, the better.
+    mark : ndarray of uint64
+        Hash of the cell's own sections; decides between equal scores.
+    point : ndarray, (n, state)
+        Last section point.
+    period : ndarray of int64
+        0 if it is not known: then the point is to be run on until it closes.
+    """
+
+    key: np.ndarray
+    score: np.ndarray
+    mark: np.ndarray
+    point: np.ndarray
+    period: np.ndarray
+
+    @classmethod
+    def none(cls, n_states: int) -> Guesses:
+        """No guess."""
+        empty = np.zeros(0)
+        whole = np.zeros(0, np.uint64)
+        return cls(whole, empty, whole, np.zeros((0, n_states)), np.zeros(0, np.int64))
+
+    def take(self, rows: np.ndarray) -> Guesses:
+        """Guesses by row."""
+        return Guesses(self.key[rows], self.score[rows], self.mark[rows], self.point[rows], self.period[rows])
+
+    def best(self, key: np.ndarray | None = None) -> Guesses:
+        """Keep the best per key, in rising order of the keys."""
+        keys = self.key if key is None else key
+        order = np.lexsort((self.mark, self.score, keys))
+        first = np.ones(len(order), bool)
+        first[1:] = keys[order][1:] != keys[order][:-1]
+        return self.take(order[first])
+
+    def least(self, n: int) -> Guesses:
+        """Return the `n` of least score, in the order of their marks."""
+        least = np.lexsort((self.mark, self.score))[:n]
+        return self.take(least[np.argsort(self.mark[least], kind="stable")])
+
+    def without_period(self) -> Guesses:
+        """Return the same points, their period unknown."""
+        return Guesses(self.key, self.score, self.mark, self.point, np.zeros_like(self.period))
+
+    def joined(self, other: Guesses) -> Guesses:
+        """Both, reduced to the best per key."""
+        return self.followed_by(other).best()
+
+    def followed_by(self, other: Guesses) -> Guesses:
+        """Both, one after the other."""
+        names = ("key", "score", "mark", "point", "period")
+        return Guesses(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+
+
+@dataclass
+class ClosedCells:
+    """Groups of closed cells, by the boxes that their last sections fall into.
+
+    A cell of period p has its last p sections (cyclic: which of them comes last does not matter).
+    Boxes of side `tolerance` that touch belong together, and so do all boxes of one cell; cells of
+    one period whose boxes are connected are a group. Cells with a point closer than `tolerance` to
+    each other are therefore in one group, whatever the order in which they come.
+    """
+
+    geometry: Geometry
+    tolerance: float
+    guesses: Guesses
+    _rows: list[np.ndarray] = field(default_factory=list)
+    _keys: list[np.ndarray] = field(default_factory=list)
+    _edges: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, block: Block) -> None:
+        """Take in the closed cells of a block."""
+        for p in np.unique(block.orbit_period[block.is_closed]):
+            cells = np.flatnonzero(block.is_closed & (block.orbit_period == p))
+            section = block.section[cells]
+            rows, keys = _rows_of(section[:, -int(p) :], int(p), self.geometry, self.tolerance)
+            self._keep(rows.reshape(-1, rows.shape[-1]), keys.ravel())
+            if keys.shape[1] > 1:
+                edges = np.stack([keys[:, :-1].ravel(), keys[:, 1:].ravel()], axis=1)
+                self._edges.append(np.unique(edges, axis=0))
+            last = section[:, -1]
+            back = section[:, -1 - int(p)] if section.shape[1] > p else last
+            found = Guesses(
+                keys[:, -1], self.geometry.distance(last, back), hashes(section.reshape(len(cells), -1)),
+                last, np.full(len(cells), int(p), np.int64),
+            )  # fmt: skip
+            self.guesses = self.guesses.joined(found)
+
+    def _keep(self, rows: np.ndarray, keys: np.ndarray) -> None:
+        unique, first = np.unique(keys, return_index=True)
+        self._rows.append(rows[first])
+        self._keys.append(unique)
+
+    def close(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return all boxes' keys in rising order and the group of each."""
+        if not self._keys:
+            return np.zeros(0, np.uint64), np.zeros(0, np.int64)
+        keys, first = np.unique(np.concatenate(self._keys), return_index=True)
+        rows = np.concatenate(self._rows)[first]
+        pairs = [np.searchsorted(keys, edges) for edges in self._edges]
+        for p in np.unique(rows[:, 0]):
+            own = np.flatnonzero(rows[:, 0] == p)
+            pairs.append(own[self.geometry.box_pairs(rows[own, 1:], self.tolerance)])
+        return keys, groups(len(keys), np.concatenate(pairs))
+
+    def group_of(self, block: Block, keys: np.ndarray, group: np.ndarray) -> np.ndarray:
+        """Group of each cell of a block, -1 if it is not closed."""
+        found = np.full(len(block.status), -1, np.int64)
+        for p in np.unique(block.orbit_period[block.is_closed]):
+            cells = np.flatnonzero(block.is_closed & (block.orbit_period == p))
+            _, own = _rows_of(block.section[cells, -1:], int(p), self.geometry, self.tolerance)
+            found[cells] = group[np.searchsorted(keys, own[:, 0])]
+        return found
+
+
+def _rows_of(points: np.ndarray, p: int, geometry: Geometry, side: float) -> tuple[np.ndarray, np.ndarray]:
+    """Period and box of each point, as rows of whole numbers and as keys."""
+    boxes = geometry.boxes(points, side)
+    rows = np.concatenate([np.full((*boxes.shape[:-1], 1), p, np.int64), boxes], axis=-1)
+    return rows, hashes(rows)
+
+
+def marks_of(section: np.ndarray) -> np.ndarray:
+    """Hash of each cell's sections."""
+    return hashes(section.reshape(len(section), section.shape[1] * section.shape[2]))

@@ -1,0 +1,172 @@
+"""The parameter points of a cube: their cells in blocks, and what is integrated there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.engine.system import System
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import Parameters
+from pipeline.analysis.attractors.cells import Block
+from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of, parameters_of, split_dims
+
+BUDGET = 256 * 2**20
+"""Bytes of sections held at once."""
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """What a cube's cells obey.
+
+    Attributes
+    ----------
+    model : Model or None
+        None if another system was given: then nothing is known of it but its equations.
+    parameters : Parameters, ndarray or None
+        Of the run; swept ones are replaced at each point. A packed vector with a system of its own. None
+        if nothing is to be integrated.
+    system : System or None
+        None, too, if nothing is to be integrated: it would bring the compiler with it.
+    geometry : Geometry
+    """
+
+    model: Model | None
+    parameters: Parameters | np.ndarray | None
+    system: System | None
+    geometry: Geometry
+
+    @classmethod
+    def of(
+        cls, ds: xr.Dataset, parameters: Parameters | np.ndarray | None = None, system: System | None = None,
+        *, needed: bool = True,
+    ) -> Dynamics:  # fmt: skip
+        """Those given, else those of the run.
+
+        Raises
+        ------
+        ValueError
+            If the parameters are `needed` and not there.
+        """
+        if system is not None:
+            return cls(None, parameters, system, Geometry.of(system))
+        if parameters is None and (needed or ds.attrs.get("parameters")):
+            parameters = parameters_of(ds)
+        model = parameters.model if isinstance(parameters, Parameters) else model_of(ds)
+        return cls(model, parameters, model.system if needed else None, Geometry.of(model))
+
+    @property
+    def integrates(self) -> System:
+        """What is integrated; it must be there."""
+        assert self.system is not None
+        return self.system
+
+    @property
+    def n_angles(self) -> int:
+        """Number of states on circles."""
+        return sum(self.geometry.is_angle)
+
+
+@dataclass
+class Point:
+    """One parameter point: where its cells are, and what is integrated there.
+
+    Attributes
+    ----------
+    parameters : Parameters or None
+        With the values of the swept ones; None for a system without a model.
+    packed : ndarray
+        The same as the engine takes them.
+    frequency : float
+        Of the drive [Hz].
+    """
+
+    cube: xr.Dataset
+    start_dims: tuple[str, ...]
+    frequency: float
+    packed: np.ndarray
+    parameters: Parameters | None
+    n_angles: int
+    block_cells: int
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return math.prod(self.cube.sizes[d] for d in self.start_dims)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.cube.sizes["state"])
+
+    def blocks(self) -> Iterator[Block]:
+        """All cells in blocks, in the order of the start dims."""
+        first = self.start_dims[0] if self.start_dims else None
+        length = self.cube.sizes[first] if first else 1
+        inner = self.n_cells // max(length, 1)
+        step = max(1, self.block_cells // max(inner, 1))
+        for begin in range(0, length, step):
+            part = self.cube.isel({first: slice(begin, begin + step)}) if first else self.cube
+            n = min(step, length - begin) * inner
+            yield self._block(part, slice(begin * inner, begin * inner + n), n)
+
+    def _block(self, part: xr.Dataset, cells: slice, n: int) -> Block:
+        def values(name: str, *own: Any) -> np.ndarray:
+            array = part[name].transpose(*self.start_dims, *own)
+            return np.asarray(array.values).reshape(n, *array.shape[len(self.start_dims) :])
+
+        section = values("section", "period_index", "state").astype(np.float64)
+        turns = values("turns", ...) if "turns" in part else np.zeros((n, self.n_angles), np.int64)
+        return Block(cells, section, values("status"), values("orbit_period"), turns)
+
+
+def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
+    """Parameter points, some at a time: what fits is loaded at once, since chunks span many points."""
+    names = [n for n in ("section", "status", "orbit_period", "turns") if n in ds]
+    cube = ds[names].reset_coords(drop=True) if FREQUENCY_DIM in ds.dims else ds[names]
+    dims, start_dims = split_dims(ds["status"])
+    shape = [ds.sizes[d] for d in dims]
+    per_point = ds["section"].size * 8 // max(math.prod(shape), 1)
+    cell = 8 * math.prod(ds.sizes[d] for d in ("period_index", "state"))
+    rows = max(1, budget // max(per_point * math.prod(shape[1:]), 1))
+    for begin in range(0, shape[0] if dims else 1, rows):
+        slab = cube.isel({dims[0]: slice(begin, begin + rows)}) if dims else cube
+        if slab["section"].size * 8 <= budget:
+            slab = slab.load()
+        points = {}
+        for local in np.ndindex(*(slab.sizes[d] for d in dims)):
+            index = (local[0] + begin, *local[1:]) if dims else ()
+            one = slab.isel(dict(zip(dims, local, strict=True)))
+            values = {d: float(ds[d].values[i]) for d, i in zip(dims, index, strict=True)}
+            values = {**_fixed(ds), **values}
+            points[index] = _point(one, start_dims, values, dynamics, max(1, budget // (4 * cell)))
+        yield points
+
+
+def _fixed(ds: xr.Dataset) -> dict[str, float]:
+    """Parameters of which one value was chosen."""
+    return {str(name): float(c) for name, c in ds.coords.items() if not c.ndim and c.dtype.kind in "fiu"}
+
+
+def _point(
+    one: xr.Dataset, start_dims: tuple[str, ...], values: Mapping[str, float], dynamics: Dynamics,
+    block_cells: int,
+) -> Point:  # fmt: skip
+    frequency, base = values.get(FREQUENCY_DIM, math.nan), dynamics.parameters
+    if isinstance(base, Parameters):
+        parameters = base.replace(**{name: value for name, value in values.items() if name in base})
+        return Point(
+            one, start_dims, frequency, parameters.pack(), parameters, dynamics.n_angles, block_cells
+        )
+    names = dynamics.system.parameter_names if dynamics.system is not None else ()
+    packed = np.zeros(len(names)) if base is None else np.array(base, np.float64)
+    for name, value in values.items():
+        if name in names:
+            packed[names.index(name)] = value
+    return Point(one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells)

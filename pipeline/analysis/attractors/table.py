@@ -1,0 +1,159 @@
+"""Table of attractors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.basins.basins import outcomes
+from pipeline.analysis.basins.numbers import Interval, basin_fractions
+from pipeline.analysis.tabular import (
+    FEW_POINTS,
+    Row,
+    aligned,
+    cell_counts,
+    distinct,
+    heading,
+    largest_share,
+    number,
+    ranges,
+    summary,
+    where_of,
+    with_interval,
+    words_of,
+)
+from pipeline.layout.vocabulary import split_dims
+from pipeline.products.product import Table
+
+
+def attractors_table(ds: xr.Dataset) -> Table:
+    """Table of the attractors, per parameter point or per id."""
+    rows = attractor_rows(ds)
+    return Table(rows, attractor_lines(ds, rows))
+
+
+def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence: float = 0.95) -> list[Row]:
+    """Return a row per attractor and parameter point.
+
+    `fraction` is that of the cells whose outcome is known, with its interval; a continuation's branches
+    are no sample of initial conditions, so they have none.
+    """
+    dims, start_dims = split_dims(ds["attractor_id"])
+    words = words_of(ds["decision"])
+    fractions = None
+    if start_dims and start_dims != ("branch",):
+        fractions = basin_fractions(
+            outcomes(ds), dims=start_dims, ids=ds["attractor"].values.tolist(),
+            confidence=confidence, method=interval,
+        )  # fmt: skip
+    rows = []
+    for index in np.ndindex(*(ds.sizes[d] for d in dims)):
+        at = dict(zip(dims, index, strict=True))
+        one = ds.isel(at)
+        cells = one["attractor_id"].values.ravel()
+        decisions = np.zeros((len(words), ds.sizes["attractor"]), np.int64)
+        np.add.at(decisions, (one["decision"].values.ravel()[cells >= 0], cells[cells >= 0]), 1)
+        for i in np.flatnonzero(one["kind"].values > 0):
+            row = {**where_of(ds, at), **_attractor(one.isel(attractor=i))}
+            if fractions is not None:
+                own = fractions.isel(at).sel(label=i)
+                row |= {name: float(own[name]) for name in ("fraction", "low", "high")}
+            rows.append(row | {f"by_{name}": int(decisions[k, i]) for k, name in enumerate(words) if k})
+    return rows
+
+
+def _attractor(one: xr.Dataset) -> Row:
+    """Columns of one attractor; what its model does not have is left out."""
+    largest = np.hypot(one["multiplier_real"].values, one["multiplier_imag"].values)
+    row: Row = {
+        "attractor_id": int(one["attractor"]),
+        "kind": words_of(one["kind"])[int(one["kind"])],
+        "orbit_period": int(one["orbit_period"]),
+    }
+    if "side" in one:
+        row["side"] = words_of(one["side"])[int(one["side"])]
+    if "rotation" in one:
+        (dim,) = one["rotation"].dims
+        names = one[dim].values if dim in one.coords else range(one.sizes[dim])
+        row |= {f"rotation_{n}": float(v) for n, v in zip(names, one["rotation"].values, strict=True)}
+    row["multiplier_modulus"] = float(largest[0]) if np.isfinite(largest).any() else np.nan
+    row["is_stable"] = int(one["is_stable"])
+    if "mirror_partner" in one:
+        row["mirror_partner"] = int(one["mirror_partner"])
+        row["mirror_distance"] = float(one["mirror_distance"])
+    if "match_basis" in one:
+        row["match_basis"] = words_of(one["match_basis"])[int(one["match_basis"])]
+    basis = (
+        {"match_basis": words_of(one["match_basis"])[int(one["match_basis"])]} if "match_basis" in one else {}
+    )
+    return row | {"n_cells": int(one["n_cells"])} | basis
+
+
+def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
+    """Return the table per parameter point if there are few, otherwise a line per attractor."""
+    dims, start_dims = split_dims(ds["attractor_id"])
+    n_points = int(np.prod([ds.sizes[d] for d in dims]))
+    n = ds.sizes["attractor"]
+    lines = [f"{n} attractor{'s' * (n != 1)} at {n_points} parameter point{'s' * (n_points != 1)}"]
+    if n_points > FEW_POINTS:
+        lines += summary(ds, rows, dims, _id_summary)
+    else:
+        for index in np.ndindex(*(ds.sizes[d] for d in dims)):
+            at = dict(zip(dims, index, strict=True))
+            where = where_of(ds, at)
+            here = [row for row in rows if all(row[k] == v for k, v in where.items())]
+            lines += heading(ds, where) + aligned([_attractor_words(row) for row in here])
+    return lines + cell_counts(ds, start_dims)
+
+
+def _attractor_words(row: Row) -> dict[str, str]:
+    turns = [v for k, v in row.items() if k.startswith("rotation_")]
+    decided = ", ".join(f"{n} {k[3:].replace('_', ' ')}" for k, n in row.items() if k.startswith("by_") and n)
+    words = {
+        "id": str(row["attractor_id"]),
+        "kind": row["kind"].replace("_", " "),
+        "period": str(row["orbit_period"] or "-"),
+    }
+    if "side" in row:
+        words["side"] = row["side"]
+    if turns:
+        words["rotation"] = " ".join(f"{round(v, 3) + 0.0:.3f}" for v in turns)
+    words |= {"|multiplier|": number(row["multiplier_modulus"], ".4f"), "cells": str(row["n_cells"])}
+    if "fraction" in row:
+        words["share"] = with_interval(row)
+    if "mirror_partner" in row:
+        words["mirror"] = str(row["mirror_partner"]) if row["mirror_partner"] >= 0 else "-"
+    return words | {"decided": decided}
+
+
+def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
+    words = {
+        "id": str(rows[0]["attractor_id"]),
+        "kind": distinct(r["kind"].replace("_", " ") for r in rows),
+        "periods": distinct(r["orbit_period"] for r in rows if r["orbit_period"]) or "-",
+    }
+    if "side" in rows[0]:
+        words["side"] = distinct(r["side"] for r in rows)
+    words |= {**ranges(ds, rows, dims), "cells": str(sum(r["n_cells"] for r in rows))}
+    words["id rests on"] = _evidence([r["match_basis"] for r in rows if "match_basis" in r])
+    if "fraction" in rows[0]:
+        words["max share"] = largest_share(ds, rows, dims)
+    if "mirror_partner" in rows[0]:
+        partners = distinct(r["mirror_partner"] for r in rows if r["mirror_partner"] >= 0)
+        words["mirror"] = partners or "-"
+    if "match_basis" in rows[0]:
+        n = sum(r["match_basis"] == "distance" for r in rows)
+        words["by distance alone"] = f"{n} points" if n else "-"
+    return words
+
+
+def _evidence(bases: Sequence[str]) -> str:
+    """Say what an id rests on: followed branches, doublings, or at how many points on distance alone."""
+    links = [basis for basis in bases if basis != "first_appearance"]
+    told = [name for name in ("branch", "doubling") if name in links]
+    n = links.count("distance")
+    if n and not told:
+        return "distance alone"
+    return ", ".join(told + ([f"distance at {n} of {len(links)}"] if n else [])) or "-"

@@ -1,0 +1,131 @@
+"""Table of basins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.basins.basins import DIVERGED
+from pipeline.analysis.tabular import (
+    FEW_POINTS,
+    Row,
+    aligned,
+    cell_counts,
+    heading,
+    largest_share,
+    ranges,
+    summary,
+    where_of,
+    with_interval,
+)
+from pipeline.layout.vocabulary import split_dims
+from pipeline.products.product import Table
+
+
+def basins_table(ds: xr.Dataset) -> Table:
+    """Table of the fractions, and lines of the numbers on boundaries."""
+    rows = basin_rows(ds)
+    return Table(rows, basin_lines(ds, rows))
+
+
+def basin_rows(ds: xr.Dataset) -> list[Row]:
+    """Return a row per outcome and parameter point: cells and fraction with its intervals."""
+    dims, _ = split_dims(ds["attractor_id"])
+    names = ("fraction", "low", "high", "fraction_if_none", "fraction_if_all", "low_if_none", "high_if_all")
+    rows = []
+    for index in np.ndindex(*(ds.sizes[d] for d in dims)):
+        at = dict(zip(dims, index, strict=True))
+        one = ds.isel(at)
+        for i, label in enumerate(ds["label"].values.tolist()):
+            row = {**where_of(ds, at), "label": label, "n_cells": int(one["count"][i])}
+            row["n_inferred"] = int(one["n_inferred"][i])
+            rows.append(row | {name: float(one[name][i]) for name in names})
+    return rows
+
+
+def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
+    """Return fractions and numbers on boundaries: a table per point if there are few, or ranges."""
+    dims, start_dims = split_dims(ds["attractor_id"])
+    n_points = int(np.prod([ds.sizes[d] for d in dims]))
+    seen = [row for row in rows if row["n_cells"]]
+    confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
+    lines = [f"fractions of the cells whose outcome is known, {ds.attrs['basin_interval']}, {confidence}"]
+    if n_points > FEW_POINTS:
+        lines += summary(ds, seen, dims, _label_summary)
+        lines += [_range_line(ds, name, text) for name, text in _BOUNDARY.items() if name in ds]
+    else:
+        for index in np.ndindex(*(ds.sizes[d] for d in dims)):
+            at = dict(zip(dims, index, strict=True))
+            where = where_of(ds, at)
+            here = [row for row in seen if all(row[k] == v for k, v in where.items())]
+            one = ds.isel(at)
+            lines += heading(ds, where) + aligned([_basin_words(row) for row in here])
+            if here:
+                bound = float(one["unseen_high"])
+                lines.append(f"  an attractor that no cell shows: at most {bound:.3g} of the region")
+            lines += _boundary_lines(one)
+    if ds.attrs["not_computed"]:
+        lines += [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
+    return lines + cell_counts(ds, start_dims)
+
+
+def _label(code: int) -> str:
+    return "diverged" if code == DIVERGED else str(code)
+
+
+def _basin_words(row: Row) -> dict[str, str]:
+    words = {"id": _label(row["label"]), "cells": str(row["n_cells"]), "fraction": with_interval(row)}
+    if row["fraction_if_all"] > row["fraction_if_none"]:
+        words["with the unfinished"] = f"{row['low_if_none']:.4f} to {row['high_if_all']:.4f}"
+    return words | _inferred([row])
+
+
+def _inferred(rows: Sequence[Row]) -> dict[str, str]:
+    """How many cells were not integrated, if any."""
+    n = sum(row["n_inferred"] for row in rows)
+    return {"inferred cells": str(n)} if n else {}
+
+
+def _label_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
+    return {
+        "id": _label(rows[0]["label"]),
+        **ranges(ds, rows, dims),
+        "cells": str(sum(r["n_cells"] for r in rows)),
+        "max fraction": largest_share(ds, rows, dims),
+        **_inferred(rows),
+    }
+
+
+_BOUNDARY = {
+    "basin_entropy": "basin entropy",
+    "boundary_basin_entropy": "boundary basin entropy",
+    "uncertainty_exponent": "uncertainty exponent",
+    "wada_beyond": "cells off the common boundary (Wada)",
+}
+
+
+def _boundary_lines(one: xr.Dataset) -> list[str]:
+    lines = []
+    for name, text in _BOUNDARY.items():
+        if name in one and np.isfinite(float(one[name])):
+            value, error, low, high = (float(one[f"{name}{end}"]) for end in ("", "_stderr", "_low", "_high"))
+            known = f"± {error:.2g} ({low:.4g} to {high:.4g})"
+            lines.append(f"  {text}: {value:.4g} {known if np.isfinite(error) else '(error not known)'}")
+    if int(one.get("above_ln2_surely", -1)) == 1:
+        lines.append("  the boundary basin entropy exceeds ln 2: the boundary is fractal")
+    if int(one.get("wada", -1)) >= 0:
+        verdict = "passes" if int(one["wada"]) else "does not pass"
+        lines.append(
+            f"  Wada merge test: {verdict} with radius {one.attrs['basin_radius']} "
+            f"(it takes {float(one['wada_distance']):g} cells)"
+        )
+    return lines
+
+
+def _range_line(ds: xr.Dataset, name: str, text: str) -> str:
+    values = ds[name].values[np.isfinite(ds[name].values)]
+    if not values.size:
+        return f"  {text}: nowhere"
+    return f"  {text}: {values.min():.4g} to {values.max():.4g} at {values.size} points"

@@ -1,0 +1,345 @@
+"""Chaos per attractor: exponents, multipliers, dimensions, 0-1 test and share, for each at each point.
+
+Schema
+------
+Dims: the *parameter dims* and ``attractor`` as in `pipeline.analysis.attractors.attractors`; ``rank``, as
+many as there are states; ``multiplier``. Variables, beside the copies of ``kind``, ``orbit_period``,
+``n_cells``, ``share``, ``multiplier_real``, ``multiplier_imag``, ``is_stable``:
+
+=============================== ========== ===================================================================
+variable                        own dims   meaning
+=============================== ========== ===================================================================
+``nature``                                 codes of `Nature`
+``n_transient``                            its cells of which the chaos ended while exponents were taken
+``n_drifting``                             not closed, with a largest exponent that drifts
+``n_contradicting``                        closed, and yet with a positive exponent
+``n_audit_failed``,                        with these flags
+``n_unresolved``, ``n_failed``
+``exponents_from``                         0 none, 1 the orbit's multipliers, 2 its cells
+``attractor_lyapunov``          rank       exponents [1/s]
+``attractor_lyapunov_stderr``   rank       standard errors [1/s]; of multipliers 0
+``attractor_lyapunov_between``  rank       standard deviation between cells beyond their errors [1/s]
+``attractor_kaplan_yorke``,                Kaplan-Yorke dimension of the section from these exponents, and
+``attractor_kaplan_yorke_stderr``          its standard error
+``attractor_correlation``,                 correlation dimension of pooled sections, its sampling error, and
+``attractor_correlation_stderr``,          the slope of the lower half of its range minus that of the upper;
+``attractor_correlation_spread``           of bounded sets with points enough
+``median_zero_one``,                       K over its cells
+``least_zero_one``,
+``largest_zero_one``
+=============================== ========== ===================================================================
+
+A polished orbit's exponents are the logarithms of its Floquet multipliers over its period: all of them, free
+of sampling errors, whether the cube has exponents or not. Those of a bounded set are means over its cells
+(`pooled_mean`), transients left out; after the first, of cells flagged good. `lyapunov_max` of the attractors
+is the first of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
+from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
+from pipeline.analysis.chaos.sections import Floats, geometry_of
+from pipeline.layout.vocabulary import (
+    BOUNDED_SET,
+    CLOSED_ORBIT,
+    FREQUENCY_DIM,
+    PERIODIC,
+    split_dims,
+)
+from pipeline.products.chaos import ChaosOptions
+from pipeline.products.lyapunov import LyapunovFlag
+
+CHAOTIC_K, REGULAR_K = 0.9, 0.1
+"""Median of K from which, and up to which, the 0-1 test alone tells chaos from order."""
+
+FEWEST_POINTS = 1000
+"""Fewest section points for a correlation dimension: they do for a dimension of 1.2."""
+
+
+class Nature(IntEnum):
+    """What an attractor is, by its exponents; where there are none, by the 0-1 test."""
+
+    UNKNOWN = 0
+    REGULAR = 1
+    UNDECIDED = 2
+    CHAOTIC = 3
+    HYPERCHAOTIC = 4
+    CHAOTIC_BY_TEST = 5
+    REGULAR_BY_TEST = 6
+    TRANSIENT = 7
+
+    @property
+    def words(self) -> str:
+        """As tables say it."""
+        by_test = self.name.endswith("_BY_TEST")
+        return self.name.removesuffix("_BY_TEST").lower() + (" (by the 0-1 test)" if by_test else "")
+
+    @property
+    def has_dimension(self) -> bool:
+        """Whether sections of it fill something that stays."""
+        return self in (Nature.CHAOTIC, Nature.HYPERCHAOTIC, Nature.CHAOTIC_BY_TEST, Nature.UNDECIDED)
+
+
+_FROM = ("none", "multipliers", "cells")
+
+
+@dataclass
+class _Cells:
+    """Cells of one parameter point as rows.
+
+    Attributes
+    ----------
+    values : dict of ndarray
+        By variable, cells on the first axis.
+    frequency : float
+        Of the drive [Hz].
+    """
+
+    values: dict[str, npt.NDArray[Any]]
+    frequency: float
+
+    @classmethod
+    def of(cls, cells: xr.Dataset, starts: Sequence[str]) -> _Cells:
+        values = {}
+        for name, array in cells.data_vars.items():
+            own = [d for d in array.dims if d not in starts]
+            table = array.transpose(*starts, *own).values
+            values[str(name)] = table.reshape(-1, *table.shape[len(starts) :])
+        return cls(values, _frequency(cells))
+
+    def get(self, name: str) -> npt.NDArray[Any] | None:
+        return self.values.get(name)
+
+
+def _frequency(one: xr.Dataset) -> float:
+    if FREQUENCY_DIM in one.coords:
+        return float(one.coords[FREQUENCY_DIM])
+    return float(one.attrs.get("frequency_hz", np.nan))
+
+
+def chaos_per_attractor(
+    ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions
+) -> xr.Dataset:
+    """Add the variables per attractor to those of the cells; see the text of this module.
+
+    Parameters
+    ----------
+    ds
+        The cube.
+    cells
+        Of `chaotic_cells`, with `attractor_id`.
+    attractors
+        Of `identify` or `match`.
+    options
+        Those of the exponents' signs, and `n_max` points of a correlation dimension; 0 for none.
+    """
+    dims, starts = split_dims(cells["motion"])
+    copied = ["kind", "orbit_period", "n_cells", "share", "multiplier_real", "multiplier_imag", "is_stable"]
+    own = attractors[copied].transpose(*dims, "attractor", ...)
+    shape, n_states = own["kind"].shape, ds.sizes["state"]
+    arrays = {
+        name: np.full((*shape, *((n_states,) if rank else ())), fill, dtype)
+        for name, (rank, dtype, fill, _, _) in _TABLE.items()
+    }
+    curves = _Curves(options)
+    for index in np.ndindex(*shape[:-1]):
+        at = dict(zip(dims, index, strict=True))
+        here = _Cells.of(cells.isel(at), starts)
+        point = own.isel(at).load()
+        for i in np.flatnonzero(point["kind"].values > 0):
+            found = _of_attractor(point.isel(attractor=i), here, int(i), n_states, options)
+            if found["kind_is_bounded"] and Nature(found["nature"]).has_dimension:
+                found |= curves.of(ds.isel(at), starts, here, int(i))
+            for name in arrays.keys() & found.keys():
+                arrays[name][(*index, i)] = found[name]
+    variables = {
+        name: ((*dims, "attractor", *(("rank",) if rank else ())), arrays[name],
+               {"units": units, "long_name": text})
+        for name, (rank, _, _, units, text) in _TABLE.items()
+    }  # fmt: skip
+    result = cells.assign(own.data_vars).assign(variables)
+    natures = " ".join(n.name.lower() for n in Nature)
+    result["nature"].attrs |= {"flag_values": np.arange(len(Nature), dtype=np.int8), "flag_meanings": natures}
+    result["exponents_from"].attrs |= {
+        "flag_values": np.arange(3, dtype=np.int8),
+        "flag_meanings": " ".join(_FROM),
+    }
+    rank = ("rank", np.arange(1, n_states + 1), {"units": "1", "long_name": "exponents in falling order"})
+    return _with_kaplan_yorke(result.assign_coords(rank=rank))
+
+
+def _flags(words: Sequence[str]) -> dict[str, Any]:
+    return {"flag_values": np.arange(len(words), dtype=np.int8), "flag_meanings": " ".join(words)}
+
+
+def _of_attractor(
+    one: xr.Dataset, cells: _Cells, number: int, n_states: int, options: ChaosOptions
+) -> dict[str, Any]:
+    """Counts, exponents, 0-1 test and nature of one attractor."""
+    is_own = cells.values["attractor_id"] == number
+    found: dict[str, Any] = {"kind_is_bounded": int(one["kind"]) == BOUNDED_SET}
+    found |= _counts(cells, is_own, options)
+    found |= _exponents(one, cells, is_own, n_states)
+    k = cells.get("zero_one")
+    if k is not None and np.isfinite(k[is_own]).any():
+        known = k[is_own][np.isfinite(k[is_own])]
+        found |= {
+            "median_zero_one": np.median(known),
+            "least_zero_one": known.min(),
+            "largest_zero_one": known.max(),
+        }
+    found["nature"] = int(_nature(one, found, options))
+    return found
+
+
+def _counts(cells: _Cells, is_own: npt.NDArray[np.bool_], options: ChaosOptions) -> dict[str, int]:
+    found = {
+        "n_transient": int((cells.values["is_transient"][is_own] == 1).sum()),
+        "n_contradicting": int((cells.values["contradicts"][is_own] == 1).sum()),
+    }
+    flag, drift = cells.get("lyapunov_flag"), cells.get("drift_sigma")
+    if flag is None or drift is None:
+        return found
+    # the blocks of a closed orbit scatter by its waves, not by chance
+    open_cells = is_own & (cells.values["status"] != PERIODIC)
+    found["n_drifting"] = int((np.abs(drift[open_cells]) > options.n_sigma).sum())
+    for code in (LyapunovFlag.AUDIT_FAILED, LyapunovFlag.UNRESOLVED, LyapunovFlag.FAILED):
+        found[f"n_{code.name.lower()}"] = int((flag[is_own] == code).sum())
+    return found
+
+
+def _exponents(
+    one: xr.Dataset, cells: _Cells, is_own: npt.NDArray[np.bool_], n_states: int
+) -> dict[str, Any]:
+    real, imaginary = one["multiplier_real"].values, one["multiplier_imag"].values
+    if int(one["kind"]) == CLOSED_ORBIT and np.isfinite(real).all():
+        modulus = np.maximum(np.hypot(real, imaginary), 1e-300)
+        rate = np.log(modulus) * cells.frequency / int(one["orbit_period"])
+        zero = np.zeros(n_states)
+        return {
+            "exponents_from": 1, "attractor_lyapunov": rate, "attractor_lyapunov_stderr": zero,
+            "attractor_lyapunov_between": zero,
+        }  # fmt: skip
+    rates, flag = cells.get("lyapunov"), cells.get("lyapunov_flag")
+    if rates is None or flag is None:
+        return {}
+    lasting = is_own & (cells.values["is_transient"] != 1)
+    good, first = lasting & (flag == GOOD), lasting & np.isin(flag, (GOOD, UNRESOLVED))
+    if not first.any():
+        return {}
+    table = np.full((3, n_states), np.nan)
+    for k in range(rates.shape[1]):
+        which = good if k else first
+        part = pooled_mean(rates[None, :, k], cells.values["lyapunov_stderr"][None, :, k], which[None])
+        table[:, k] = [values[0] for values in part]
+    names = ("attractor_lyapunov", "attractor_lyapunov_stderr", "attractor_lyapunov_between")
+    return {"exponents_from": 2, **dict(zip(names, table, strict=True))}
+
+
+def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Nature:
+    if int(one["kind"]) == CLOSED_ORBIT and int(one["is_stable"]) == 1:
+        return Nature.REGULAR
+    if found["n_transient"] == int(one["n_cells"]):
+        return Nature.TRANSIENT
+    rate = found.get("attractor_lyapunov")
+    if rate is not None and np.isfinite(rate[0]):
+        margin = np.maximum(options.n_sigma * found["attractor_lyapunov_stderr"], options.least)
+        if int(one["kind"]) == CLOSED_ORBIT:
+            return Nature.REGULAR if rate[0] <= margin[0] else Nature.UNDECIDED
+        if rate[0] > margin[0]:
+            return Nature.HYPERCHAOTIC if len(rate) > 1 and rate[1] > margin[1] else Nature.CHAOTIC
+        return Nature.REGULAR if rate[0] < -margin[0] else Nature.UNDECIDED
+    if int(one["kind"]) == CLOSED_ORBIT:
+        return Nature.REGULAR if int(one["is_stable"]) < 0 else Nature.UNDECIDED
+    k = found.get("median_zero_one")
+    if k is None:
+        return Nature.UNKNOWN
+    if k >= CHAOTIC_K:
+        return Nature.CHAOTIC_BY_TEST
+    return Nature.REGULAR_BY_TEST if k <= REGULAR_K else Nature.UNDECIDED
+
+
+class _Curves:
+    """Correlation dimensions of attractors' pooled sections."""
+
+    def __init__(self, options: ChaosOptions) -> None:
+        self._n_max = options.n_max
+
+    def of(self, point: xr.Dataset, starts: Sequence[str], cells: _Cells, number: int) -> dict[str, float]:
+        """Of one attractor, from the cells of its parameter point; empty if its points are too few."""
+        lasting = (cells.values["attractor_id"] == number) & (cells.values["is_transient"] != 1)
+        n_keep = point.sizes["period_index"]
+        if min(int(lasting.sum()) * n_keep, self._n_max) < FEWEST_POINTS:
+            return {}
+        found = correlation_dimension(
+            pooled(point, starts, lasting), pool=["cell"], n_max=self._n_max, geometry=geometry_of(point)
+        )
+        return {
+            f"attractor_correlation{end}": float(found[f"correlation_dimension{end}"])
+            for end in ("", "_stderr", "_spread")
+        }
+
+
+def pooled(point: xr.Dataset, starts: Sequence[str], which: npt.NDArray[np.bool_]) -> xr.Dataset:
+    """Sections and status of some cells of a parameter point, on the dim ``cell``."""
+    own = point[["section", "status"]].reset_coords(drop=True)
+    rows = own.stack(cell=list(starts), create_index=False) if starts else own.expand_dims("cell")
+    return rows.isel(cell=np.flatnonzero(which)).assign_attrs(point.attrs)
+
+
+def _with_kaplan_yorke(result: xr.Dataset) -> xr.Dataset:
+    """Kaplan-Yorke dimension of each attractor, from its own exponents."""
+    exponents = {
+        "attractor_lyapunov": result["attractor_lyapunov"],
+        "attractor_lyapunov_stderr": result["attractor_lyapunov_stderr"],
+    }
+    spectra = xr.Dataset(exponents).reset_coords(drop=True)
+    # exponents that were not taken are not those of a whole spectrum
+    found = kaplan_yorke_dimension(spectra, name="attractor_lyapunov", dim="rank")
+    about = {"units": "1", "long_name": "Kaplan-Yorke dimension of the section"}
+    error = {"units": "1", "long_name": "standard error of the Kaplan-Yorke dimension"}
+    dims = result["nature"].dims
+    return result.assign(
+        attractor_kaplan_yorke=(dims, _values(found["kaplan_yorke_dimension"], dims), about),
+        attractor_kaplan_yorke_stderr=(dims, _values(found["kaplan_yorke_dimension_stderr"], dims), error),
+    )
+
+
+def _values(array: xr.DataArray, dims: Sequence[Any]) -> Floats:
+    return np.asarray(array.transpose(*dims).values)
+
+
+_TABLE: dict[str, tuple[bool, str, float, str, str]] = {
+    "nature": (False, "int8", 0, "1", "what the attractor is"),
+    "n_transient": (False, "int64", 0, "1", "cells whose chaos ended"),
+    "n_drifting": (False, "int64", 0, "1", "cells whose largest exponent drifts"),
+    "n_contradicting": (False, "int64", 0, "1", "cells that closed, and yet have a positive exponent"),
+    "n_audit_failed": (False, "int64", 0, "1", f"cells flagged: {LyapunovFlag.AUDIT_FAILED.sentence}"),
+    "n_unresolved": (False, "int64", 0, "1", f"cells flagged: {LyapunovFlag.UNRESOLVED.sentence}"),
+    "n_failed": (False, "int64", 0, "1", f"cells flagged: {LyapunovFlag.FAILED.sentence}"),
+    "exponents_from": (False, "int8", 0, "1", "where the exponents are from"),
+    "attractor_lyapunov": (True, "float64", np.nan, "1/s", "Lyapunov exponents per unit time"),
+    "attractor_lyapunov_stderr": (True, "float64", np.nan, "1/s", "their standard errors"),
+    "attractor_lyapunov_between": (
+        True, "float64", np.nan, "1/s", "standard deviation between cells beyond their errors",
+    ),
+    "attractor_correlation": (False, "float64", np.nan, "1", "correlation dimension of the section"),
+    "attractor_correlation_stderr": (False, "float64", np.nan, "1", "its sampling error"),
+    "attractor_correlation_spread": (
+        False, "float64", np.nan, "1", "slope of the lower half of the range minus the upper",
+    ),
+    "median_zero_one": (False, "float64", np.nan, "1", "0-1 test, median over the cells"),
+    "least_zero_one": (False, "float64", np.nan, "1", "0-1 test, least over the cells"),
+    "largest_zero_one": (False, "float64", np.nan, "1", "0-1 test, largest over the cells"),
+}  # fmt: skip
+"""Whether on `rank`, dtype, fill, units and long name of the variables per attractor."""

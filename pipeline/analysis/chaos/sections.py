@@ -1,0 +1,58 @@
+"""What indicators of chaos read from a cube: the sections of the cells that were computed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from magpend_core.status import Status
+from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import model_of
+
+Floats = npt.NDArray[np.float64]
+
+FLOOR = 1e-6
+"""Scaled distance below which sections are one point: the closure tolerance of a run."""
+
+
+def geometry_of(ds: xr.Dataset, geometry: Geometry | None = None) -> Geometry:
+    """Geometry of a cube's states: the one given, else that of its model."""
+    return Geometry.of(model_of(ds)) if geometry is None else geometry
+
+
+def computed(ds: xr.Dataset, geometry: Geometry) -> xr.DataArray:
+    """Sections, NaN in the cells that were not computed to the end.
+
+    Raises
+    ------
+    ValueError
+        If there are no sections, or their states are not those of the geometry.
+    """
+    if "section" not in ds:
+        raise ValueError("The dataset has no section; give the dataset of pipeline.open_run.")
+    section = ds["section"]
+    if section.sizes["state"] != len(geometry.scales):
+        raise ValueError(
+            f"section has {section.sizes['state']} states, the geometry {len(geometry.scales)}: give the "
+            "geometry of the system that was integrated"
+        )
+    if "status" not in ds:
+        return section
+    return section.where(ds["status"].isin((Status.PERIODIC, Status.BOUNDED, Status.INFERRED)))
+
+
+def at_least(name: str, value: int, least: int) -> int:
+    """Return a number that is large enough; raises ValueError if it is not."""
+    if value < least:
+        raise ValueError(f"{name} is {value}, below {least}: give {least} or more")
+    return int(value)
+
+
+def with_coords(ds: xr.Dataset, dims: Sequence[object], variables: Mapping[str, Any]) -> xr.Dataset:
+    """Dataset with those coordinates of another that lie on the given dims."""
+    coords = {name: c for name, c in ds.coords.items() if set(c.dims) <= set(dims)}
+    return xr.Dataset(variables, coords=coords)

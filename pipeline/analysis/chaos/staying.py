@@ -1,0 +1,111 @@
+"""Correlation dimension per attractor, of bounded sets that stay, and why the others have none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.attractors.lifetimes import ATTRACTOR, lifetimes
+from pipeline.analysis.chaos.dimensions import correlation_dimension
+from pipeline.analysis.chaos.per_attractor import pooled
+from pipeline.analysis.chaos.sections import geometry_of
+from pipeline.analysis.selection import select_points
+from pipeline.layout.vocabulary import BOUNDED_SET, split_dims
+from pipeline.products.chaos import DimensionOptions
+
+REASONS = ("has_dimension", "absent", "closed_orbit", "transient", "too_few_points")
+HAS_DIMENSION, ABSENT, CLOSED, TRANSIENT, TOO_FEW = range(len(REASONS))
+"""Values of `reason`."""
+
+
+def section_dimension(
+    ds: xr.Dataset, attractors: xr.Dataset, options: DimensionOptions | None = None, **changes: Any
+) -> xr.Dataset:
+    """Correlation dimension of each bounded set that stays, from the sections of its cells.
+
+    A cell that is still closing, or a chaotic transient, fills nothing: a slope of its correlation sum is no
+    dimension. So bounded sets are run on first, as `lifetimes` does, and only those that none of the sample
+    leaves have a dimension.
+
+    Parameters
+    ----------
+    ds
+        Cube with `section`, `status` and `orbit_period`.
+    attractors
+        What `identify` or `match` made of it.
+    options
+        By default those of `DimensionOptions`; `at` selects values of swept parameters.
+    changes
+        Fields of the options, instead of `options`.
+
+    Returns
+    -------
+    Dataset
+        On the parameter dims and `attractor` (those that a point of the selection has): the variables of
+        `pipeline.analysis.chaos.dimensions.correlation_dimension`; `n_cells`, `share`, `kind`; `reason`, why
+        there is no dimension (`REASONS`); `verdict`, `n_sampled`, `n_left` and `lifetime_low` of `lifetimes`.
+
+    Raises
+    ------
+    ValueError
+        If an axis or a value is not the cube's, an option is out of bounds, or `attractors` are those of
+        another cube.
+    """
+    options = options or DimensionOptions(**changes)
+    part = select_points(ds, options.at)
+    dims, starts = split_dims(part["status"])
+    found = attractors.sel({d: part[d].values for d in dims})
+    present = (found["kind"] > 0).any([d for d in found["kind"].dims if d != "attractor"])
+    stay = lifetimes(part, found, options)
+    found, stay = (x.isel(attractor=np.flatnonzero(present.values)) for x in (found, stay))
+    section = part[["section", "status"]].load().assign_attrs(ds.attrs)
+    ids = found["attractor_id"].transpose(*dims, *starts).values
+    curves, reason = [], np.full(found["kind"].transpose(*dims, "attractor").shape, ABSENT, np.int8)
+    kind = found["kind"].transpose(*dims, "attractor").values
+    verdict = stay["verdict"].transpose(*dims, "attractor").values
+    for index in np.ndindex(*reason.shape):
+        number = int(found["attractor"].values[index[-1]])
+        stays = kind[index] == BOUNDED_SET and verdict[index] == ATTRACTOR
+        own = (ids[index[:-1]] == number).ravel() & stays
+        point = section.isel(dict(zip(dims, index[:-1], strict=True)))
+        curve = correlation_dimension(
+            pooled(point, starts, own), pool=["cell"], theiler=options.theiler, n_max=options.n_max,
+            floor=options.floor, geometry=geometry_of(ds),
+        )  # fmt: skip
+        curves.append(curve)
+        reason[index] = _reason(int(kind[index]), stays, float(curve["correlation_dimension"]))
+    return _dataset(found, stay, curves, reason, dims).assign_attrs(
+        {**ds.attrs, **{f"dimension_{k}": getattr(options, k) for k in ("theiler", "n_max", "floor")}}
+    )
+
+
+def _reason(kind: int, stays: bool, dimension: float) -> int:
+    if kind != BOUNDED_SET:
+        return CLOSED if kind else ABSENT
+    if not stays:
+        return TRANSIENT
+    return HAS_DIMENSION if np.isfinite(dimension) else TOO_FEW
+
+
+def _dataset(
+    found: xr.Dataset, stay: xr.Dataset, curves: list[xr.Dataset], reason: np.ndarray, dims: tuple[str, ...]
+) -> xr.Dataset:
+    own = (*dims, "attractor")
+    variables: dict[str, Any] = {}
+    for name in curves[0].data_vars if curves else ():
+        values = np.stack([one[name].values for one in curves])
+        tail = tuple(map(str, curves[0][name].dims))
+        variables[str(name)] = (
+            (*own, *tail),
+            values.reshape(*reason.shape, *values.shape[1:]),
+            curves[0][name].attrs,
+        )
+    about = {
+        "units": "1", "long_name": "why there is no dimension",
+        "flag_values": np.arange(len(REASONS), dtype=np.int8), "flag_meanings": " ".join(REASONS),
+    }  # fmt: skip
+    result = found[["n_cells", "share", "kind"]].transpose(*own).assign(variables)
+    kept = stay[["verdict", "n_sampled", "n_left", "lifetime_low"]].transpose(*own)
+    return result.assign(kept.data_vars).assign(reason=(own, reason, about))

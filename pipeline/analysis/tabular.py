@@ -1,0 +1,130 @@
+"""Tables of analyses: rows of numbers for programs, aligned lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+FEW_POINTS = 6
+"""Up to so many parameter points get a table each."""
+
+MOST_RANGES = 6
+"""Up to so many ranges of an axis are listed."""
+
+Row = dict[str, Any]
+
+
+def where_of(ds: xr.Dataset, at: Mapping[str, int]) -> Row:
+    """Values of the parameters at a point."""
+    return {d: float(ds[d].values[i]) for d, i in at.items()}
+
+
+def words_of(array: xr.DataArray) -> list[str]:
+    """Meanings of an array of codes."""
+    return str(array.attrs["flag_meanings"]).split()
+
+
+def unit_of(ds: xr.Dataset, dim: str) -> str:
+    """Unit of an axis after a space, nothing for 1."""
+    unit = ds[dim].attrs.get("units", "1")
+    return "" if unit == "1" else f" {unit}"
+
+
+def heading(ds: xr.Dataset, where: Row) -> list[str]:
+    """Heading of a parameter point, none if nothing is swept."""
+    text = ", ".join(f"{d} {v:g}{unit_of(ds, d)}" for d, v in where.items())
+    return [f"{text}:"] if text else []
+
+
+def number(value: float, spec: str) -> str:
+    """Format a number, a dash if it is not finite."""
+    return format(value, spec) if np.isfinite(value) else "-"
+
+
+def with_interval(row: Row) -> str:
+    """Fraction with its interval."""
+    return f"{row['fraction']:.4f} ({row['low']:.4f} to {row['high']:.4f})"
+
+
+def distinct(values: Iterable[Any]) -> str:
+    """Different values in order."""
+    return ", ".join(map(str, sorted(set(values))))
+
+
+def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
+    """Range of each axis, and the number of points."""
+    words = {}
+    for d in dims:
+        values = [row[d] for row in rows]
+        words[f"{d}{unit_of(ds, d)}"] = f"{min(values):g} to {max(values):g}"
+    return words | {"points": str(len(rows))}
+
+
+def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> str:
+    """Largest fraction and where it is."""
+    best = max(rows, key=lambda row: (np.nan_to_num(row["fraction"], nan=-1.0),))
+    where = ", ".join(f"{best[d]:g}{unit_of(ds, d)}" for d in dims)
+    return f"{number(best['fraction'], '.4f')} at {where}"
+
+
+def summary(
+    ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str], describe: Callable[..., dict[str, str]]
+) -> list[str]:
+    """Return a table with a line per id."""
+    key = "attractor_id" if rows and "attractor_id" in rows[0] else "label"
+    groups: dict[int, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row[key], []).append(row)
+    return aligned([describe(ds, groups[i], dims) for i in sorted(groups)])
+
+
+def aligned(rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """Align rows under their headings."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    cells = [names] + [[row.get(name, "") for name in names] for row in rows]
+    widths = [max(len(line[k]) for line in cells) for k in range(len(names))]
+    lines = ["  ".join(w.ljust(n) for w, n in zip(line, widths, strict=True)).rstrip() for line in cells]
+    return [f"  {line}" for line in lines] if rows else []
+
+
+def cell_counts(ds: xr.Dataset, start_dims: Sequence[str]) -> list[str]:
+    """Return a line on the cells without an attractor, if there are any."""
+    unknown = ds["attractor_id"].values < 0
+    status = ds["status"].values
+    names = str(ds["status"].attrs["flag_meanings"]).split()
+    codes = [int(c) for c in ds["status"].attrs["flag_values"]]
+    counts: dict[str, int] = {}
+    for code, name in zip(codes, names, strict=True):
+        n = int((unknown & (status == code)).sum())
+        what = "undecided" if name in ("periodic", "bounded", "inferred") else name
+        if n:
+            counts[what] = counts.get(what, 0) + n
+    if not counts:
+        return [f"all {unknown.size} cells belong to an attractor"]
+    texts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items())
+    return [f"{int((~unknown).sum())} of {unknown.size} cells belong to an attractor; {texts}"]
+
+
+def with_error(value: float, error: float, most: int = 6) -> str:
+    """Value and standard error, both to two digits of the error, of the value `most` decimals at most."""
+    if not np.isfinite(value):
+        return "-"
+    if not (np.isfinite(error) and error >= 1e-6):
+        return f"{value:.{most}g}"
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, most))
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
+
+
+def axis_ranges(ds: xr.Dataset, dim: str, rows: Sequence[Row], alone: bool) -> str:
+    """Ranges of neighbouring values of the only axis; otherwise, or if they are many, the whole range."""
+    axis = ds[dim].values.astype(np.float64)
+    values = np.array(sorted({row[dim] for row in rows}))
+    places = np.searchsorted(np.sort(axis), values)
+    parts = np.split(values, np.flatnonzero(np.diff(places) > 1) + 1)
+    if not alone or len(parts) > MOST_RANGES:
+        more = f" in {len(parts)} ranges" if alone else ""
+        return f"{values[0]:g} to {values[-1]:g}{more}"
+    return ", ".join(f"{p[0]:g}" if len(p) == 1 else f"{p[0]:g} to {p[-1]:g}" for p in parts)

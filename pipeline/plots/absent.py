@@ -1,0 +1,77 @@
+"""Cells that have nothing to draw: their share below a diagram, and what is said of an empty one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Patch
+
+from pipeline.plots import style
+from pipeline.plots.points import Survey
+
+# Greys instead of hatching: some readers of SVG paint its patterns black.
+LOOKS: dict[str, dict[str, Any]] = {
+    "pending": {"facecolor": "0.92", "edgecolor": "0.6", "linewidth": 0.4},
+    "failed": {"facecolor": "0.1", "edgecolor": "0.1", "linewidth": 0.8},
+    "not reached": {"facecolor": "0.62", "edgecolor": "0.62", "linewidth": 0.8},
+}
+
+
+def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
+    """Draw the share of absent cells in the strip, and shade the diagram where no cell is left.
+
+    Parameters
+    ----------
+    ax, strip
+        Axes of the diagram, and those below.
+    x
+        Values of the parameter.
+    survey
+        With the numbers of cells along the parameter.
+    layers
+        Those that the axes show.
+    """
+    edges = style.edges(x)
+    cells = survey.cells[list(layers)].sum(0)
+    floor = np.zeros(cells.size)
+    for name, counts in survey.absent.items():
+        share = counts[list(layers)].sum(0) / np.maximum(cells, 1)
+        if share.any():
+            style.fill_columns(strip, edges, floor, floor + share, LOOKS[name], f"absent:{name}")
+            floor = floor + share
+    strip.set_ylim(0.0, 1.0)
+    strip.set_yticks([0.5], ["absent"])
+    strip.tick_params(axis="y", which="both", right=False, left=False)
+    strip.tick_params(axis="x", which="both", top=False)
+    blank = (floor >= 1.0 - 1e-12).astype(float)
+    if blank.any():
+        looks = {"facecolor": "0.955", "linewidth": 0.0, "zorder": 1.5}
+        area = style.fill_columns(ax, edges, np.zeros(blank.size), blank, looks, "blank")
+        area.set_transform(ax.get_xaxis_transform())
+
+
+def absent_handles(survey: Survey) -> list[Patch]:
+    """Handles of a legend for what became of cells without a point."""
+    return [Patch(label=name, **LOOKS[name]) for name, counts in survey.absent.items() if counts.any()]
+
+
+def say_empty(ax: Axes, survey: Survey, shown: str = "") -> None:
+    """Say in empty axes why there is nothing to draw."""
+    n_cells = int(survey.cells.sum())
+    absent = {name: int(counts.sum()) for name, counts in survey.absent.items() if counts.any()}
+    text = f"nothing to draw: of {n_cells} cells, " + style.join(f"{n} {name}" for name, n in absent.items())
+    if not n_cells:
+        text = "nothing to draw: the cube has no cells"
+    elif absent.get("pending", 0) == n_cells:
+        text = f"nothing to draw yet: all {n_cells} cells are pending"
+    elif sum(absent.values()) < n_cells:
+        text = f"nothing to draw: no point lies {shown or 'here'}"
+    size = style.look_of(ax).label
+    width = 0.8 * style.figure_of(ax).frame.width_in
+    ax.text(
+        0.5, 0.5, style.folded(text, width, size), transform=ax.transAxes, ha="center", va="center",
+        fontsize=size, zorder=3, bbox={"facecolor": "white", "edgecolor": "none", "pad": 5.0},
+    )  # fmt: skip

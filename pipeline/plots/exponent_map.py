@@ -1,0 +1,115 @@
+"""Map of the largest Lyapunov exponent over two parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.ticker import MaxNLocator
+
+from pipeline.plots import labels, style
+from pipeline.plots.bifurcation import swept_parameters
+from pipeline.plots.lyapunov import UNITS, demand, exponent_values, rate_unit
+from pipeline.plots.selection import at_points
+
+_SHOWN = 0.98
+"""Share of the points whose exponents the scale holds, so that a few do not pale all others."""
+
+
+def plot_lyapunov_map(
+    ds: xr.Dataset,
+    *,
+    per: str = "s",
+    at: Mapping[str, float] | None = None,
+    frame: style.Frame = style.WIDE,
+) -> style.DataFigure:
+    """Draw the largest exponent over two parameters.
+
+    Parameters
+    ----------
+    ds
+        Cube with the product ``lyapunov`` over two swept parameters.
+    per
+        ``s``: per unit time [1/s]; ``period``: per drive period.
+    at
+        Values of further swept parameters.
+    frame
+        Width of the figure and ranges of its axes.
+
+    Returns
+    -------
+    DataFigure
+        At each point the largest exponent that any of its cells has: chaos shows wherever one of
+        the coexisting attractors is chaotic. White is 0, and the same distance from it has the same
+        depth of colour on both sides. Grey where no cell has one. Its `data` hold ``exponent_value`` and
+        ``chaotic_share``, the share of cells whose exponent is positive.
+
+    Raises
+    ------
+    ValueError
+        If there are no exponents, if an option is unknown, or if not two parameters are left.
+    """
+    style.check_choice("unit (per)", per, UNITS)
+    demand(ds)
+    part = at_points(ds, at)
+    swept = [d for d in swept_parameters(part) if part.sizes[d] > 1]
+    if len(swept) != 2:
+        raise ValueError(
+            f"a map is drawn over two swept parameters, and {len(swept)} are left "
+            f"({', '.join(swept) or 'none'}); choose values of the others with at"
+        )
+    values = exponent_values(part, per, spectrum=False)
+    largest = values["exponent_value"].isel(exponent=0, drop=True)
+    cells = [d for d in largest.dims if d not in swept]
+    data = xr.Dataset(
+        {
+            "exponent_value": largest.max(cells, keep_attrs=True).transpose(swept[1], swept[0]),
+            "chaotic_share": (largest > 0).mean(cells).transpose(swept[1], swept[0]),
+        },
+        attrs={"title": "largest Lyapunov exponent, maximum over the cells of each point"},
+    )
+    fig = style.new_figure(4.4, data, frame)
+    ax = fig.add_subplot()
+    style.style_axes(ax, inside=False)
+    _draw_map(fig, ax, data, part, swept)
+    style.caption(ax, labels.caption(part, drop=swept))
+    style.limits(ax, frame, *(style.span(part[d].values) for d in swept))
+    style.finish(fig)
+    return fig
+
+
+def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Dataset, swept: list[str]) -> None:
+    grid = data["exponent_value"].values
+    x, y = (style.edges(part[d].values.astype(np.float64)) for d in swept)
+    norm, extend = _scale(grid)
+    ax.set_facecolor("0.8")
+    image = ax.pcolormesh(x, y, np.ma.masked_invalid(grid), cmap="PuOr_r", norm=norm, rasterized=True)
+    image.set_gid("map")
+    style.label_axes(ax, *(labels.parameter_label(part[d]) for d in swept))
+    bar = fig.colorbar(
+        ScalarMappable(norm, "PuOr_r"), ax=ax, extend=extend, pad=0.015, aspect=32, ticks=MaxNLocator(7)
+    )
+    bar.outline.set_linewidth(style.LINE_PT)
+    bar.ax.tick_params(labelsize=fig.look.tick, width=style.LINE_PT, labelfontfamily=style.FONT)
+    bar.set_label(
+        f"largest exponent [{rate_unit(data)}]\nmaximum over the cells of each point",
+        fontsize=fig.look.label,
+    )
+
+
+def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
+    """Return a scale as far below 0 as above it, and which of its ends values exceed."""
+    known = grid[np.isfinite(grid)]
+    most = float(np.abs(known).max(initial=0.0))
+    half = float(np.quantile(np.abs(known), _SHOWN)) if known.size else 1.0
+    half = half if half > 0.0 else most or 1.0
+    if most <= 1.5 * half:
+        half = most or 1.0
+    ends = (bool((known < -half).any()), bool((known > half).any()))
+    return Normalize(-half, half), {
+        (False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"
+    }[ends]  # fmt: skip

@@ -1,0 +1,113 @@
+"""How figures become files: the picture, and beside it the data drawn, both with their provenance."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import xarray as xr
+from matplotlib.figure import Figure
+
+from pipeline.plots.style import DPI, TEXT_LOCK, DataFigure
+
+SUFFIXES = (".png", ".pdf", ".svg")
+VECTOR_DPI = 400
+"""Resolution of the images inside PDF and SVG files, which get magnified."""
+
+_SETTINGS: dict[str, Any] = {"svg.hashsalt": "magpend", "svg.fonttype": "none", "pdf.fonttype": 42}
+
+
+def save_figure(fig: Figure, path: str | Path) -> Path:
+    """Write a figure as PNG, PDF or SVG, by the suffix of the path.
+
+    The file holds no time stamp of its own and no random identifier: the same figure gives the same bytes
+    with the same version of matplotlib. Texts of PDF and SVG stay texts; PDF embeds the fonts as outlines.
+    It is written only once it has been drawn completely.
+
+    Parameters
+    ----------
+    fig
+        The figure. The attributes of the data of a `DataFigure` go into the file's metadata.
+    path
+        Where to write; the folder must exist. An existing file is replaced.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is none of .png, .pdf, .svg.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(
+            f"cannot write a figure as {str(path)!r}: "
+            f"the suffix {path.suffix!r} is not one of {', '.join(SUFFIXES)}"
+        )
+    buffer = io.BytesIO()
+    options: dict[str, Any] = {
+        "format": suffix[1:],
+        "dpi": DPI if suffix == ".png" else VECTOR_DPI,
+        "metadata": _metadata(fig.data.attrs if isinstance(fig, DataFigure) else {}, suffix),
+        "facecolor": "white",
+    }
+    with TEXT_LOCK:
+        if suffix == ".png":
+            fig.savefig(buffer, **options)
+        else:
+            _save_vectors(fig, buffer, options)
+    path.write_bytes(buffer.getvalue())
+    return path
+
+
+def save_data(fig: DataFigure, path: str | Path) -> Path:
+    """Write the data of a figure as NetCDF beside it: the same path with the suffix ``.nc``."""
+    target = Path(path).with_suffix(".nc")
+    fig.data.to_netcdf(target, engine="scipy", format="NETCDF3_64BIT")
+    return target
+
+
+def with_provenance(ds: xr.Dataset, provenance: Mapping[str, Any]) -> xr.Dataset:
+    """Return a dataset whose attributes also say where it comes from; what is no text or number, as JSON."""
+    plain = {
+        key: value if isinstance(value, str | int | float) else json.dumps(value, sort_keys=True)
+        for key, value in provenance.items()
+    }
+    return ds.assign_attrs({**ds.attrs, **plain})
+
+
+def _metadata(attrs: Mapping[Any, Any], suffix: str) -> dict[str, Any]:
+    """Metadata of a file in the words that its format has for them."""
+    title, source = str(attrs.get("title", "")), str(attrs.get("source", "magpend"))
+    rest = {k: v for k, v in attrs.items() if isinstance(v, str | int | float) and k not in ("title",)}
+    about = "; ".join(f"{key}: {value}" for key, value in rest.items()).replace("\n", ", ")
+    if suffix == ".png":
+        return {"Title": title, "Source": source, "Description": about} if attrs else {}
+    if suffix == ".pdf":
+        own = {"Title": title, "Creator": source, "Subject": about} if attrs else {}
+        return {**own, "CreationDate": None}
+    own = {"Title": title, "Source": source, "Description": about} if attrs else {}
+    return {**own, "Date": None}
+
+
+def _save_vectors(fig: Figure, buffer: io.BytesIO, options: dict[str, Any]) -> None:
+    """Save with fonts as texts and with identifiers that do not change from run to run.
+
+    matplotlib takes these from the shared settings alone; these few keys are set while the lock is held,
+    and all others are left as they are.
+    """
+    settings: Any = matplotlib.rcParams
+    before = {key: settings[key] for key in _SETTINGS}
+    settings.update(_SETTINGS)
+    try:
+        fig.savefig(buffer, **options)
+    finally:
+        settings.update(before)

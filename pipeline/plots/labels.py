@@ -1,0 +1,235 @@
+"""What the axes and captions of figures say: symbols and units of states, parameters, fixed values.
+
+All of it comes from the model and from the coordinates of what is drawn; no name is known here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.ticker import Formatter, FuncFormatter, MultipleLocator
+
+from pipeline.layout.vocabulary import model_of
+from pipeline.plots.style import check_choice, join
+
+if TYPE_CHECKING:
+    from magpend_core.models.model import Model
+
+_DEGREE_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 45, 90, 180, 360)
+_PI_STEPS = tuple(0.125 * 2**k for k in range(24))
+
+
+@dataclass(frozen=True)
+class Measure:
+    """How a state or a quantity is drawn.
+
+    Attributes
+    ----------
+    name : str
+    symbol : str
+        For an axis: between dollar signs, or the plain name.
+    unit : str
+        In which it is drawn.
+    factor : float
+        From the stored unit to that.
+    on_circle : bool
+        Whether full turns of it do not matter.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    factor: float = 1.0
+    on_circle: bool = False
+
+    @property
+    def label(self) -> str:
+        """Symbol and unit for an axis."""
+        return with_unit(self.symbol, self.unit)
+
+    @property
+    def half_turn(self) -> float:
+        """Half a turn of an angle in the unit drawn."""
+        return math.pi * self.factor
+
+    def shown(self, values: np.ndarray, *, wrap: bool = False) -> np.ndarray:
+        """Values in the unit drawn, angles brought to half a turn about 0 if asked for."""
+        folded = wrapped(values) if wrap and self.on_circle else values
+        return np.asarray(folded * self.factor if self.factor != 1.0 else folded)
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Name and unit of an axis; no unit for pure numbers."""
+    return name if unit in ("", "1") else f"{name} [{unit}]"
+
+
+def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Measure:
+    """Say how a state of a dataset is drawn.
+
+    Parameters
+    ----------
+    ds
+        Of a run, so that its model is known.
+    state
+        Name; by default the model's first.
+    degrees
+        Degrees for angles and their rates.
+
+    Raises
+    ------
+    ValueError
+        If the model has no such state, or degrees are asked for of one that is no angle.
+    """
+    model = model_of(ds)
+    state = state or model.state_names[0]
+    check_choice("state", state, model.state_names)
+    one = model.state(state)
+    return _measure(one.name, one.symbol, one.unit, degrees, one.on_circle)
+
+
+def quantity_measure(ds: xr.Dataset, name: str, degrees: bool = False) -> Measure:
+    """Say how a quantity of the model, or a state, is drawn; raises ValueError if there is none."""
+    model = model_of(ds)
+    if name in model.state_names:
+        return state_measure(ds, name, degrees)
+    check_choice("quantity", name, (*(q.name for q in model.quantities), *model.state_names))
+    one = model.quantity(name)
+    return _measure(one.name, one.symbol, one.unit, degrees, False)
+
+
+def _measure(name: str, symbol: str, unit: str, degrees: bool, on_circle: bool) -> Measure:
+    written = f"${symbol}$" if symbol else name.replace("_", " ")
+    turning = unit == "rad" or unit.startswith("rad/")
+    if degrees and not turning:
+        raise ValueError(f"{name} [{unit}] is no angle; draw it without degrees")
+    if degrees:
+        return Measure(name, written, unit.replace("rad", "deg", 1), 180.0 / math.pi, on_circle)
+    return Measure(name, written, unit, 1.0, on_circle)
+
+
+def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
+    """Say how the initial values of a state are drawn; `degrees` count for angles alone."""
+    model = model_of(ds)
+    one = model.state(dim.removesuffix("_0"))
+    return _measure(
+        dim, f"{one.symbol}(0)" if one.symbol else f"{one.name}(0)", one.unit,
+        degrees and one.unit.startswith("rad"), one.on_circle,
+    )  # fmt: skip
+
+
+def some_angle(model: Model, degrees: bool, what: str) -> None:
+    """Refuse degrees where no state is an angle."""
+    if degrees and not any(s.unit.startswith("rad") for s in model.states):
+        raise ValueError(f"{what} of {model.name} have no angle; draw them without degrees")
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """Bring angles to [-pi, pi)."""
+    return np.asarray((angle + math.pi) % (2.0 * math.pi) - math.pi)
+
+
+def on_circle(angle: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Wrap an angle and break lines over it where it leaves one edge and enters at the other."""
+    folded = wrapped(angle)
+    jumps = np.flatnonzero(np.abs(np.diff(folded)) > math.pi) + 1
+    return tuple(np.insert(values, jumps, np.nan) for values in (folded, *others))
+
+
+def angle_ticks(ax: Axes, measure: Measure, axis: str = "y", most: float | None = None) -> None:
+    """Put ticks of an angle's axis at round values: multiples of pi in wide ranges, of 15, 30 ... degrees."""
+    if not measure.on_circle:
+        return
+    low, high = ax.get_ylim() if axis == "y" else ax.get_xlim()
+    span = abs(high - low)
+    most = most or (8.5 if axis == "y" else 4.5)
+    if measure.factor != 1.0 and span > 0.5:
+        _set_step(ax, axis, _step(span, most, _DEGREE_STEPS), None)
+    elif measure.factor == 1.0 and span > 0.75 * math.pi:
+        _set_step(ax, axis, _step(span / math.pi, most, _PI_STEPS) * math.pi, FuncFormatter(pi_fraction))
+
+
+def _step(span: float, most: float, steps: Sequence[float]) -> float:
+    """Smallest step that gives at most so many intervals, or the largest one on offer."""
+    return next((step for step in steps if span / step <= most), steps[-1])
+
+
+def _set_step(ax: Axes, axis: str, step: float, formatter: Formatter | None) -> None:
+    target = ax.yaxis if axis == "y" else ax.xaxis
+    target.set_major_locator(MultipleLocator(step))
+    if formatter is not None:
+        target.set_major_formatter(formatter)
+
+
+def pi_fraction(value: float, _position: int | None = None) -> str:
+    """Write a multiple of pi/8 as a fraction of pi."""
+    eighths = round(8.0 * value / math.pi)
+    if eighths == 0:
+        return "0"
+    divisor = math.gcd(eighths, 8)
+    numerator, denominator = abs(eighths) // divisor, 8 // divisor
+    sign = "\N{MINUS SIGN}" if eighths < 0 else ""
+    factor = "" if numerator == 1 else str(numerator)
+    return f"{sign}{factor}π" + ("" if denominator == 1 else f"/{denominator}")
+
+
+def parameter_label(coordinate: xr.DataArray) -> str:
+    """Axis label of a parameter: what it is, and its unit."""
+    name = str(coordinate.attrs.get("long_name", coordinate.name))
+    if coordinate.name == "frequency":
+        name = "drive frequency"
+    return with_unit(name, str(coordinate.attrs.get("units", "Hz" if coordinate.name == "frequency" else "")))
+
+
+def swept_label(name: str, units: str) -> str:
+    """Axis label of what branches are followed along."""
+    return "drive frequency [Hz]" if name in ("frequency", "frequency_hz") else with_unit(name, units)
+
+
+def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True) -> str:
+    """Name the values at which everything drawn was taken: of parameters, then of the initial state.
+
+    Parameters
+    ----------
+    ds
+        What is drawn: its scalar coordinates and its dims of size 1 are fixed.
+    drop
+        Dims that the figure shows on its axes.
+    with_start
+        Whether to name initial states.
+    """
+    axes, states = set(drop), set(model_of(ds).state_names)
+    parameters: list[str] = []
+    starts: list[str] = []
+    for key in sorted(map(str, ds.coords)):
+        coordinate = ds.coords[key]
+        is_start = key.removesuffix("_0") in states and key.endswith("_0")
+        if coordinate.size != 1 or coordinate.dtype.kind != "f" or key in axes:
+            continue
+        (starts if is_start else parameters).append(_value(ds, coordinate, is_start))
+    return join([*parameters, *(starts if with_start else [])])
+
+
+def _value(ds: xr.Dataset, coordinate: xr.DataArray, is_start: bool) -> str:
+    name, unit = str(coordinate.name), str(coordinate.attrs.get("units", "1"))
+    value = float(coordinate.values.ravel()[0])
+    if is_start:
+        measure = start_measure(ds, name)
+        return _assignment(measure.symbol, value, measure.unit)
+    if name == "frequency":
+        return _assignment("$f$", value, "Hz")
+    return _assignment(name, value, unit)
+
+
+def _assignment(symbol: str, value: float, unit: str) -> str:
+    return f"{symbol} = {value:.6g}" + ("" if unit in ("", "1") else f"\u00a0{unit}")
+
+
+def shown_at(ds: xr.Dataset, dims: Iterable[str]) -> dict[str, Any]:
+    """Values of the parameter dims of one point, by name."""
+    return {d: float(ds[d].values.ravel()[0]) for d in dims if d in ds.coords}

@@ -1,0 +1,67 @@
+"""Colours of the kinds of motion that a model's classifier tells apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.sides import classify
+from pipeline.layout.vocabulary import model_of
+from pipeline.plots import style
+
+COLOURS = (
+    style.BLUE,
+    style.VERMILLION,
+    style.GREEN,
+    style.PURPLE,
+    style.ORANGE,
+    style.SKY,
+    "#5B3A1E",
+    "#332288",
+)
+"""Of the words of a classifier, in their order; a ninth begins again."""
+
+PLAIN = "#1A3A5C"
+"""Colour of all motions where nothing tells them apart."""
+
+
+@dataclass(frozen=True)
+class Motions:
+    """The words for the motions of a dataset, and their colours, by code.
+
+    Attributes
+    ----------
+    words, colours : tuple of str
+    drawn : tuple of int
+        Codes in the order of legends: motions, then what is neutral.
+    """
+
+    words: tuple[str, ...]
+    colours: tuple[str, ...]
+    drawn: tuple[int, ...]
+
+    @property
+    def told(self) -> bool:
+        """Whether motions are told apart."""
+        return len(self.words) > 1
+
+
+def motions_of(ds: xr.Dataset) -> Motions:
+    """Return the words and colours of the model of a dataset; one for all without a classifier."""
+    classifier = model_of(ds).classifier
+    if classifier is None:
+        return Motions(("motion",), (PLAIN,), (0,))
+    own = [c for c in range(1, len(classifier.words)) if c not in classifier.neutral]
+    colours = [style.GREY] * len(classifier.words)
+    for k, code in enumerate(own):
+        colours[code] = COLOURS[k % len(COLOURS)]
+    neutral = [c for c in range(1, len(classifier.words)) if c in classifier.neutral]
+    return Motions(classifier.words, tuple(colours), (*own, *neutral))
+
+
+def motion_codes(cells: xr.Dataset) -> xr.DataArray:
+    """Code of the motion of each cell of a cube's part, on the dims of ``status``."""
+    found = classify(cells)
+    return xr.zeros_like(cells["status"], dtype=np.int8) if found is None else found

@@ -1,0 +1,170 @@
+"""Stroboscopic section: the points of one parameter point in the plane of two states, and its zooms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.layout.vocabulary import model_of, split_dims
+from pipeline.plots import labels, palette, pixels, style
+from pipeline.plots.absent import absent_handles, say_empty
+from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.motions import Motions
+from pipeline.plots.points import View, make_view, survey
+from pipeline.plots.selection import at_points
+from pipeline.products.figures import SectionOptions
+
+COLOURS_BY = ("motion", "attractor")
+_MOST_PT, _LEAST_PT = 1.7, 0.45
+
+
+def plot_section(
+    ds: xr.Dataset,
+    attractors: xr.Dataset | None = None,
+    *,
+    states: tuple[str, str] | None = None,
+    at: Mapping[str, float] | None = None,
+    degrees: bool = False,
+    frame: style.Frame = style.WIDE,
+) -> style.DataFigure:
+    """Draw the kept sections of all cells of one parameter point in the plane of two states.
+
+    Parameters
+    ----------
+    ds
+        Cube of a sweep or a continuation, as `pipeline.open_run` gives it.
+    attractors
+        Result of `pipeline.analysis.attractors.attractors.match` of the same cube: each has its colour.
+        Without it the colours are those of the kinds of motion.
+    states
+        Names of the states to the right and upwards; by default the first that a portrait shows.
+    at
+        Values of the swept parameters.
+    degrees
+        Degrees for angles and their rates.
+    frame
+        Width of the figure; `xlim` and `ylim` choose a part, whose points are counted anew.
+
+    Returns
+    -------
+    DataFigure
+        Up to `pixels.MARKER_LIMIT` points are markers, more are counted on pixels that are the darker the
+        more there are. Its `data` hold the points, as `pipeline.plots.pixels.draw_points` says; ``x`` and
+        ``y`` are the states in the order given.
+
+    Raises
+    ------
+    ValueError
+        For an unknown state, if more than one parameter point is left, or degrees are asked for without
+        an angle.
+    """
+    part = _one_point(ds, at)
+    measures = _measures(part, states, degrees)
+    view = _view(part, measures, attractors)
+    found = survey(view, xlim=frame.xlim, ylim=frame.ylim)
+    fig = style.new_figure(4.8, xr.Dataset(), frame)
+    ax = fig.add_subplot()
+    style.style_axes(ax)
+    style.limits(ax, frame, *(_range(r, m) for r, m in zip((found.x, found.y), measures, strict=True)))
+    labels.angle_ticks(ax, measures[0], "x", 8.0)
+    labels.angle_ticks(ax, measures[1], "y")
+    style.label_axes(ax, measures[0].label, measures[1].label)
+    style.caption(ax, labels.caption(part))
+    if found.empty:
+        say_empty(ax, found, "in these ranges")
+    style.legend_above(fig, [*_handles(view, {code for _, code in found.classes}), *absent_handles(found)])
+    style.finish(fig)
+    diameter = float(np.clip(260.0 / np.sqrt(max(view.n_points, 1)), _LEAST_PT, _MOST_PT))
+    data = pixels.draw_points([pixels.Panel(ax, (0,))], view, diameter)
+    for axis, m in zip("xy", measures, strict=True):
+        data[axis].attrs = {"units": m.unit, "long_name": m.name}
+    fixed = {str(k): v.variable for k, v in part.coords.items() if not v.ndim and v.dtype.kind == "f"}
+    fig.data = data.assign_coords(fixed).assign_attrs(title="stroboscopic section")
+    return fig
+
+
+def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -> list[labels.Measure]:
+    """How the states to the right and upwards are drawn."""
+    model = model_of(part)
+    names = states or model.portraits[0]
+    for name in names:
+        style.check_choice("state", name, model.state_names)
+    turns = [degrees and model.state(name).unit.startswith("rad") for name in names]
+    if degrees and not any(turns):
+        raise ValueError(f"neither {names[0]} nor {names[1]} is an angle; draw them without degrees")
+    return [labels.state_measure(part, n, turn) for n, turn in zip(names, turns, strict=True)]
+
+
+def _view(part: xr.Dataset, measures: list[labels.Measure], attractors: xr.Dataset | None) -> View:
+    """The points, in the colours of motions or of attractors; directions are not told apart."""
+
+    def coordinates(block: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+        section = block["section"].transpose(*block["status"].dims, "period_index", "state")
+        x, y = (m.shown(section.sel(state=m.name).values) for m in measures)
+        return x, y
+
+    view = replace(make_view(part, ("section",), coordinates), layers=("",))
+    return view if attractors is None else _by_attractor(view, part, attractors)
+
+
+def _one_point(ds: xr.Dataset, at: Mapping[str, float] | None) -> xr.Dataset:
+    part = at_points(ds, at)
+    dims, _ = split_dims(part["status"])
+    long = [d for d in dims if part.sizes[d] > 1]
+    if long:
+        one = float(part[long[0]].values[part.sizes[long[0]] // 2])
+        axes = ", ".join(f"{d} ({part.sizes[d]} values)" for d in long)
+        raise ValueError(
+            f"a section is drawn of one parameter point, and the run also has {axes}: "
+            f"choose a value of each, such as --at {long[0]}={one:g}"
+        )
+    return part.isel(dict.fromkeys(dims, 0))
+
+
+def _range(found: tuple[float, float], measure: labels.Measure) -> tuple[float, float]:
+    low, high = found
+    if not low <= high:
+        return (-measure.half_turn, measure.half_turn) if measure.on_circle else (-1.0, 1.0)
+    margin = max(0.04 * (high - low), 1e-9 * max(abs(low), abs(high)), 1e-12)
+    return low - margin, high + margin
+
+
+def _handles(view: View, found: set[int]) -> list[Any]:
+    motions = view.motions
+    return [
+        style.dot(motions.words[c], motions.colours[c]) for c in motions.drawn if c in found and motions.told
+    ]
+
+
+def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
+    """Colour points by the attractor of their cell; code 0 is a cell without one."""
+    chosen = attractors
+    for dim in split_dims(attractors["attractor_id"])[0]:
+        chosen = chosen.sel({dim: float(part[dim])})
+    cast = palette.cast_of(attractors, chosen)
+    ids = sorted(cast.names)
+    motions = Motions(
+        ("no attractor", *(cast.names[i] for i in ids)), (style.GREY, *(cast.colours[i] for i in ids)),
+        (*(i + 1 for i in ids), 0),
+    )  # fmt: skip
+    codes = (chosen["attractor_id"].clip(-1) + 1).astype(np.int32)
+    marked = part.assign_coords(_kind=(codes.dims, codes.values))
+    return replace(view, ds=marked, motions=motions)
+
+
+def draw(run: Run, options: SectionOptions) -> style.DataFigure:
+    """Draw the figure ``section`` of a run."""
+    cube = run.cube()
+    at, notes = values_of(run, options)
+    found = attractors_of(run, options) if options.colour == "attractor" else None
+    model = model_of(cube)
+    pair = next((p for p in model.portraits if p[0] == options.state), (options.state, ""))
+    first, second = options.state, options.against or pair[1] or model.portraits[0][1]
+    figure = plot_section(
+        cube, found, states=(first, second), at=at, degrees=options.degrees, frame=frame_of(options)
+    )
+    return noted(figure, notes)

@@ -1,0 +1,232 @@
+"""A day with another system: every command of README and docs on runs of the Duffing oscillator.
+
+It has two states, no angles, no words for its motions and other units than the pendulum; whatever knew the
+pendulum would fail here.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+
+import pytest
+import xarray as xr
+
+from pipeline.products.registry import COMMANDS, FIGURES
+
+SWEEP = """
+kind = "sweep"
+title = "Duffing, a plane of two parameters"
+model = "duffing"
+[parameters]
+preset = "twin-well"
+[axes]
+frequency_hz = { values = [0.155, 0.159154943] }
+amplitude = { values = [0.15, 0.3] }
+[initial_conditions]
+kind = "grid"
+x = { start = -1.5, stop = 1.5, num = 5 }
+v = { start = -1.0, stop = 1.0, num = 5 }
+[integration]
+rtol = 1e-7
+atol = 1e-7
+n_transient = 60
+n_keep = 220
+[products]
+lyapunov = { n_transient = 40, n_periods = 64, n_blocks = 4 }
+extremes = { quantities = ["energy", "v"] }
+[smoke]
+axes.frequency_hz.values = [0.155]
+"""
+
+WALK = """
+kind = "continuation"
+title = "Duffing, its bent resonance"
+model = "duffing"
+[parameters]
+preset = "hardening"
+[axes]
+frequency_hz = { start = 0.16, stop = 0.30, num = 15 }
+[continuation]
+direction = "both"
+[initial_conditions]
+kind = "random"
+n = 2
+seed = 1
+x = [-1.0, 1.0]
+v = [-1.0, 1.0]
+[integration]
+rtol = 1e-8
+atol = 1e-8
+n_transient = 60
+n_keep = 12
+"""
+
+AT = {
+    "point": ["--at", "frequency_hz=0.159154943", "--at", "amplitude=0.3"],
+    "line": ["--at", "amplitude=0.15"],
+}
+
+ANALYSES = {
+    "attractors": ("sweep", []),
+    "basins": ("sweep", ["--box", "2", "--resamples", "20"]),
+    "hysteresis": ("walk", []),
+    "settling": ("sweep", ["--n-sample", "4", "--n-periods", "64"]),
+    "chaos": ("sweep", []),
+    "dimension": ("sweep", ["--n-max", "2000"]),
+    "branches": ("walk", ["--period", "1"]),
+    "curves": (
+        "walk",
+        ["--period", "1", "--second", "amplitude", "--second-from", "0.25", "--second-to", "0.35"],
+    ),
+}
+
+FIGURES_OF = {
+    "bifurcation": ("walk", ["--state", "v"]),
+    "attractors": ("walk", []),
+    "gallery": ("sweep", AT["point"]),
+    "basins": ("sweep", [*AT["point"], "--shade"]),
+    "fractions": ("sweep", AT["line"]),
+    "regimes": ("sweep", []),
+    "lyapunov": ("sweep", AT["line"]),
+    "convergence": ("sweep", AT["point"]),
+    "dimension": ("sweep", [*AT["point"], "--n-max", "2000"]),
+    "branches": ("walk", ["--period", "1"]),
+    "multipliers": ("walk", ["--period", "1"]),
+    "curves": ("walk", ANALYSES["curves"][1]),
+    "section": ("sweep", AT["point"]),
+}
+
+PICTURES = [
+    *((name, *FIGURES_OF.get(name, ("sweep", []))) for name in FIGURES),
+    ("lyapunov", "sweep", ["--map"]),
+    ("lyapunov", "sweep", ["--spectrum", "--per", "period", *AT["line"]]),
+    ("bifurcation", "sweep", ["--quantity", "energy.max", *AT["line"]]),
+    ("regimes", "sweep", ["--show", "number"]),
+    ("bifurcation", "walk", ["--layout", "side", "--width", "85", "--format", "pdf"]),
+]
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory):
+    """A folder with both runs, and what calls a command in it: code, output, errors."""
+    folder = tmp_path_factory.mktemp("duffing")
+    (folder / "sweep.toml").write_text(SWEEP)
+    (folder / "walk.toml").write_text(WALK)
+    return folder
+
+
+@pytest.fixture
+def call(day, monkeypatch, capsys):
+    from pipeline.cli.main import main
+
+    def run(*words):
+        monkeypatch.chdir(day)
+        monkeypatch.setattr(sys, "argv", ["magpend", *map(str, words)])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        captured = capsys.readouterr()
+        assert code == 0, captured.err
+        return captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def runs(call, day):
+    """Both runs, made when they are first asked for."""
+    for name in ("sweep", "walk"):
+        if not (day / name).exists():
+            out, _ = call("run", f"{name}.toml", "--out", name, "--workers", "0")
+            assert f"cube: {name}/cube.zarr" in out
+    return call
+
+
+def test_run__dry_run_smoke_and_again(call, day):
+    out, _ = call("run", "sweep.toml", "--dry-run")
+    assert "100 cells" in out
+    call("run", "sweep.toml", "--smoke", "--workers", "0", "--out", "small")
+    _, err = call("run", "sweep.toml", "--smoke", "--workers", "0", "--out", "small")
+    assert "nothing to do" in err
+
+
+def test_status_and_verify(runs):
+    for name in ("sweep", "walk"):
+        assert "complete" in runs("status", name)[0]
+        assert "intact" in runs("verify", name)[0]
+
+
+def test_cube__has_the_models_own_names(runs, day):
+    import magpend
+
+    ds = magpend.open_run(day / "sweep")
+    assert ds.state.values.tolist() == ["x", "v"]
+    assert ds.attrs["model"] == "duffing"
+    assert {"x_0", "v_0", "frequency", "amplitude"} <= set(ds.dims)
+    assert not {"turns", "side", "link"} & {*ds.variables, *ds.dims}
+    ds.to_netcdf(day / "cube.nc", engine="scipy")
+    assert magpend.Run.open(day / "sweep").model.name == "duffing"
+
+
+def test_zoom__and_run_it(runs, day):
+    runs("zoom", "sweep", "--x", "0", "1", "--num-x", "3", "--at", "frequency=0.155", "--axis", "v=0:1",
+         "--at", "amplitude=0.15", "--out", "closer.toml")  # fmt: skip
+    text = (day / "closer.toml").read_text()
+    assert "x = { start = 0.0, stop = 1.0, num = 3 }" in text
+    assert 'model = "duffing"' in text
+    runs("run", "closer.toml", "--dry-run")
+
+
+def test_simulate(call, day):
+    call("simulate", "--model", "duffing", "--x", "0.5", "--v", "0.1", "--frequency", "0.16", "--set",
+         "amplitude=0.25", "--periods", "3", "--samples", "20", "--out", "one.csv")  # fmt: skip
+    with (day / "one.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[0]["x_m"]) == 0.5
+    assert "energy_J_per_kg" in rows[0]
+    assert (day / "one.png").stat().st_size > 5000
+
+
+def test_models(call):
+    assert "duffing" in call("models")[0]
+    assert "twin-well" in call("models", "duffing")[0]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_analyse(runs, name):
+    """Prints a table for people, and the same for programs."""
+    directory, options = ANALYSES[name]
+    out, _ = runs("analyse", name, directory, *options)
+    assert out.strip()
+    rows = json.loads(runs("analyse", name, directory, *options, "--json")[0])
+    text, _ = runs("analyse", name, directory, *options, "--csv", "-")
+    assert len(list(csv.DictReader(text.splitlines()))) == len(rows)
+    if rows:
+        assert not {"side", "rotation_psi1"} & set(rows[0])
+        assert "psi" not in out
+        assert "rad" not in out.replace("gradient", "").replace("radius", "").replace("radii", "")
+    assert "magpend" not in out
+
+
+@pytest.mark.parametrize(("name", "directory", "options"), PICTURES, ids=lambda value: str(value))
+def test_plot(runs, day, name, directory, options):
+    """Draws a figure, and puts the data that it shows beside it."""
+    out, _ = runs("plot", name, directory, *options)
+    figure, data = (line.partition(": ")[2] for line in out.splitlines()[-2:])
+    assert (day / figure).stat().st_size > 2000
+    with xr.open_dataset(day / data, engine="scipy") as stored:
+        assert stored.variables
+
+
+def test_figures__have_names_of_their_own(day):
+    """No two commands above write one file."""
+    written = [p for name in ("sweep", "walk") for p in (day / name / "figures").glob("*.[!n]*")]
+    assert len(written) >= len(PICTURES) - 1
+
+
+def test_prune__removes_nothing_of_now(runs):
+    assert runs("analyse", "prune", "sweep")[0] == "nothing to remove\n"
