@@ -1,7 +1,8 @@
 """Pseudo-arclength continuation of the solutions of a problem (Keller 1977).
 
-The predictor is a step along the tangent, bent as the curve was between the last two points; the corrector is Newton's method in the plane normal to it, so
-that folds in the parameter are nothing special. Unknowns are scaled; lengths are Euclidean in them.
+The predictor is a step along the tangent, bent as the curve was between the last two points; the corrector is
+Newton's method in the plane normal to the tangent, so that folds in the parameter are nothing special.
+Unknowns are scaled; lengths are Euclidean in them.
 """
 
 from __future__ import annotations
