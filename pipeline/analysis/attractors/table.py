@@ -83,12 +83,10 @@ def _attractor(one: xr.Dataset) -> Row:
     if "mirror_partner" in one:
         row["mirror_partner"] = int(one["mirror_partner"])
         row["mirror_distance"] = float(one["mirror_distance"])
+    row["n_cells"] = int(one["n_cells"])
     if "match_basis" in one:
         row["match_basis"] = words_of(one["match_basis"])[int(one["match_basis"])]
-    basis = (
-        {"match_basis": words_of(one["match_basis"])[int(one["match_basis"])]} if "match_basis" in one else {}
-    )
-    return row | {"n_cells": int(one["n_cells"])} | basis
+    return row
 
 
 def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
