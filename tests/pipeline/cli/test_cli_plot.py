@@ -85,6 +85,7 @@ def test_plot__continuation_with_loops(main, write_spec, walk_text, tmp_path):
     code, _, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
     assert code == 0, err
     assert "hysteresis: computed" in err
-    with xr.open_dataset(tmp_path / "run" / "figures" / "attractors_degrees_psi1.nc", engine="scipy") as stored:
+    path = tmp_path / "run" / "figures" / "attractors_degrees_psi1.nc"
+    with xr.open_dataset(path, engine="scipy") as stored:
         assert {"value", "share", "present"} <= set(stored.data_vars)
         assert stored["value"].attrs["units"] == "deg"
