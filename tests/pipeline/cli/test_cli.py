@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import xarray as xr
 
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
@@ -224,6 +225,16 @@ def test_simulate__writes_series_and_figure(main, tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 0
     assert main("simulate", "--periods", "2", "--no-figure")[0] == 0
     assert not (tmp_path / "trajectory.png").exists()
+
+
+def test_simulate__data_and_provenance_beside_the_figure(main, tmp_path):
+    code, out, _ = main("simulate", "--psi1", "0.1", "--periods", "2", "--samples", "20", "--out", "a.csv")
+    assert code == 0
+    assert out.split() == ["series:", "a.csv", "figure:", "a.png", "data:", "a.nc"]
+    with xr.open_dataset(tmp_path / "a.nc", engine="scipy") as stored:
+        assert {"psi1", "path"} <= set(stored.data_vars)
+        assert {"created", "host", "versions", "parameters", "model"} <= set(stored.attrs)
+    assert stored.attrs["host"].encode() in (tmp_path / "a.png").read_bytes()
 
 
 def test_presets__values_units_and_source(main):
