@@ -11,7 +11,7 @@ Schema
 `identify` and `match` return a Dataset of the same form. Dims: the *parameter dims* of the cube
 (``frequency`` and others, in the order of the cube; none if nothing is swept), its *start dims*
 (``initial_condition``, the grid's ``<state>_0``, or ``branch``), and ``attractor``, ``point``, ``state``,
-``multiplier``, and the model's dim of angles (``link`` for the pendulum). Coordinates are those of the cube.
+``multiplier``, and the model's dim of angles. Coordinates are those of the cube.
 
 ======================== ===================================== ============ ==================================
 variable                 dims                                  dtype, fill  meaning

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 import xarray as xr
-
-from magpend_core.status import Status
 from pipeline.analysis.chaos.indicators import (
     _displacement,
     _Pairs,
@@ -12,6 +10,8 @@ from pipeline.analysis.chaos.indicators import (
     kaplan_yorke_dimension,
     zero_one_test,
 )
+
+from magpend_core.status import Status
 from pipeline.analysis.sets import Geometry
 from pipeline.products.lyapunov import LyapunovFlag
 
