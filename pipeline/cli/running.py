@@ -71,8 +71,7 @@ def run(
     if plot:
         _diagram(state.directory)
     else:
-        figure = preview.first_figure(state.plan)
-        console.result(f"plot it with: magpend plot {figure} {state.directory}")
+        console.result(f"plot it with: {preview.figure_command(state.plan, state.directory)}")
 
 
 def _diagram(directory: Path) -> None:
