@@ -16,10 +16,11 @@ import numpy as np
 
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell, seconds_per_period
+from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec
 
-BRANCHES, POINTS = 32, 4
-"""Size of the sample: two groups of lanes, and of a continuation some points of each branch."""
+BRANCHES, MOST_BRANCHES, POINTS = 32, 256, 8
+"""Size of a sample: two groups of lanes or more, and of a continuation some points of each branch."""
 
 SPEED_S = 0.25
 """Time for each of the two stretches in which the speed is measured, by the rule of thumb [s]."""
@@ -28,6 +29,7 @@ CLOSING_S = 0.8
 """Most time for finding out when cells close, by the rule of thumb [s]."""
 
 LEAST_PERIODS = 8
+NEVER_CLOSES = 1e-300
 
 
 @dataclass(frozen=True)
@@ -59,19 +61,22 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
 
     compiled_s = warm_up(spec)
     most, products = periods_per_cell(spec)
-    spec = replace(spec, products={})
-    inputs = _sample(spec, plan, np.random.default_rng(0), pairs=False)
+    # what the engine watches on the way is measured with it
+    watched = {name: o for name, o in spec.products.items() if CELL_PRODUCTS[name].integrate(o)}
+    spec = replace(spec, products=watched)
+    products -= periods_per_cell(spec)[1]
+    inputs = _sample(spec, plan, np.random.default_rng(0), BRANCHES, pairs=False)
     ratio, measured, seconds = _speed(spec, inputs, most)
     how = f"measured: {inputs.frequency_hz.size} of its cells over {measured} periods, {seconds:.1f} s"
     periods = most
     if spec.integration.stop_when_closed:
-        periods = _periods_until_closed(spec, plan, most)
+        periods = _periods_until_closed(spec, plan, most, ratio)
         how += f"; a cell takes {periods:.0f} of at most {most:.0f} periods until it has closed"
     per_cell = ratio * mean_seconds_per_period(spec) * (periods + products)
     return Estimate(per_cell * plan.n_cells, how, compiled_s)
 
 
-def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, *, pairs: bool) -> Inputs:
+def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *, pairs: bool) -> Inputs:
     """Inputs of cells drawn from all over the run.
 
     With `pairs` the points of a continuation's branch are neighbours two by two: where the second one
@@ -81,7 +86,7 @@ def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, *, pairs: bool) ->
     n_points = 1 if plan.path is None else plan.shape[plan.path]
     in_task = math.prod(plan.block) // n_points
     branches = [n for i, n in enumerate(plan.shape) if i != plan.path]
-    chosen = rng.choice(math.prod(branches), min(BRANCHES, in_task, math.prod(branches)), replace=False)
+    chosen = rng.choice(math.prod(branches), min(n_branches, in_task, math.prod(branches)), replace=False)
     parts = []
     for flat in np.sort(chosen):
         place = list(np.unravel_index(flat, branches)) if branches else []
@@ -116,48 +121,62 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
     """
     by_rule = float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).sum())
     n_periods = int(min(max(SPEED_S / by_rule, LEAST_PERIODS), most))
-    _, first_s = _integrate(spec, inputs, n_periods)
-    if first_s > 4 * SPEED_S:  # far slower than the rule says: one stretch has to do
-        return first_s / (by_rule * n_periods), n_periods, first_s
-    values, first_s = _integrate(spec, inputs, n_periods)
-    ends = values["section"][:, -1, -1]
-    later = replace(inputs, initial_states=np.where(np.isfinite(ends), ends, inputs.initial_states))
-    _, later_s = _integrate(spec, later, n_periods)
+    ends, first, seconds = _stretch(spec, inputs, n_periods)
+    if seconds > 4 * SPEED_S:  # far slower than the rule says: one stretch has to do
+        return first, n_periods, seconds
+    _, first, first_s = _stretch(spec, inputs, n_periods)
+    _, later, later_s = _stretch(spec, replace(inputs, initial_states=ends), n_periods)
     share = n_periods / most
-    return (share * first_s + (1 - share) * later_s) / (by_rule * n_periods), 2 * n_periods, first_s + later_s
+    return share * first + (1 - share) * later, 2 * n_periods, first_s + later_s
 
 
-def _integrate(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[dict[str, np.ndarray], float]:
-    """Integrate the sample for some periods without stopping; the variables, and the processor's time [s]."""
+def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, float, float]:
+    """Integrate the sample for some periods; last states, time over that of the rule, and the time [s].
+
+    The time is the processor's, so that other programs do not count.
+    """
     from pipeline.compute.task import integrate
 
+    # a tolerance that nothing meets, rather than not to stop: that would be another kernel to compile
     integration = spec.integration.model_copy(
-        update={"n_transient": n_periods - 1, "n_keep": 1, "stop_when_closed": False}
+        update={"n_transient": n_periods - 1, "n_keep": 1, "closure_tolerance": NEVER_CLOSES}
     )
     started = time.process_time()
     values = integrate(replace(spec, integration=integration), inputs)
-    return values, time.process_time() - started
+    seconds = time.process_time() - started
+    ends = values["section"][:, -1, -1]
+    a_period = seconds_per_period(inputs.frequency_hz, spec.integration.rtol)
+    by_rule = float((a_period * values["n_periods"]).sum())
+    return np.where(np.isfinite(ends), ends, inputs.initial_states), seconds / by_rule, seconds
 
 
-def _periods_until_closed(spec: Spec, plan: Plan, most: float) -> float:
-    """Mean periods of a cell in a run that stops when orbits have closed."""
+def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> float:
+    """Mean periods of a cell in a run that stops when orbits have closed.
+
+    A first sample says about how many cells there is time for.
+    """
     from pipeline.compute.task import integrate
 
-    rng, counts = np.random.default_rng(1), []
-    left = CLOSING_S
+    rng, n_keep = np.random.default_rng(1), spec.integration.n_keep
+    found, n_branches, left = np.empty(0), BRANCHES, CLOSING_S
     while left > 0:
-        inputs = _sample(spec, plan, rng, pairs=True)
-        by_rule = float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).sum())
-        cap = int(min(most, max(CLOSING_S / by_rule, LEAST_PERIODS + spec.integration.n_keep)))
-        integration = spec.integration.model_copy(update={"n_transient": cap - spec.integration.n_keep})
+        inputs = _sample(spec, plan, rng, n_branches, pairs=True)
+        a_period = ratio * float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).mean())
+        if not len(found):
+            cap = int(
+                min(most, max(CLOSING_S / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS))
+            )
+            integration = spec.integration.model_copy(update={"n_transient": cap - n_keep})
         started = time.process_time()
         values = integrate(replace(spec, integration=integration), inputs)
         left -= time.process_time() - started
         periods = values["n_periods"]
-        counts.append(periods[:, 1::2] if periods.shape[1] > 1 else periods)
-        if plan.n_cells <= BRANCHES:
+        found = np.append(found, periods[:, 1::2] if periods.shape[1] > 1 else periods)
+        per_branch = float(found.mean()) * a_period * periods.shape[1]
+        n_branches = int(np.clip(left / per_branch, 1, MOST_BRANCHES))
+        if len(found) >= plan.n_cells or n_branches < BRANCHES:
             break
-    return mean_with_tail(np.concatenate([c.ravel() for c in counts]).astype(float), cap, most)
+    return mean_with_tail(found, cap, most)
 
 
 def mean_with_tail(periods: np.ndarray, cap: float, most: float) -> float:

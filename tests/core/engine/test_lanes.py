@@ -320,7 +320,7 @@ from magpend_core.engine.observers import RECORD_LAST
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 packed, frequency, starts = (np.load("many.npz")[k] for k in ("packed", "frequency", "starts"))
 found = run_branches(packed, frequency, starts, n_transient=7, n_keep=3, rtol=1e-7, atol=1e-7)
-code = "".join(engine_of(PENDULUM_FITTED, RECORD_LAST).inspect_asm().values())
+code = "".join(engine_of(PENDULUM_FITTED, RECORD_LAST, ()).inspect_asm().values())
 digest = hashlib.sha256(found.section.tobytes() + found.n_steps.tobytes()).hexdigest()
 print(digest, "zmm" in code, "ymm" in code)
 """
