@@ -13,7 +13,8 @@ import pytest
 
 import pipeline
 from magpend_core import Status
-from pipeline.analysis.sides import Side, side
+from magpend_core.models.pendulum.sides import Side
+from pipeline.analysis.sides import classify
 from pipeline.runs.workflows import shipped_workflows
 
 # see tests/core/data/README.md for where these points come from
@@ -65,7 +66,7 @@ def test_quickstart__orbits_at_2p2_hz(ds, orbit):
 def test_quickstart__both_sides(ds, frequency):
     here = ds.sel(frequency=[frequency], method="nearest")
     closed = (here.orbit_period == 1).values.ravel()
-    sides = side(here).values.ravel()[closed]
+    sides = classify(here).values.ravel()[closed]
     assert {int(Side.LEFT), int(Side.RIGHT)} == set(sides.tolist())
 
 

@@ -14,7 +14,6 @@ import xarray as xr
 
 from magpend_core.models.model import Classifier
 from magpend_core.models.parameters import Parameters
-from magpend_core.models.pendulum.sides import Side as Side
 from pipeline.layout.vocabulary import BOUNDED, FREQUENCY_DIM, INFERRED, PERIODIC, model_of, parameters_of
 
 UNKNOWN = 0
@@ -92,7 +91,3 @@ def _label(
     known = np.isfinite(section).all(axis=(-2, -1)) & np.isin(status, _COMPUTED)
     code = classifier.classify(np.nan_to_num(section), turns, frequency, values)
     return np.where(known, code, np.int8(UNKNOWN)).astype(np.int8)
-
-
-side = classify
-ARM_LENGTHS = (0.174, 0.1788)

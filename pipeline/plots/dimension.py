@@ -21,7 +21,8 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     ----------
     ds
         Result of `pipeline.analysis.chaos.dimensions.correlation_dimension` for one set of points, or of
-        `pipeline.analysis.chaos.chaos.section_dimension` for one parameter point.
+        `pipeline.analysis.chaos.staying.section_dimension` for one parameter point: of its attractors the one
+        with the most cells among those that have a dimension.
     frame
         Width of the figure, range of the radius, and of the correlation sum.
 
@@ -35,6 +36,7 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     ValueError
         If there is more than one set, or nothing to draw.
     """
+    ds = _of_one_attractor(ds)
     several = [str(d) for d in ds["correlation_dimension"].dims if ds.sizes[d] > 1]
     if several:
         raise ValueError(f"a correlation sum is drawn of one set, and {', '.join(several)} has several")
@@ -76,6 +78,17 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     return fig
 
 
+def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
+    """Take the attractor with the most cells, of those of which there is a correlation sum."""
+    if "attractor" not in ds["correlation_dimension"].dims:
+        return ds
+    others = [d for d in ds["n_points"].dims if d != "attractor"]
+    cells = ds["n_cells"].where(ds["n_points"] > 0, 0).sum(others)
+    if not int(cells.max() if cells.size else 0):
+        raise ValueError("there is no correlation sum to draw: no bounded set stays at this point")
+    return ds.isel(attractor=int(cells.values.argmax()))
+
+
 def _scales(ds: xr.Dataset) -> str:
     """What counts as 1, such as ``1 for 1 rad, 10 rad/s``."""
     model = model_of(ds)
@@ -111,7 +124,7 @@ def _correlation(ds: xr.Dataset) -> xr.Dataset:
     x, y = one["log_radius"].values, one["log_correlation_sum"].values
     there = np.isfinite(x) & np.isfinite(y)
     if there.sum() < 3:
-        raise ValueError("there is no correlation sum to draw: no chaotic cell, or all points are one")
+        raise ValueError("there is no correlation sum to draw: all points are one")
     x, y = x[there], y[there]
     numbers = ("correlation_dimension", "correlation_dimension_stderr", "fit_low", "fit_high", "n_points")
     return xr.Dataset(

@@ -11,7 +11,7 @@ Schema
 `identify` and `match` return a Dataset of the same form. Dims: the *parameter dims* of the cube
 (``frequency`` and others, in the order of the cube; none if nothing is swept), its *start dims*
 (``initial_condition``, the grid's ``<state>_0``, or ``branch``), and ``attractor``, ``point``, ``state``,
-``multiplier``, and the model's dim of angles. Coordinates are those of the cube.
+``multiplier``, and the dim of the model's angles. Coordinates are those of the cube.
 
 ======================== ===================================== ============ ==================================
 variable                 dims                                  dtype, fill  meaning
@@ -54,7 +54,8 @@ Distances are in units of the states' scales (1 rad, 10 rad/s for the pendulum),
 states are in the units of the coordinate ``state_units``.
 From `identify` an id numbers the attractors of one parameter point (attribute ``matched`` 0), in
 lexicographic order of the least section point; from `match` it follows an attractor (``matched`` 1), and
-where that attractor is absent its row holds the fill values.
+where that attractor is absent its row holds the fill values. `match` adds ``match_basis`` (int8, parameter
+dims, attractor): what the id rests on there; `matching` says what an id is.
 
 `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the orbit, 3 approaching the
 orbit, 4 one of the set, 5 ended on the orbit when it was run on; `deciding.decide` has the criteria. A cell

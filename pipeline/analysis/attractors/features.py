@@ -2,12 +2,12 @@
 
 Half a drive period
 -------------------
-A drive whose second half is minus its first gives many systems a symmetry that takes half a period:
-``x(t) -> -x(t + T/2)``. On the section (t = 0) the image of a
-point x is therefore minus the state that the motion from x has at t = T/2, not minus x itself. The model says
-what its symmetry is. The image of a closed orbit is found in this way from its polished orbit, that of a
-bounded set from its stored points; the mirror partner is the attractor nearest to the image whose rotation
-agrees with the image's. A motion that is its own image is its own partner. Where the symmetry is approximate,
+A drive whose second half is minus its first gives many systems a symmetry that takes half a period, such as
+``y(t) -> -y(t + T/2)``. On the section (t = 0) the image of a point x is then minus the state that the motion
+from x has at t = T/2, not minus x itself. The model says what its symmetry is. The image of a closed orbit is
+found in this way from its polished orbit, that of a bounded set from its stored points; the mirror partner is
+the attractor nearest to the image whose rotation agrees with the image's. A motion that is its own image is
+its own partner. Where the symmetry is approximate (a duty cycle of 0.4927 instead of one half),
 `mirror_distance` says how well it holds.
 """
 

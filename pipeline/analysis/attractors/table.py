@@ -84,12 +84,10 @@ def _attractor(one: xr.Dataset) -> Row:
     if "mirror_partner" in one:
         row["mirror_partner"] = int(one["mirror_partner"])
         row["mirror_distance"] = float(one["mirror_distance"])
+    row["n_cells"] = int(one["n_cells"])
     if "match_basis" in one:
         row["match_basis"] = words_of(one["match_basis"])[int(one["match_basis"])]
-    basis = (
-        {"match_basis": words_of(one["match_basis"])[int(one["match_basis"])]} if "match_basis" in one else {}
-    )
-    return row | {"n_cells": int(one["n_cells"])} | basis
+    return row
 
 
 def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
@@ -145,17 +143,14 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dic
     if "mirror_partner" in rows[0]:
         partners = distinct(r["mirror_partner"] for r in rows if r["mirror_partner"] >= 0)
         words["mirror"] = partners or "-"
-    if "match_basis" in rows[0]:
-        n = sum(r["match_basis"] == "distance" for r in rows)
-        words["by distance alone"] = f"{n} points" if n else "-"
     return words
 
 
 def _evidence(bases: Sequence[str]) -> str:
     """Say what an id rests on: followed branches, doublings, or at how many points on distance alone."""
-    links = [basis for basis in bases if basis != "first_appearance"]
-    told = [name for name in ("branch", "doubling") if name in links]
-    n = links.count("distance")
+    evidence = [basis for basis in bases if basis != "first_appearance"]
+    told = [name for name in ("branch", "doubling") if name in evidence]
+    n = evidence.count("distance")
     if n and not told:
         return "distance alone"
-    return ", ".join(told + ([f"distance at {n} of {len(links)}"] if n else [])) or "-"
+    return ", ".join(told + ([f"distance at {n} of {len(evidence)}"] if n else [])) or "-"

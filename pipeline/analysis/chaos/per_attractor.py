@@ -21,8 +21,8 @@ variable                        own dims   meaning
 ``attractor_lyapunov_between``  rank       standard deviation between cells beyond their errors [1/s]
 ``attractor_kaplan_yorke``,                Kaplan-Yorke dimension of the section from these exponents, and
 ``attractor_kaplan_yorke_stderr``          its standard error
-``attractor_correlation``,                 correlation dimension of pooled sections, its sampling error, and
-``attractor_correlation_stderr``,          the slope of the lower half of its range minus that of the upper;
+``attractor_correlation``,                 correlation dimension of the pooled sections, its sampling error,
+``attractor_correlation_stderr``,          and the slope of the lower half of its range minus the upper;
 ``attractor_correlation_spread``           of bounded sets with points enough
 ``median_zero_one``,                       K over its cells
 ``least_zero_one``,

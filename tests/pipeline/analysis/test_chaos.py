@@ -1,4 +1,4 @@
-"""Chaos of a cube's cells: motion, means with errors, transients; what is printed and refused."""
+"""Chaos of cells and of attractors: exponents, transients, dimensions; what is printed and refused."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from magpend_core import Status, load_preset, polish_orbits
+from magpend_core import Status
 from pipeline import open_run
-from pipeline.analysis.chaos.chaos import chaos, section_dimension
-from pipeline.analysis.chaos.lyapunov import pooled_mean
-from pipeline.cli.analyse import CHAOS_OPTIONS, DIMENSION_OPTIONS
+from pipeline.analysis.attractors.attractors import identify
+from pipeline.analysis.chaos.chaos import chaos, chaotic_cells
+from pipeline.analysis.chaos.lyapunov import Motion, pooled_mean
+from pipeline.analysis.chaos.per_attractor import Nature
+from pipeline.analysis.chaos.staying import section_dimension
+from pipeline.analysis.chaos.table import chaos_table, dimension_table
 from pipeline.cli.exits import Exit
 from pipeline.plots import plot_convergence, plot_dimension
-from pipeline.products import derived
-from pipeline.products import tables as report
+from pipeline.runs.derive import derive
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 SPREAD = np.array([0.0, -0.4, -0.9, -1.5])
@@ -49,22 +51,78 @@ def made_up(first, frequency=(2.0,), *, stderr=0.02, n_blocks=16, n_keep=5):
     )
 
 
-def test_chaos__means_by_motion():
-    found = chaos(made_up([0.3, 0.36, -0.2, 0.01]))
-    assert found.n_cells.values.tolist() == [[0, 1, 1, 2, 0, 2]]
-    chaotic = found.isel(frequency=0).sel(kind="chaotic")
-    assert chaotic.mean_lyapunov.values == pytest.approx(0.33 + SPREAD)
+def attractors_of(cube, ids, kinds, periods=None, multipliers=None):
+    """Attractors by hand: `ids` of the cells (frequency, cell), `kinds` (frequency, attractor)."""
+    ids, kinds = np.atleast_2d(ids), np.atleast_2d(kinds)
+    periods = np.where(kinds == 1, 1, 0) if periods is None else np.atleast_2d(periods)
+    mu = np.full((*kinds.shape, 4), np.nan) if multipliers is None else np.asarray(multipliers, float)
+    at, cells = ("frequency", "attractor"), ("frequency", "initial_condition")
+    counts = np.stack([(ids == i).sum(1) for i in range(kinds.shape[1])], 1)
+    stable = np.where(np.isfinite(mu[..., 0]), np.abs(mu).max(-1) < 1, -1)
+    return xr.Dataset(
+        {
+            "attractor_id": (cells, ids.astype(np.int32)),
+            "kind": (at, kinds.astype(np.int8), {"flag_meanings": "absent closed_orbit bounded_set"}),
+            "orbit_period": (at, periods.astype(np.int32)),
+            "n_cells": (at, counts),
+            "share": (at, counts / ids.shape[1]),
+            "multiplier_real": ((*at, "multiplier"), mu),
+            "multiplier_imag": ((*at, "multiplier"), np.where(np.isfinite(mu), 0.0, np.nan)),
+            "is_stable": (at, stable.astype(np.int8)),
+        },
+        coords={"frequency": cube["frequency"], "attractor": np.arange(kinds.shape[1])},
+    )
+
+
+def one_set(cube):
+    """All cells on one bounded set."""
+    shape = cube["status"].shape
+    return attractors_of(cube, np.zeros(shape, int), np.full((shape[0], 1), 2))
+
+
+def test_chaos__exponents_of_each_attractor():
+    """Two sets side by side: no mean over both, and no bias by which cells count as chaotic."""
+    cube = made_up([0.3, 0.36, 0.8, 0.8])
+    found = chaos(cube, attractors_of(cube, [0, 0, 1, 1], [2, 2])).isel(frequency=0)
+    assert found.attractor_lyapunov.values[0] == pytest.approx(0.33 + SPREAD)
+    assert found.attractor_lyapunov.values[1] == pytest.approx(0.8 + SPREAD)
     # two cells 0.06 apart with errors of 0.02: variance 0.0018 between, of which 0.0004 is explained
-    assert chaotic.mean_lyapunov_stderr.values == pytest.approx(np.sqrt(0.0018 / 2))
-    assert chaotic.mean_lyapunov_between.values == pytest.approx(np.sqrt(0.0014))
-    assert chaotic.mean_lyapunov_per_period.values == pytest.approx((0.33 + SPREAD) / 2.0)
-    assert chaotic.mean_lyapunov_per_period_stderr.values == pytest.approx(np.sqrt(0.0018 / 2) / 2.0)
-    # one cell has its own error
-    assert found.mean_lyapunov_stderr.sel(kind="regular").values == pytest.approx(0.02)
-    # sums 0.3, 0.2, -0.4 and 0.36, 0.32, -0.22
-    dimensions = [2 + 0.2 / 0.6, 2 + 0.32 / 0.54]
-    assert found.kaplan_yorke_dimension.values[0, :3] == pytest.approx([*dimensions, 0.0])
-    assert chaotic.mean_kaplan_yorke.item() == pytest.approx(np.mean(dimensions))
+    assert found.attractor_lyapunov_stderr.values[0] == pytest.approx(np.sqrt(0.0018 / 2))
+    assert found.attractor_lyapunov_between.values[0] == pytest.approx(np.sqrt(0.0014))
+    assert found.nature.values.tolist() == [Nature.CHAOTIC, Nature.HYPERCHAOTIC]
+    assert found.exponents_from.values.tolist() == [2, 2]
+    # sums 0.33, 0.26, -0.31
+    assert found.attractor_kaplan_yorke.values[0] == pytest.approx(2 + 0.26 / 0.57)
+    assert found.kaplan_yorke_dimension.values[:2] == pytest.approx([2 + 0.2 / 0.6, 2 + 0.32 / 0.54])
+    assert found.share.values.tolist() == [0.5, 0.5]
+    row = chaos_table(chaos(cube, one_set(cube))).rows[0]
+    assert row["lyapunov_1_per_period"] == pytest.approx(row["lyapunov_1"] / 2.0)
+
+
+def test_chaos__exponents_of_orbits_are_their_multipliers():
+    cube = made_up([[-0.2, -0.3]])[["section", "status", "orbit_period"]].isel(period_index=slice(0, 1))
+    cube = cube.isel(period_index=np.zeros(200, int))
+    cube["status"][:] = 1
+    cube["orbit_period"][:] = 2
+    mu = np.array([[[0.9, -0.5, 0.2, 0.1]]])
+    found = chaos(cube, attractors_of(cube, [0, 0], [1], [2], mu)).isel(frequency=0, attractor=0)
+    assert found.attractor_lyapunov.values == pytest.approx(np.log([0.9, 0.5, 0.2, 0.1]) * 2.0 / 2)
+    assert found.exponents_from == 1
+    assert found.attractor_kaplan_yorke == 0
+    assert found.nature == Nature.REGULAR
+
+
+def test_chaos__a_closed_cell_with_a_positive_exponent():
+    """It closed on an unstable orbit or by chance: not regular, and said so."""
+    cube = made_up([0.736, -0.2, 0.01])
+    cube["status"][:] = 1
+    cube["orbit_period"][:] = 3
+    cells = chaotic_cells(cube)
+    assert cells.motion.values.tolist() == [[Motion.UNDECIDED, Motion.REGULAR, Motion.REGULAR]]
+    assert cells.contradicts.values.tolist() == [[1, 0, 0]]
+    table = chaos_table(chaos(cube, attractors_of(cube, [0, 0, 0], [1])))
+    assert table.rows[0]["n_contradicting"] == 1
+    assert "1 closed with a positive exponent" in "\n".join(table.lines)
 
 
 def test_pooled_mean__covers_what_it_says():
@@ -82,26 +140,28 @@ def test_pooled_mean__covers_what_it_says():
 def test_chaos__exponents_after_the_first_are_of_good_cells():
     cube = made_up([0.3, 0.36])
     cube["lyapunov_flag"][0, 1] = 3
-    found = chaos(cube).isel(frequency=0).sel(kind="chaotic")
-    assert found.mean_lyapunov.values == pytest.approx([0.33, -0.1, -0.6, -1.2])
+    found = chaos(cube, one_set(cube)).isel(frequency=0, attractor=0)
+    assert found.attractor_lyapunov.values == pytest.approx([0.33, -0.1, -0.6, -1.2])
     assert int(found.n_unresolved) == 1
     cube["lyapunov_flag"][0, 1] = 4
-    found = chaos(cube).isel(frequency=0)
-    assert found.n_failed.sel(kind="unknown") == 1
-    assert found.mean_lyapunov.sel(kind="chaotic").values[0] == pytest.approx(0.3)
+    found = chaos(cube, one_set(cube)).isel(frequency=0, attractor=0)
+    assert int(found.n_failed) == 1
+    assert found.attractor_lyapunov.values[0] == pytest.approx(0.3)
 
 
 def test_chaos__transients_and_drift():
     cube = made_up([0.3, 0.3, 0.3])
     cube["lyapunov_blocks"][0, 0, 11:, 0] -= 0.8  # chaos for 11 of 16 blocks, then decay
     cube["lyapunov_blocks"][0, 1, 8:, 0] += 0.5  # drifts, but stays chaotic
-    found = chaos(cube).isel(frequency=0)
+    found = chaos(cube, one_set(cube)).isel(frequency=0, attractor=0)
     assert found.is_transient.values.tolist() == [1, 0, 0]
-    row = found.sel(kind="chaotic")
-    assert (int(row.n_transient), int(row.n_drifting), int(row.n_cells)) == (1, 2, 3)
+    assert (int(found.n_transient), int(found.n_drifting), int(found.n_cells)) == (1, 2, 3)
+    assert found.nature == Nature.CHAOTIC
+    gone = chaos(cube.isel(initial_condition=[0]), one_set(cube.isel(initial_condition=[0])))
+    assert gone.nature.item() == Nature.TRANSIENT
     # an orbit with complex multipliers, on which chaos ends: means of -0.1 among swings of 0.2
     cube["lyapunov_blocks"][0, 2, 8:, 0] = -0.1 + 0.2 * np.resize([1.0, -1.0], 8)
-    assert chaos(cube).is_transient.values.tolist() == [[1, 0, 1]]
+    assert chaotic_cells(cube).is_transient.values.tolist() == [[1, 0, 1]]
     # lasting chaos that is weaker at the end, and an orbit from the beginning
     cube["lyapunov_blocks"][0, 0, 12:, 0] = 0.02
     cube["lyapunov_blocks"][0, 2, :, 0] = -0.1 + 0.2 * np.resize([1.0, -1.0], 16)
@@ -110,61 +170,79 @@ def test_chaos__transients_and_drift():
     cube["lyapunov_blocks"][0, 1, :, 0] = step + 0.12 * np.resize([1.0, -1.0], 16)
     # an orbit that is approached along a slower direction first
     cube["lyapunov_blocks"][0, 0, :, 0] = np.repeat([-0.01, -0.3], 8) + 1e-3 * np.resize([1.0, -1.0], 16)
-    assert chaos(cube).is_transient.values.tolist() == [[0, 0, 0]]
-    few = chaos(cube.isel(block=slice(0, 11)))
+    assert chaotic_cells(cube).is_transient.values.tolist() == [[0, 0, 0]]
+    few = chaotic_cells(cube.isel(block=slice(0, 11)))
     assert few.is_transient.values.tolist() == [[-1, -1, -1]]
 
 
-def test_chaos__hyperchaotic_and_chaotic_cells_together():
-    # the second exponents are 0.05 and 0.2, with errors of 0.02
-    ds = chaos(made_up([0.45, 0.6]))
-    assert ds.n_cells.values.tolist() == [[0, 0, 0, 1, 1, 2]]
-    assert ds.mean_lyapunov.sel(kind="all_chaotic").values[0, 0] == pytest.approx(0.525)
-    assert [row["motion"] for row in report.chaos_rows(ds)] == ["chaotic", "hyperchaotic", "all_chaotic"]
-    one = chaos(made_up([0.3, 0.36]))
-    assert [row["motion"] for row in report.chaos_rows(one)] == ["chaotic"]
-
-
 def test_chaos__zero_one_needs_sections():
-    short = chaos(made_up([0.3]))
+    cube = made_up([0.3])
+    short = chaos(cube, one_set(cube))
     assert "0-1 test: 5 sections, and it needs 200; raise n_keep" in short.attrs["not_computed"]
     assert "zero_one" not in short
-    noise = chaos(made_up([0.3], n_keep=400))
+    cube = made_up([0.3], n_keep=400)
+    noise = chaos(cube, one_set(cube))
     assert noise.attrs["not_computed"] == ""
     assert noise.zero_one.values[0, 0] > 0.9
-    assert noise.median_zero_one.sel(kind="chaotic").item() == noise.zero_one.values[0, 0]
+    assert noise.median_zero_one.item() == noise.zero_one.values[0, 0]
 
 
 def test_chaos__without_exponents():
     cube = made_up([0.3, -0.2], n_keep=256)[["section", "status", "orbit_period"]]
     cube["orbit_period"][0, 1] = 2
-    found = chaos(cube)
+    found = chaos(cube, attractors_of(cube, [0, 1], [2, 1]))
     assert "run it with [products] lyapunov" in found.attrs["not_computed"]
-    assert found.n_cells.values.tolist() == [[1, 1, 0, 0, 0, 0]]
-    assert np.isfinite(found.median_zero_one.sel(kind="unknown")).all()
+    assert found.motion.values.tolist() == [[Motion.UNKNOWN, Motion.REGULAR]]
+    # K near 1 alone tells, and says what it rests on
+    assert found.nature.values.tolist() == [[Nature.CHAOTIC_BY_TEST, Nature.REGULAR]]
+    assert "chaotic (by the 0-1 test)" in "\n".join(chaos_table(found).lines)
     with pytest.raises(ValueError, match=r"nothing to compute\. Lyapunov exponents.*0-1 test: 128 sections"):
-        chaos(cube, stride=2)
+        chaos(cube, one_set(cube), stride=2)
 
 
-def test_options__are_those_of_the_analysis():
-    assert {p.name: p.default for p in CHAOS_OPTIONS} == derived.chaos_defaults()
+def test_chaos__correlation_dimension_of_enough_points():
+    cube = on_a_plane()
+    found = chaos(cube, attractors_of(cube, [0] * 8 + [1, 1], [2, 2]), n_max=4000).isel(frequency=0)
+    assert found.attractor_correlation.values[0] == pytest.approx(2.0, abs=0.15)
+    assert np.isnan(found.attractor_correlation.values[1])
+    without = chaos(cube, one_set(cube), n_max=0)
+    assert np.isnan(without.attractor_correlation.values).all()
 
 
-def test_chaos_lines__a_summary_if_there_are_many_points():
+def test_chaos__attractors_of_another_cube():
+    cube = made_up([0.3, 0.3])
+    with pytest.raises(ValueError, match="other cells"):
+        chaos(cube, one_set(cube.isel(initial_condition=[0])))
+
+
+def test_chaos_table__a_summary_if_there_are_many_points():
     frequency = np.arange(8) * 0.5 + 1.0
     rates = np.full((8, 2), -0.2)
     rates[[0, 1, 4], 0] = [0.3, 0.38, 0.33]
-    ds = chaos(made_up(rates, frequency))
-    lines = report.chaos_lines(ds, report.chaos_rows(ds))
-    assert lines[0] == "motion of 16 cells at 8 parameter points"
-    assert re.search(r"^  regular +13 +8 +1 to 4\.5$", lines[2])
-    assert re.search(r"^  chaotic +3 +3 +1 to 1\.5, 3$", lines[3])
-    assert lines[4] == (
-        "  largest mean of exponent 1: 0.380 ± 0.020 per s, 0.253 ± 0.013 per drive period, chaotic, "
+    cube = made_up(rates, frequency)
+    table = chaos_table(chaos(cube, attractors_of(cube, np.tile([0, 1], (8, 1)), np.full((8, 2), 2))))
+    assert table.lines[0] == "16 cells at 8 parameter points"
+    assert re.search(r"^  regular +0, 1 +13 +8 +1 to 4\.5$", table.lines[2])
+    assert re.search(r"^  chaotic +0 +3 +3 +1 to 1\.5, 3$", table.lines[3])
+    assert table.lines[4] == (
+        "  largest exponent: 0.380 ± 0.020 per s, 0.253 ± 0.013 per drive period, attractor 0, chaotic, "
         "at frequency 1.5 Hz"
     )
-    assert "-0.200 ± 0.0" in lines[5]
-    assert lines[6] == "  cells flagged: none"
+    assert table.lines[5] == "  cells flagged: none"
+
+
+def test_chaos__lyapunov_max_of_attractors_is_the_first_exponent():
+    """Both leave transients out, and take cells of which the first exponent alone is resolved."""
+    cube = made_up([0.3, 0.34, 0.9, 0.5]).assign_attrs(closure_tolerance=1e-6)
+    cube["section"][0] = cube["section"].values[0, 0] + 1e-3
+    cube["lyapunov_flag"][0, 1] = 3
+    cube["lyapunov_flag"][0, 2] = 2
+    cube["lyapunov_blocks"][0, 3, 11:, 0] -= 1.2
+    found = identify(cube, polish=False)
+    assert found.sizes["attractor"] == 1
+    own = chaos(cube, found)
+    assert found["lyapunov_max"].item() == pytest.approx(0.32)
+    assert own["attractor_lyapunov"].values[0, 0, 0] == pytest.approx(found["lyapunov_max"].item())
 
 
 RUN = """
@@ -199,46 +277,39 @@ def run(tmp_path_factory):
 
 
 def test_analyse_chaos__order_and_chaos(main, run, tmp_path):
-    code, out, err = main("analyse", run, "chaos", "--csv", tmp_path / "c.csv")
-    assert (code, err) == (0, "")
+    code, out, err = main("analyse", "chaos", run, "--csv", tmp_path / "c.csv")
+    assert code == 0, err
     at = out.index("frequency 2.4 Hz:")
-    assert re.search(r"regular +4 +0 ", out[:at])
-    assert re.search(r"chaotic +\d ", out[at:])
-    assert re.search(r"chaotic +s +0\.\d+ ± 0\.\d+", out[at:])
-    assert re.search(r"chaotic +drive period +0\.\d+ ± 0\.\d+", out[at:])
+    assert re.search(r"regular +1 +\d+ ", out[:at])
+    assert re.search(r"chaotic +- +\d+ +[01]\.\d+ +0\.\d+ ± 0\.\d+, ", out[at:])
     with (tmp_path / "c.csv").open() as file:
         rows = list(csv.DictReader(file))
-    regular = next(row for row in rows if row["motion"] == "regular")
-    # the logarithms of the multipliers of the orbits, which are of several periods
-    closed = open_run(run).sel(frequency=2.2)
-    orbit = polish_orbits(
-        np.tile(load_preset().pack(), (4, 1)), np.full(4, 2.2), closed.section.values[:, -1],
-        closed.orbit_period.values,
-    )  # fmt: skip
-    growth = np.log(np.abs(orbit.multipliers)).max(axis=1) * 2.2 / closed.orbit_period.values
-    assert float(regular["lyapunov_1"]) == pytest.approx(growth.mean(), abs=1e-4)
+    closed = [row for row in rows if row["nature"] == "regular"]
+    found = derive(run, "attractors")
+    for row in closed:  # the logarithm of the largest multiplier, and close to what was measured
+        one = found.sel(frequency=float(row["frequency"]), attractor=int(row["attractor_id"]))
+        assert float(row["lyapunov_1"]) == pytest.approx(float(one["lyapunov_max"]), rel=1e-12)
+        cells = open_run(run).sel(frequency=float(row["frequency"]))
+        own = cells.lyapunov.isel(exponent=0).values[one["attractor_id"].values == int(row["attractor_id"])]
+        assert float(row["lyapunov_1"]) == pytest.approx(own.mean(), abs=1e-3)
     for row in rows:
         per_period = float(row["lyapunov_1"]) / float(row["frequency"])
         assert float(row["lyapunov_1_per_period"]) == pytest.approx(per_period, rel=1e-12)
-    assert main("analyse", run, "chaos")[1].startswith("chaos: taken from")
-    assert main("analyse", run, "chaos", "--least", "0.01")[1].startswith("chaos: computed")
+    assert "chaos: taken from" in main("analyse", "chaos", run)[2]
+    assert "chaos: computed" in main("analyse", "chaos", run, "--least", "0.01")[2]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--n-sigma", "0"], "n_sigma = 0 is out of bounds: it must be greater than 0."),
-        (["--least", "-1"], "least = -1 is out of bounds: it must be 0 or more."),
-        (["--n-frequencies", "9"], "n_frequencies = 9 is out of bounds: it must be 10 or more."),
-        (["--stride", "0"], "stride = 0 is out of bounds: it must be 1 or more."),
-        (["--seed", "-1"], "seed = -1 is out of bounds: it must be 0 or more."),
-        (["--least", "nan"], "least = nan: must be a number."),
-        ([], "nothing to compute. Lyapunov exponents: the cube has none"),
+        (["--n-sigma", "0"], "n_sigma = 0.0 is out of bounds"),
+        (["--n-frequencies", "9"], "n_frequencies = 9 is out of bounds"),
+        ([], "nothing to compute. Lyapunov exponents of what does not close: the cube has none"),
     ],
 )
 def test_analyse_chaos__refused_before_computing(main, made, arguments, message):
     made.commit(0)
-    code, out, err = main("analyse", made.info.directory, "chaos", *arguments)
+    code, out, err = main("analyse", "chaos", made.info.directory, *arguments)
     assert (code, out) == (Exit.REFUSED, "")
     assert message in err
     assert not (made.info.directory / "derived").exists()
@@ -259,40 +330,63 @@ def on_a_plane(n_cells=8, n_keep=500):
     return cube
 
 
-def test_section_dimension__pools_the_chaotic_cells():
+@pytest.fixture
+def verdicts(monkeypatch):
+    """Let sets stay (1) or not (2) instead of running them on."""
+
+    def stay(*codes):
+        def lifetimes(ds, found, options):
+            values = np.broadcast_to(np.array(codes, np.int8), found["kind"].shape)
+            own = found["kind"].dims
+            return xr.Dataset(
+                {
+                    "verdict": (own, values), "n_sampled": (own, 4 + 0 * values),
+                    "n_left": (own, 4 * (values == 2)), "lifetime_low": (own, np.full(values.shape, 99.0)),
+                },
+                found.coords,
+            )  # fmt: skip
+
+        monkeypatch.setattr("pipeline.analysis.chaos.staying.lifetimes", lifetimes)
+
+    return stay
+
+
+def test_section_dimension__of_each_set_that_stays(verdicts):
     cube = on_a_plane()
-    found = section_dimension(cube, at={"frequency": 2.0})
-    assert (int(found.n_cells[0]), int(found.n_points[0])) == (8, 4000)
+    verdicts(1, 2, 0)
+    found = section_dimension(
+        cube, attractors_of(cube, [0] * 8 + [1, 2], [2, 2, 1]), at={"frequency": 2.0}
+    ).isel(frequency=0)
+    assert found.n_points.values.tolist() == [4000, 0, 0]
     assert float(found.correlation_dimension[0]) == pytest.approx(2.0, abs=0.1)
-    # without exponents, the cells that do not close
-    bare = cube[["section", "status", "orbit_period"]]
-    bare["orbit_period"][0, 0] = 1
-    found = section_dimension(bare)
-    assert (int(found.n_cells[0]), int(found.n_points[0])) == (9, 4500)
+    # what leaves has none, whatever its sections fill
+    assert np.isnan(found.correlation_dimension.values[1:]).all()
+    assert found.reason.values.tolist() == [0, 3, 2]
+    lines = dimension_table(found.expand_dims("frequency")).lines
+    assert re.search(r"none: a transient", lines[3])
+    assert "4 of 4 left" in lines[3]
 
 
-def test_section_dimension__nothing_chaotic():
-    ds = section_dimension(made_up([-0.2, -0.3], n_keep=50))
-    rows = report.dimension_rows(ds)
-    assert (rows[0]["n_cells"], rows[0]["n_points"]) == (0, 0)
-    assert "no chaotic cell" in report.dimension_lines(ds, rows)[2]
-    few = section_dimension(made_up([0.3, 0.3], n_keep=50))
-    assert "too few points" in report.dimension_lines(few, report.dimension_rows(few))[2]
-
-
-def test_dimension_options__are_those_of_the_analysis():
-    assert {p.name: p.default for p in DIMENSION_OPTIONS} == derived.dimension_defaults()
+def test_section_dimension__nothing_to_measure(verdicts):
+    verdicts(1)
+    cube = made_up([0.3, 0.3], n_keep=50)
+    closed = section_dimension(cube, attractors_of(cube, [0, 0], [1]))
+    assert "no bounded set" in dimension_table(closed).lines[1]
+    few = section_dimension(cube, one_set(cube))
+    assert "none: too few points" in dimension_table(few).lines[2]
 
 
 def artists(fig, gid):
     return [a for a in fig.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)]
 
 
-def test_plot_dimension__curve_fit_and_slope():
-    ds = section_dimension(on_a_plane())
+def test_plot_dimension__curve_fit_and_slope(verdicts):
+    verdicts(1)
+    cube = on_a_plane()
+    ds = section_dimension(cube, attractors_of(cube, [0] * 8 + [-1, -1], [2]))
     fig = plot_dimension(ds)
     (curve,), (slope,), (fit,) = (artists(fig, g) for g in ("correlation_sum", "local_slope", "fit"))
-    one = ds.isel(frequency=0)
+    one = ds.isel(frequency=0, attractor=0)
     known = np.isfinite(one.log_correlation_sum.values)
     assert np.log(curve.get_ydata()) == pytest.approx(one.log_correlation_sum.values[known])
     low, high = (float(one[name]) for name in ("fit_low", "fit_high"))
@@ -308,8 +402,8 @@ def test_plot_dimension__curve_fit_and_slope():
     assert at == pytest.approx(np.log(curve.get_ydata())[inside], abs=0.05)
     with pytest.raises(ValueError, match="frequency has several"):
         plot_dimension(xr.concat([ds, ds], "frequency"))
-    with pytest.raises(ValueError, match="no chaotic cell"):
-        plot_dimension(section_dimension(made_up([-0.2])))
+    with pytest.raises(ValueError, match="no bounded set stays"):
+        plot_dimension(section_dimension(cube, attractors_of(cube, [0] * 10, [1])))
 
 
 # ---- convergence -------------------------------------------------------------------------------
@@ -330,7 +424,7 @@ def test_plot_convergence__lines_bands_and_transients():
     assert len(artists(fig, "running:regular")) == 1
     assert fig.data["exponent_stderr"].values == pytest.approx(0.01)
     assert artists(fig, "band:regular")[0].get_height() == pytest.approx(2 * 0.01)
-    below = artists(fig, "in_block")
+    below = artists(fig, "in_block:chaotic")
     assert below[0].get_ydata() == pytest.approx(blocks)
     assert below[0].get_xdata()[:2].tolist() == [10.0, 30.0]
     assert fig.axes[0].get_title(loc="left") == "frequency 2 Hz"

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis import tables as report
+from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.basins.basins import basins as basins_of
+from pipeline.analysis.basins.table import basins_table
+from pipeline.analysis.tabular import FEW_POINTS
 from pipeline.cli.exits import Exit
 from pipeline.runs.derive import derive
 
@@ -177,7 +179,7 @@ def test_analyse__refused_before_computing(main, made, arguments, message):
 
 
 def test_report__a_line_per_attractor_if_there_are_many_points():
-    n = report.FEW_POINTS + 1
+    n = FEW_POINTS + 1
     frequency = 2.0 + 0.5 * np.arange(n)
     kind = np.ones((n, 2), np.int8)
     kind[:4, 1] = 0
@@ -209,7 +211,7 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
         },
         coords={"frequency": ("frequency", frequency, {"units": "Hz"}), "attractor": [0, 1]},
     )
-    lines = report.attractor_lines(ds, report.attractor_rows(ds))
+    lines = attractors_table(ds).lines
     assert lines[0] == f"2 attractors at {n} parameter points"
     assert lines[1].split()[:3] == ["id", "kind", "periods"]
     assert re.search(r"^  0 +closed orbit +1 +unknown +2 to 5 +7 +56 +1\.0000 at 2 Hz", lines[2])
@@ -217,15 +219,15 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
     assert lines[4] == "all 70 cells belong to an attractor"
     cube = ds[["status"]].assign(n_periods=ds["status"])
     measured = basins_of(cube, ds)
-    lines = report.basin_lines(measured, report.basin_rows(measured))
+    lines = basins_table(measured).lines
     assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz", lines[3])
     assert lines[4] == "not computed: boundaries: the starts are no grid"
     assert not any("inferred" in line for line in lines)
     refined = ds["status"].where(cells == 0, 7).astype(np.int8).assign_attrs(flags)
     measured = basins_of(cube, ds.assign(status=refined))
-    rows = report.basin_rows(measured)
+    rows = basins_table(measured).rows
     assert [row["n_inferred"] for row in rows] == [row["n_cells"] * (row["label"] == 1) for row in rows]
-    lines = report.basin_lines(measured, rows)
+    lines = basins_table(measured).lines
     assert lines[1].endswith("inferred cells")
     assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz +14$", lines[3])
 
