@@ -208,7 +208,7 @@ def test_plot_branches__names_cover_no_line():
     names = [t for t in ax.texts if t.get_text() == "F1"]
     assert names
     for text in names:
-        # without the line that leads to it
+        text.get_window_extent()  # finds its place; what it returns also holds the line that leads to it
         box = Text.get_window_extent(text)
         for line in ax.get_lines():
             x, y = ax.transData.transform(np.asarray(line.get_xydata())).T
