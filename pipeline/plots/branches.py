@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
@@ -201,7 +202,7 @@ def _name(ax: Axes, names: list[_Name]) -> None:
             ax.annotate(
                 name.text, (name.x, y), tuple(spot - anchor), textcoords="offset points", ha="center",
                 va="center", fontsize=_NAME_PT, fontfamily=style.FONT, zorder=9.0, gid=f"name:{name.text}",
-                arrowprops=_LEADER,
+                arrowprops=_LEADER, path_effects=[withStroke(linewidth=1.5, foreground="white")],
             )  # fmt: skip
             break
 
