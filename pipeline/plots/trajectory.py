@@ -79,10 +79,8 @@ def plot_trajectory(
         handles += _draw_path(path, ds, drawing, Motion(series, section, "0.35"))
     if frame.xlim:
         axes[-1].set_xlim(*style.check_range("xlim", frame.xlim))
-    style.caption(axes[0], _place(ds))
-    style.legend_above(fig, handles)
     fig.align_ylabels(axes)
-    style.finish(fig)
+    style.complete(fig, axes[0], _place(ds), handles)
     if path is not None:
         equalise(path)
     return fig
