@@ -54,14 +54,10 @@ def plot_branches(
         From `pipeline.analysis.branches`.
     cube
         Sweep or continuation over the same parameter, drawn below.
-    state
-        Name of the state drawn; by default the model's first.
+    state, degrees, at
+        As for `plot_bifurcation`.
     max_period
         Longest period drawn; by default all.
-    degrees
-        Degrees instead of radians.
-    at
-        Values of further parameters that the cube sweeps.
     frame
         Width of the figure and ranges of its axes.
 
@@ -79,7 +75,6 @@ def plot_branches(
     below = _below(cube, measure, degrees, at, frame)
     fig = style.new_figure(4.5, _stored(ds), frame)
     ax = fig.add_subplot()
-    style.style_axes(ax)
     if below is not None:
         below.dress(ax)
     chosen = _chosen(ds, max_period)
@@ -111,7 +106,8 @@ def _below(
 
 
 def _dress(ax: Axes, frame: style.Frame, measure: Measure) -> None:
-    """Set limits and ticks where no diagram has."""
+    """Set look, limits and ticks where no diagram has."""
+    style.style_axes(ax)
     ax.margins(y=0.08)
     style.limits(ax, frame)
     labels.angle_ticks(ax, measure)
@@ -192,7 +188,8 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
         ax.plot(
             np.full(period, x), y, linestyle="none", marker=MARKERS[kind],
             markersize=size if stable else 0.62 * size, markerfacecolor="white" if stable else "0.75",
-            markeredgecolor="black", markeredgewidth=0.7, zorder=8.0 if stable else 7.0, scalex=scale, scaley=scale,
+            markeredgecolor="black", markeredgewidth=0.7,
+            zorder=8.0 if stable else 7.0, scalex=scale, scaley=scale,
         )  # fmt: skip
         if stable:
             names.append(_Name(period, x, float(y.min()), float(y.max()), f"{SHORT[kind]}{period}"))
