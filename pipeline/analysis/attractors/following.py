@@ -13,7 +13,7 @@ from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.attractors.cells import Block, ClosedCells, Guesses
 from pipeline.analysis.attractors.deciding import REACH, decide
-from pipeline.analysis.attractors.orbits import Orbit, distinct, number_of, polish
+from pipeline.analysis.attractors.orbits import Orbit, distinct, number_of, polish, scaled_derivative
 from pipeline.analysis.attractors.spirals import PER_PHASE, Recurrence, near_closed
 from pipeline.analysis.sets import Geometry
 
@@ -227,7 +227,7 @@ def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np
         # where it is fast, nothing is gained
         if not 1.0 < growth < LEAP ** (orbit.period / LEG):
             continue
-        values, vectors = np.linalg.eig(orbit.derivative * scales[None, :] / scales[:, None])
+        values, vectors = np.linalg.eig(scaled_derivative(orbit, geometry))
         grows = np.abs(values) > 1.0
         values, onto = values[grows], np.linalg.inv(vectors)[grows].T
         n = 2 * int(np.log(LEAP) / np.log(growth) / 2)

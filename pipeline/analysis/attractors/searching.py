@@ -19,7 +19,7 @@ from pipeline.analysis.attractors.deciding import LOOSE_SHARE, STRICT, decide
 from pipeline.analysis.attractors.following import Engine, follow
 from pipeline.analysis.attractors.orbits import RUN_ON_RTOL, Orbit, distinct, number_of, polish, run_on
 from pipeline.analysis.attractors.points import Dynamics, Point
-from pipeline.analysis.attractors.spirals import MAX_GUESSES, RUN_ON_LEGS, near_closed, spirals_of
+from pipeline.analysis.attractors.spirals import MAX_GUESSES, RUN_ON_LEGS, beside, near_closed, spirals_of
 from pipeline.analysis.sets import Geometry, hashes
 from pipeline.products.attractors import IdentifyOptions
 
@@ -271,4 +271,6 @@ def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses
         # the period seen may be half the true one, and the orbit an unstable one: the future tells
         own = closed.guesses.least(MAX_GUESSES)
         own = own.followed_by(own.without_period())
+    if len(near.key):
+        own = own.followed_by(beside(orbits, search.longest, search.geometry))
     return own.followed_by(near.least(MAX_GUESSES))

@@ -302,8 +302,8 @@ def test_analyse_chaos__order_and_chaos(main, run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--n-sigma", "0"], "n_sigma = 0.0 is out of bounds"),
-        (["--n-frequencies", "9"], "n_frequencies = 9 is out of bounds"),
+        (["--n-sigma", "0"], "n_sigma = 0.0: must be greater than 0.0."),
+        (["--n-frequencies", "9"], "n_frequencies = 9: must be 10 or more."),
         ([], "nothing to compute. Lyapunov exponents of what does not close: the cube has none"),
     ],
 )
