@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ class Sections:
         branch bit for bit.
     extremes : ndarray, (..., n_keep, n_quantities, 3), or None
         Least and largest value and mean of each watched quantity over the drive period that ends at the
-        section; NaN for cells that failed, None if nothing was watched.
+        section; NaN for cells that failed, None if nothing was watched. See `engine.watching`.
     """
 
     section: np.ndarray
@@ -72,6 +73,7 @@ def run_branches(
     step_size: np.ndarray | None = None,
     system: System = PENDULUM_FITTED,
     n_lanes: int = N_LANES,
+    quantities: Sequence[str] | None = None,
 ) -> Sections:
     """Walk many branches through their points; each point starts where the one before ended.
 
@@ -111,6 +113,10 @@ def run_branches(
         What is integrated.
     n_lanes
         Trajectories in flight.
+    quantities
+        Names of quantities and states of the system whose extremes and means are wanted over each
+        period that ends in a kept section. They change no other number. Angles are counted on from
+        their value in (-pi, pi] at the begin of the period.
 
     Returns
     -------
@@ -132,6 +138,7 @@ def run_branches(
         parameters=parameters, frequency_hz=frequency_hz, initial_states=initial_states,
         n_keep=n_keep, n_measures=FIRST_TURN + system.n_states, rtol=rtol, atol=atol,
         max_steps_per_period=max_steps_per_period, step_size=step_size, n_lanes=n_lanes,
+        quantities=quantities,
     )  # fmt: skip
     angles = [FIRST_TURN + i for i, angle in enumerate(system.is_angle) if angle]
     return Sections(
@@ -144,6 +151,7 @@ def run_branches(
         n_rejected=cells.n_rejected.astype(np.int32),
         final_state=cells.state,
         step_size=cells.step_size,
+        extremes=cells.watched if quantities is not None else None,
     )
 
 
@@ -200,5 +208,6 @@ def sections(
         packed, frequency, initial, n_transient=n_transient, n_keep=n_keep,
         rtol=rtol, atol=atol, system=system, **options,
     )  # fmt: skip
-    per_cell = ("section", "turns", "status", "orbit_period", "n_periods", "n_steps", "n_rejected")
-    return replace(result, **{name: getattr(result, name)[:, 0] for name in per_cell})
+    found = {f.name: getattr(result, f.name) for f in fields(result)}
+    per_cell = {k: v for k, v in found.items() if v is not None and k not in ("final_state", "step_size")}
+    return replace(result, **{name: value[:, 0] for name, value in per_cell.items()})

@@ -15,7 +15,6 @@ from magpend_core.engine.jit import OPTIONS, is_covered, kernel, specialise
 from magpend_core.engine.lanes import (
     DIVERGED,
     FIRST_STEP,
-    N_STAGES,
     REACHED,
     STEP_LIMIT,
     STEP_UNDERFLOW,
@@ -27,24 +26,11 @@ from magpend_core.engine.lanes import (
 from magpend_core.engine.observers import RECORD_LAST
 from magpend_core.engine.simd import WIDTH
 from magpend_core.engine.system import System
+from magpend_core.engine.tableau import DENSE, N_STAGES
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models.parameters import Parameters
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_frequency, check_states
-
-# Continuous extension of order 4 of the Dormand-Prince pair: y(t + x h) = y + h sum_i k_i P_i(x),
-# P_i(x) = sum_j DENSE[i, j] x^(j + 1). Shampine, Math. Comp. 46 (1986) 135-150.
-DENSE = np.array(
-    [
-        [1.0, -8048581381 / 2820520608, 8663915743 / 2820520608, -12715105075 / 11282082432],
-        [0.0, 0.0, 0.0, 0.0],
-        [0.0, 131558114200 / 32700410799, -68118460800 / 10900136933, 87487479700 / 32700410799],
-        [0.0, -1754552775 / 470086768, 14199869525 / 1410260304, -10690763975 / 1880347072],
-        [0.0, 127303824393 / 49829197408, -318862633887 / 49829197408, 701980252875 / 199316789632],
-        [0.0, -282668133 / 205662961, 2019193451 / 616988883, -1453857185 / 822651844],
-        [0.0, 40617522 / 29380423, -110615467 / 29380423, 69997945 / 29380423],
-    ]
-)
 
 
 def prepare(frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any) -> Any:
@@ -86,7 +72,7 @@ def follow(
     scratch, section = np.zeros(NC), np.zeros(N)
     edge_table = np.zeros((3, max(NE, 1)))
     w = prepare(frequency, p, state, slack, scratch, edge_table)
-    y0, k0 = np.zeros(N), np.zeros(N)
+    y0, k0, events, n_watching = np.zeros(N), np.zeros(N), np.zeros(1, np.bool_), np.zeros(1, np.int64)
     turns = np.zeros(N, np.int64)
     edge = begin_period(w, 0, 0, edge_table)
     take_section(w, 0, 0, section, turns)
@@ -96,7 +82,7 @@ def follow(
         for i in range(N):
             y0[i] = w[ROWS.state + i * WIDTH]
             k0[i] = w[ROWS.slopes + i * WIDTH]
-        attempt(w, 1, slack, rtol, atol, max_attempts)
+        attempt(w, events, n_watching, 1, slack, rtol, atol, max_attempts)
         if w[ROWS.event] == TOO_MANY_STEPS:
             return STEP_LIMIT
         if w[ROWS.event] == UNDERFLOW:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -48,6 +50,28 @@ def check_tolerances(rtol: Any, atol: Any) -> tuple[float, float]:
     return check_tolerance("rtol", rtol, LEAST_RTOL), check_tolerance("atol", atol)
 
 
+def check_quantities(names: Sequence[str] | None, system: System) -> tuple[int, ...]:
+    """Return the numbers of states and quantities in ``state_names + quantity_names``.
+
+    Raises
+    ------
+    ValueError
+        If the system has no such quantities; the message names those that it has.
+    """
+    if isinstance(names, str):
+        raise ValueError(f"quantities = {names!r} is one string; give a sequence of names: [{names!r}].")
+    known = system.state_names + system.quantity_names
+    unknown = [name for name in names or () if name not in known]
+    if unknown:
+        near = [match for name in unknown for match in get_close_matches(str(name), known, n=2)]
+        hint = f"did you mean {', '.join(dict.fromkeys(near))}? " if near else ""
+        raise ValueError(
+            f"quantities: {system.name} has no {', '.join(map(repr, unknown))}; {hint}"
+            f"It has {', '.join(known)}."
+        )
+    return tuple(known.index(name) for name in names or ())
+
+
 def integrate(
     system: System,
     observer: Observer,
@@ -63,6 +87,7 @@ def integrate(
     max_steps_per_period: int,
     step_size: Any = None,
     n_lanes: int = N_LANES,
+    quantities: Sequence[str] | None = None,
 ) -> Cells:
     """Walk branches through their points under an observer.
 
@@ -83,7 +108,7 @@ def integrate(
         Rows of n_states numbers that the observer may write per cell; NaN before.
     n_measures
         Numbers that the observer may write per cell; 0 before.
-    rtol, atol, max_steps_per_period, step_size, n_lanes
+    rtol, atol, max_steps_per_period, step_size, n_lanes, quantities
         As for `magpend_core.sections.run_branches`.
 
     Returns
@@ -99,6 +124,7 @@ def integrate(
         If the system is not what it says (see `check_system`).
     """
     rtol, atol = check_tolerances(rtol, atol)
+    watched = check_quantities(quantities, system)
     attempts = float(check_count("max_steps_per_period", max_steps_per_period, 1))
     n_lanes = check_count("n_lanes", n_lanes, 1)
     frequency = check_frequency(frequency_hz, 2)
@@ -130,7 +156,8 @@ def integrate(
         n_periods=np.zeros(per_cell, np.int64),
         n_steps=np.zeros(per_cell, np.int64),
         n_rejected=np.zeros(per_cell, np.int64),
+        watched=np.full((*per_cell, n_keep, len(watched), 3), np.nan),
     )
     if cells.status.size:
-        engine_of(system, observer)(cells, n_lanes, rtol, atol, attempts, settings)
+        engine_of(system, observer, watched)(cells, n_lanes, rtol, atol, attempts, settings)
     return cells

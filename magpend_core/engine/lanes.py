@@ -25,41 +25,37 @@ import numpy as np
 from numba import njit
 
 from magpend_core.engine import observers
-from magpend_core.engine.jit import OPTIONS, inline, is_covered, kernel, specialise
+from magpend_core.engine.jit import UNCOUNTED, inline, is_covered, kernel, specialise
 from magpend_core.engine.observers import Observer
 from magpend_core.engine.simd import (
     WIDTH,
     absolute,
+    any_nonzero,
     load,
     load_rows,
     maximum,
     minimum,
-    multiply_add,
-    sqrt,
     store,
     store_rows,
     where_less,
 )
 from magpend_core.engine.system import System
-from magpend_core.engine.vecmath import TWO_PI, exp2_rough, log2_rough
+from magpend_core.engine.tableau import ERROR, N_STAGES, NODES, STAGES
+from magpend_core.engine.vecmath import TWO_PI, exp2_rough, hypot_rough, log2_rough
+from magpend_core.engine.watching import (
+    begin_watch,
+    evaluate_watched,
+    keep_extremes,
+    set_watching,
+    update_extremes,
+    watched_function,
+)
 from magpend_core.status import Status
 
-# Dormand and Prince, J. Comput. Appl. Math. 6 (1980) 19-26, RK5(4)7M
-NODES = np.array([0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0])
-STAGES = np.array(
-    [
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0],
-        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0],
-        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0],
-        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0],
-        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
-    ]
-)
-ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
-N_STAGES = 7
 ZERO: Any = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
+
+UNROLLED_STATES = 3
+"""Systems of so many states at most have their stages written out (see `unrolled_stages`)."""
 
 FIRST_STEP = 1e-3
 """First step of a branch in drive periods; error control finds the right size within a few steps."""
@@ -81,6 +77,7 @@ class Rows(NamedTuple):
     slopes: int  # N_STAGES * n_states rows
     trial: int  # the stage's state, at the end the new state
     constants: int
+    forcing: int  # at the last stage's time
     time: int  # s, since the last section
     wish: int  # s, step size that the error control wants
     step: int  # s, step size of this attempt
@@ -92,18 +89,27 @@ class Rows(NamedTuple):
     target_width: int  # s
     start_ratio: int  # step_ratio of the edge at the start
     target_ratio: int
+    target_share: int  # target_ratio/(1 + target_ratio)
     period: int  # s
     steps: int  # accepted in this cell
     rejected: int  # rejected attempts in this cell
     attempts: int  # in this period
     event: int
+    halfway: int  # state in the middle of a step, if something is watched
+    begin: int  # watched quantities at the begin of the step, a row each; so below
+    middle: int
+    end: int
+    lowest: int  # in this period
+    highest: int
+    integral: int
     size: int
 
 
-def rows_of(system: System) -> Rows:
-    """Lay out a group for a system."""
+def rows_of(system: System, n_watched: int = 0) -> Rows:
+    """Lay out a group for a system of which `n_watched` quantities are watched."""
     counts = [
-        system.n_states, N_STAGES * system.n_states, system.n_states, system.n_constants, *[1] * 16,
+        system.n_states, N_STAGES * system.n_states, system.n_states, system.n_constants, *[1] * 18,
+        system.n_states if n_watched else 0, *[n_watched] * 6,
     ]  # fmt: skip
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
     return Rows(*(int(x) for x in offsets))
@@ -125,8 +131,8 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     The step is the least of what error control wants and, for each layer and edge, what keeps it in
     proportion to the distance from the nearest complex singularity: with D the distance in time to
     the crossing, d the half-width in time and c the layer's `step_ratio`, at most
-    max(c D/(1 + c), c d) towards the crossing and c sqrt(D^2 + d^2) away from it. It ends on the
-    segment's end exactly, and the last two steps before that share the rest.
+    max(c D/(1 + c), c d) towards the crossing and, to 2 %, c sqrt(D^2 + d^2) away from it. It ends on
+    the segment's end exactly, and the last two steps before that share the rest.
     """
     y = load_rows(w, base + ROWS.state, N)
     dy = load_rows(w, base + ROWS.slopes, N)
@@ -135,6 +141,8 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     remaining = load(w, base + ROWS.target) - t
     h = load(w, base + ROWS.wish)
     if HAS_LAYERS:  # numba cannot loop over an empty tuple
+        # the least quotient, kept as one until the end: one division for all layers
+        speed_h = 1.0 + 0.0 * h
         for value, rate, half_width, per_strength in layers(y, dy, c):
             speed = absolute(rate)
             ratio = step_ratio(slack * speed * per_strength)
@@ -142,17 +150,19 @@ def choose_step(w: Any, base: int, slack: float) -> None:
             nearing = value * rate
             # the two bounds of the docstring over one common division
             towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
-            away = ratio * sqrt(multiply_add(value, value, half_width * half_width))
+            away = ratio * hypot_rough(distance, half_width)
             length = where_less(nearing, 0.0, towards, away)
-            h = minimum(length / (speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)), h)
+            speed = speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)
+            mine, other = length * speed_h, h * speed
+            h = where_less(mine, other, length, h)
+            speed_h = where_less(mine, other, speed, speed_h)
+        h = h / speed_h
     if NE > 0:
         passed = t - load(w, base + ROWS.start)
-        width = load(w, base + ROWS.start_width)
-        ratio = load(w, base + ROWS.start_ratio)
-        h = minimum(ratio * sqrt(multiply_add(passed, passed, width * width)), h)
-        width = load(w, base + ROWS.target_width)
-        ratio = load(w, base + ROWS.target_ratio)
-        h = minimum(maximum(ratio / (1.0 + ratio) * remaining, ratio * width), h)
+        away = hypot_rough(passed, load(w, base + ROWS.start_width))
+        h = minimum(load(w, base + ROWS.start_ratio) * away, h)
+        least = load(w, base + ROWS.target_ratio) * load(w, base + ROWS.target_width)
+        h = minimum(maximum(load(w, base + ROWS.target_share) * remaining, least), h)
     shared = where_less(remaining, 2.0 * h, 0.5 * remaining, h)
     h = where_less(h, remaining, shared, remaining)
     h = where_less(0.5, load(w, base + ROWS.fresh), 0.0, h)
@@ -168,10 +178,48 @@ def run_stage(w: Any, base: int, s: int) -> None:
         for j in range(1, s):
             total = total + STAGES[s, j] * load(w, row + ROWS.slopes + j * N * WIDTH)
         store(w, row + ROWS.trial, load(w, row + ROWS.state) + h * total)
+    if NODES[s] != NODES[s - 1]:
+        c = load_rows(w, base + ROWS.constants, NC)
+        store(w, base + ROWS.forcing, forcing(load(w, base + ROWS.time) + NODES[s] * h, c))
+    # read after the last store, so that they can be operands in memory instead of spilled registers
     c = load_rows(w, base + ROWS.constants, NC)
-    u = forcing(load(w, base + ROWS.time) + NODES[s] * h, c)
-    slopes = rhs(load_rows(w, base + ROWS.trial, N), u, c)
+    slopes = rhs(load_rows(w, base + ROWS.trial, N), load(w, base + ROWS.forcing), c)
     store_rows(w, base + ROWS.slopes + s * N * WIDTH, slopes)
+
+
+def run_stages(w: Any, base: int) -> None:
+    """Compute the states and slopes of all stages but the first, which is the last step's last."""
+    for s in range(1, N_STAGES):
+        run_stage(w, base, s)
+
+
+def unrolled_stages(system: System) -> Callable[..., None]:
+    """Return `run_stages` written out for a small system.
+
+    The slopes stay in registers, the tableau's zeros cost nothing. Not for larger systems: six copies
+    of a long right-hand side compile for long and gain little.
+    """
+    n = system.n_states
+    lines = [
+        "def run_stages(w, base):",
+        "h, t = load(w, base + ROWS.step), load(w, base + ROWS.time)",
+        "c = load_rows(w, base + ROWS.constants, NC)",
+        "y = load_rows(w, base + ROWS.state, N)",
+        "k0 = load_rows(w, base + ROWS.slopes, N)",
+    ]
+    for s in range(1, N_STAGES):
+        terms = [(j, STAGES[s, j]) for j in range(s) if STAGES[s, j] != 0.0]
+        sums = (" + ".join(f"{float(a)!r} * k{j}[{i}]" for j, a in terms) for i in range(n))
+        lines.append("trial = (" + ", ".join(f"y[{i}] + h * ({x})" for i, x in enumerate(sums)) + ",)")
+        if NODES[s] != NODES[s - 1]:
+            lines.append(f"u = forcing(t + {float(NODES[s])!r} * h, c)")
+        lines.append(f"k{s} = rhs(trial, u, c)")
+        lines.append(f"store_rows(w, base + ROWS.slopes + {s * n * WIDTH}, k{s})")
+    lines.append("store_rows(w, base + ROWS.trial, trial)")
+    scope = dict(globals())
+    exec("\n    ".join(lines), scope)
+    function: Callable[..., None] = scope["run_stages"]
+    return function
 
 
 def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
@@ -189,8 +237,11 @@ def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
     return (h * h) * total * (1.0 / N_CONTROLLED)
 
 
-def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> None:
-    """Accept or reject the attempt, lane by lane, and set the next wish and the event."""
+def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> bool:
+    """Accept or reject the attempt, lane by lane, and set the next wish and the event.
+
+    Return whether a lane of the group has an event.
+    """
     e2 = minimum(squared_error(w, base, rtol, atol), 1e20)
     factor = SAFETY * exp2_rough(log2_rough(maximum(e2, 1e-20)) * -0.1)
     bounded = minimum(maximum(factor, SHRINK), GROW)
@@ -230,16 +281,27 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
         last = load(w, base + ROWS.state + (N - 1) * WIDTH)
         event = where_less(event, 0.5, where_less(last, RENEW_BELOW, DUE, event), event)
     store(w, base + ROWS.event, event)
+    return any_nonzero(event)
 
 
-def attempt(w: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float) -> None:
-    """Advance all groups by one attempted step."""
+def attempt(
+    w: Any, events: Any, n_watching: Any, n_groups: int, slack: float, rtol: float, atol: float,
+    max_attempts: float,
+) -> None:  # fmt: skip
+    """Advance all groups by one attempted step.
+
+    `events` says afterwards which have a lane with an event; `n_watching` holds the number of lanes
+    of each that are in a period whose extremes are wanted.
+    """
     for group in range(n_groups):
         base = group * ROWS.size
         choose_step(w, base, slack)
-        for s in range(1, N_STAGES):
-            run_stage(w, base, s)
-        finish_step(w, base, rtol, atol, max_attempts)
+        run_stages(w, base)
+        if WATCHES and n_watching[group] > 0:
+            evaluate_watched(w, base)
+        events[group] = finish_step(w, base, rtol, atol, max_attempts)
+        if WATCHES and n_watching[group] > 0:
+            update_extremes(w, base)
 
 
 def load_cell(
@@ -276,7 +338,9 @@ def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge:
     """Let a segment end at `time`, with the layer of the edge number `edge` (none for n_edges)."""
     w[base + ROWS.target + lane] = time
     w[base + ROWS.target_width + lane] = edge_table[1, edge] if edge < NE else np.inf
-    w[base + ROWS.target_ratio + lane] = edge_table[2, edge] if edge < NE else 1.0
+    ratio = edge_table[2, edge] if edge < NE else 1.0
+    w[base + ROWS.target_ratio + lane] = ratio
+    w[base + ROWS.target_share + lane] = ratio / (1.0 + ratio)
 
 
 def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> int:
@@ -349,6 +413,8 @@ class Work(NamedTuple):
     turns: Any  # int64 (lanes, n_states), since the branch's start
     edge_table: Any  # float64 (lanes, 3, n_edges): time [s], half-width [s], step_ratio
     memory: Any  # float64 (lanes, n_memory), the observer's own
+    watching: Any  # int64, 1 in a period whose extremes are wanted
+    n_watching: Any  # int64 per group: sum of the above
 
 
 class Cells(NamedTuple):
@@ -366,9 +432,10 @@ class Cells(NamedTuple):
     n_periods: Any  # int64
     n_steps: Any  # int64, accepted
     n_rejected: Any  # int64
+    watched: Any  # (..., n_keep, n_watched, 3), see `watching`; no numbers where nothing is watched
 
 
-def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any) -> None:
+def start_branch(cells: Cells, work: Work, lane: int, branch: int, settings: Any, scratch: Any) -> None:
     """Put a branch's initial state and first cell into a lane."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     for i in range(N):
@@ -376,7 +443,7 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any)
         work.lanes[w_at] = cells.state[branch, i]
         work.turns[lane, i] = 0
     work.branch[lane] = branch
-    start_point(cells, work, lane, ZERO, scratch)
+    start_point(cells, work, lane, ZERO, settings, scratch)
     # angles come in as given; from here on they are in (-pi, pi] at every section
     take_section(work.lanes, base, column, scratch, work.turns[lane])
     given = cells.step_size[branch]
@@ -384,7 +451,7 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, scratch: Any)
     work.lanes[base + ROWS.wish + column] = given if given > 0.0 else cautious
 
 
-def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -> None:
+def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, scratch: Any) -> None:
     """Begin the cell `point` of a lane's branch from the lane's state."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     branch = work.branch[lane]
@@ -399,6 +466,8 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, scratch: Any) -
     work.lanes[base + ROWS.fresh + column] = 1.0
     work.lanes[base + ROWS.after_rejection + column] = 0.0
     work.lanes[base + ROWS.event + column] = NOTHING
+    if WATCHES:
+        begin_watch(work, lane, keeps_next(0, work.memory[lane], settings))
 
 
 def has_failed(status: int) -> bool:
@@ -411,6 +480,8 @@ def forget(cells: Cells, branch: int, point: int) -> None:
     for i in range(cells.section.shape[2]):
         for k in range(N):
             cells.section[branch, point, i, k] = np.nan
+        if WATCHES:
+            cells.watched[branch, point, i] = np.nan
 
 
 def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
@@ -455,6 +526,8 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
         work.i_period[lane] += 1
         if take_section(w, base, column, section, work.turns[lane]):
             at = (work.branch[lane], work.point[lane])
+            if WATCHES and work.watching[lane] == 1:
+                keep_extremes(w, base, column, cells.watched[at][n_kept(work.memory[lane])])
             status = observe(
                 section, work.turns[lane], work.i_period[lane], work.memory[lane],
                 cells.section[at], cells.measures[at], settings,
@@ -463,6 +536,8 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
             status = DIVERGED
         if status == PENDING:
             work.edge[lane] = begin_period(w, base, column, work.edge_table[lane])
+            if WATCHES:
+                begin_watch(work, lane, keeps_next(work.i_period[lane], work.memory[lane], settings))
             return False
     elif not in_bounds(w, base, column):
         # a blow-up within a period shrinks the step before a section could show it
@@ -475,7 +550,7 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     if has_failed(status) or work.point[lane] + 1 == cells.frequency.shape[1]:
         end_branch(cells, work, lane, status)
         return True
-    start_point(cells, work, lane, work.point[lane] + 1, scratch)
+    start_point(cells, work, lane, work.point[lane] + 1, settings, scratch)
     return False
 
 
@@ -489,28 +564,36 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: 
         np.zeros(n_groups * ROWS.size), np.zeros(size, np.int64), np.zeros(size, np.int64),
         np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros((size, N), np.int64),
         np.zeros((size, 3, max(NE, 1))), np.zeros((size, memory_size(settings, N))),
+        np.zeros(size, np.int64), np.zeros(n_groups, np.int64),
     )  # fmt: skip
     scratch = np.zeros(max(NC, N))
     section = np.zeros(N)
     for lane in range(size):
         # lanes beyond the last branch repeat it, so that they hold ordinary numbers; no one looks
-        start_branch(cells, work, lane, min(lane, n_branches - 1), scratch)
+        start_branch(cells, work, lane, min(lane, n_branches - 1), settings, scratch)
     next_branch = active
+    # a field of a tuple is counted by an atomic operation at every use: too slow per lane
+    rows, events = work.lanes, np.zeros(n_groups, np.bool_)
     while active > 0:
-        attempt(work.lanes, (active + WIDTH - 1) // WIDTH, cells.slack, rtol, atol, max_attempts)
-        lane = ZERO
-        while lane < active:
-            event = work.lanes[(lane // WIDTH) * ROWS.size + ROWS.event + lane % WIDTH]
-            if event == NOTHING or not serve(cells, work, lane, settings, section, scratch):
-                lane += 1
-            elif next_branch < n_branches:
-                start_branch(cells, work, lane, next_branch, scratch)
-                next_branch += 1
-                lane += 1
-            else:
-                # the last lane moves here, with its event if it has one
-                active -= 1
-                copy_lane(work, active, lane)
+        in_use = (active + WIDTH - 1) // WIDTH
+        attempt(rows, events, work.n_watching, in_use, cells.slack, rtol, atol, max_attempts)
+        for group in range(in_use):
+            if not events[group]:
+                continue
+            lane, last = group * WIDTH, min(group * WIDTH + WIDTH, active)
+            while lane < last:
+                event = rows[group * ROWS.size + ROWS.event + lane % WIDTH]
+                if event == NOTHING or not serve(cells, work, lane, settings, section, scratch):
+                    lane += 1
+                elif next_branch < n_branches:
+                    start_branch(cells, work, lane, next_branch, settings, scratch)
+                    next_branch += 1
+                    lane += 1
+                else:
+                    # the last lane moves here, with its event if it has one
+                    active -= 1
+                    copy_lane(work, active, lane)
+                    last = min(last, active)
 
 
 def copy_lane(work: Work, source: int, target: int) -> None:
@@ -527,23 +610,36 @@ def copy_lane(work: Work, source: int, target: int) -> None:
             work.edge_table[target, k, i] = work.edge_table[source, k, i]
     for i in range(work.memory.shape[1]):
         work.memory[target, i] = work.memory[source, i]
+    if WATCHES:
+        set_watching(work, target, work.watching[source])
+        set_watching(work, source, 0)
 
 
 _INLINE = (
     "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period",
     "in_bounds", "take_section", "renew_state", "move_lane", "has_failed",
+    "evaluate_watched", "update_extremes", "keep_extremes", "set_watching", "begin_watch",
 )  # fmt: skip
 _CALLED = (
-    "choose_step", "run_stage", "finish_step", "attempt",
+    "choose_step", "run_stage", "run_stages", "finish_step", "attempt",
     "forget", "end_cell", "end_branch", "start_point", "start_branch", "serve", "copy_lane",
 )  # fmt: skip
 
 
-def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
+def _name(system: System, observer: Observer, watched: tuple[int, ...]) -> str:
+    return "_".join([system.label, observer.name, *(["watch"] if watched else []), *map(str, watched)])
+
+
+def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> dict[str, Any]:
     """Names that the templates of this module use, bound to a system and an observer."""
-    name = f"{system.label}_{observer.name}"
+    name = _name(system, observer, watched)
     bindings: dict[str, Any] = {
-        "ROWS": rows_of(system),
+        "ROWS": rows_of(system, len(watched)),
+        "WATCHES": len(watched) > 0,
+        "N_WATCHED": len(watched),
+        "watched_values": watched_function(system, watched),
+        "n_kept": observer.n_kept,
+        "keeps_next": observer.keeps_next,
         "N": system.n_states,
         "N_CONTROLLED": system.controlled,
         "NC": system.n_constants,
@@ -566,15 +662,21 @@ def engine_bindings(system: System, observer: Observer) -> dict[str, Any]:
         bindings[key] = inline(specialise(getattr(observers, key), name, **bindings))
     bindings["observe"] = inline(specialise(observer.observe, name, **bindings))
     bindings["renew"] = inline(specialise(observer.renew, name, **bindings))
-    for key in (*_INLINE, *_CALLED):
-        function = specialise(globals()[key], name, **bindings)
-        bindings[key] = inline(function) if key in _INLINE else njit(**OPTIONS)(function)
+    templates: dict[str, Any] = {key: globals()[key] for key in (*_INLINE, *_CALLED)}
+    if system.n_states <= UNROLLED_STATES:
+        templates["run_stages"] = unrolled_stages(system)
+    for key, template in templates.items():
+        function = specialise(template, name, **bindings)
+        bindings[key] = inline(function) if key in _INLINE else njit(**UNCOUNTED)(function)
     return bindings
 
 
 @cache
-def engine_of(system: System, observer: Observer) -> Callable[..., None]:
-    """Compile `advance` for a system and an observer."""
-    bindings = engine_bindings(system, observer)
+def engine_of(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> Callable[..., None]:
+    """Compile `advance` for a system and an observer, and for the quantities to be watched.
+
+    Those are given by their numbers in ``system.state_names + system.quantity_names``.
+    """
+    bindings = engine_bindings(system, observer, watched)
     cached = is_covered(*system.functions, observer.observe, observer.memory_size, observer.renew)
-    return kernel(specialise(advance, f"{system.label}_{observer.name}", **bindings), cached)
+    return kernel(specialise(advance, _name(system, observer, watched), **bindings), cached)

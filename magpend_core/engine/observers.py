@@ -9,6 +9,9 @@ An observer is a pair of functions bound at compile time.
     cell's outputs. Returns ``PENDING`` to go on, any other status to end the cell.
 ``memory_size(settings, n_states) -> int``
     Length of `memory`.
+``n_kept(memory) -> int`` and ``keeps_next(i_period, memory, settings) -> bool``, only where it keeps sections
+    How many sections of this cell are kept, and whether the one at the end of the period that follows
+    period number `i_period` will be: then the engine watches that period if it is asked to.
 ``renew(state, memory, settings)``, only where an observer rewrites states
     Called at each edge of the forcing within a period, after a step that leaves the last state below
     `renew_below`, and before `observe` at the period's end; the trajectory goes on from what it makes
@@ -46,6 +49,16 @@ class Settings(NamedTuple):
 
 def _leave(state: Any, memory: Any, settings: Any) -> None:
     """Rewrite nothing."""
+
+
+@inline
+def _none_kept(memory: Any) -> int:
+    return 0
+
+
+@inline
+def _keeps_none(i_period: int, memory: Any, settings: Any) -> bool:
+    return False
 
 
 @dataclass(frozen=True)
@@ -90,6 +103,8 @@ class Observer:
     bindings: Mapping[str, Any] = field(default_factory=dict, hash=False)
     renew: Callable[..., None] = _leave
     renew_below: float = -math.inf
+    n_kept: Callable[..., int] = _none_kept
+    keeps_next: Callable[..., bool] = _keeps_none
 
     @property
     def rewrites(self) -> bool:
@@ -210,8 +225,22 @@ def _memory_size(settings: Settings, n_states: int) -> int:
     return _RING + settings.window * n_states
 
 
-RECORD_LAST = Observer("record_last", _record, _memory_size, {"STOP_EARLY": False})
+@inline
+def _n_kept(memory: Any) -> int:
+    return int(memory[_KEPT])
+
+
+@inline
+def _keeps_next(i_period: int, memory: Any, settings: Settings) -> bool:
+    return i_period >= settings.n_transient or memory[_SETTLED] != 0.0
+
+
+RECORD_LAST = Observer(
+    "record_last", _record, _memory_size, {"STOP_EARLY": False}, n_kept=_n_kept, keeps_next=_keeps_next
+)
 """Keep `n_keep` sections after exactly `n_transient` periods."""
 
-RECORD_CLOSED = Observer("record_closed", _record, _memory_size, {"STOP_EARLY": True})
+RECORD_CLOSED = Observer(
+    "record_closed", _record, _memory_size, {"STOP_EARLY": True}, n_kept=_n_kept, keeps_next=_keeps_next
+)
 """Keep `n_keep` sections as soon as the orbit has closed, after `n_transient` periods at the latest."""

@@ -220,6 +220,11 @@ def where_odd(shifted: Any, odd: Any, even: Any) -> Any:
     return np.where(low == 1, odd, even)[()]
 
 
+def any_nonzero(x: Any) -> bool:
+    """Whether a number, or any lane of a group, is not 0."""
+    return bool(np.any(x != 0.0))
+
+
 def binary_exponent(x: Any) -> Any:
     """Exponent e of a positive normal number x = m 2**e with m in [1, 2), as a float."""
     return np.frexp(x)[1] - 1.0
@@ -282,6 +287,21 @@ _primitive(times_power_of_two, _emit_power)
 _primitive(where_odd, _emit_where_odd)
 _primitive(binary_exponent, _emit_exponent)
 _primitive(mantissa, _emit_mantissa)
+
+
+@type_callable(any_nonzero)
+def _type_any_nonzero(context: Any) -> Any:
+    return lambda x: types.boolean if _is_number(x) else None
+
+
+@lower_builtin(any_nonzero, types.Any)
+def _lower_any_nonzero(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+    kind = _ir_type(sig.args[0])
+    found = builder.fcmp_unordered("!=", values[0], ir.Constant(kind, None))
+    if not isinstance(sig.args[0], LanesType):
+        return found
+    bits = ir.IntType(WIDTH)
+    return builder.icmp_unsigned("!=", builder.bitcast(found, bits), ir.Constant(bits, 0))
 
 
 @type_callable(negate_if_bit)

@@ -4,11 +4,11 @@ numba has no vector math library, so ``math.exp`` in a kernel is a call into lib
 and its last bit depends on the machine. The functions here are made of additions, products, at most
 one division and selects; they take a float64 or a group of lanes (see `simd`).
 
-Accuracy: the largest errors, in units in the last place, are below 1 for `exp` and `log`, 1.6 for `sincos`, 2
-for `sin` and 3.5 for `atan` (between 0.41 and 0.55; 1.6 elsewhere), measured against 40-digit arithmetic
-in ``tests/core/test_vecmath.py``. Next to their zeros beyond the first the sines are off by up to
-3e-27 times the argument, which there is more. The polynomials interpolate in Chebyshev nodes, with
-errors below 2e-17.
+Accuracy: the largest errors, in units in the last place, are below 1 for `exp`, `exp2_falling` and
+`log`, 1.6 for `sincos`, 2 for `sin` and `cos` and 3.5 for `atan` (between 0.41 and 0.55; 1.6
+elsewhere), measured against 40-digit arithmetic in ``tests/core/engine/test_vecmath.py``. Next to their
+zeros beyond the first the sines are off by up to 3e-27 times the argument, which there is more. The
+polynomials interpolate in Chebyshev nodes, with errors below 2e-17.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from magpend_core.engine.simd import (
     mantissa,
     maximum,
     minimum,
+    multiply_add,
     negate_if_bit,
     times_power_of_two,
     where_less,
@@ -32,11 +33,12 @@ from magpend_core.engine.simd import (
 
 TWO_PI = 2.0 * math.pi
 TWO_OVER_PI = 2.0 / math.pi
+LN2 = 0.6931471805599453
+LOG2_E = 1.4426950408889634
 _INV_TWO_PI = 1.0 / TWO_PI
 _INV_PI = 1.0 / math.pi
 
 _ROUND = 6755399441055744.0  # 1.5 * 2**52: adding it leaves the nearest integer in the low bits
-_LOG2_E = 1.4426950408889634
 _LN2_HIGH = 0.6931471803691238  # upper 33 bits of ln 2, so that k * _LN2_HIGH is exact
 _LN2_LOW = 1.9082149292705877e-10
 # pi/2 as a sum of a number of 33 bits, so that n times it is exact for |n| < 2**20, and a rest that
@@ -56,7 +58,7 @@ _PI_4 = math.pi / 4
 def exp(x: Any) -> Any:
     """Exponential function; arguments below -700 count as -700, above 700 as 700."""
     x = minimum(maximum(x, -700.0), 700.0)
-    shifted = x * _LOG2_E + _ROUND
+    shifted = x * LOG2_E + _ROUND
     k = shifted - _ROUND
     r = (x - k * _LN2_HIGH) - k * _LN2_LOW
     # r coth(r/2) is even in r and needs five coefficients; exp(r) = 1 + r + r c/(2 - c) (fdlibm).
@@ -69,6 +71,26 @@ def exp(x: Any) -> Any:
     p = p * u + 0.1666666666666666
     c = r - u * p
     return times_power_of_two(1.0 + (r + (r * c) / (2.0 - c)), shifted)
+
+
+@inline
+def exp2_falling(x: Any) -> Any:
+    """Two to the power of `x`, which is at most 0; arguments below -1000 count as -1000."""
+    x = maximum(x, -1000.0)
+    shifted = x + _ROUND
+    r = x - (shifted - _ROUND)
+    p = 4.4549605981865186e-10
+    p = p * r + 7.072585949269223e-09
+    p = p * r + 1.0178062445845774e-07
+    p = p * r + 1.321544258792169e-06
+    p = p * r + 1.525273382983612e-05
+    p = p * r + 0.0001540353044173605
+    p = p * r + 0.0013333558146416936
+    p = p * r + 0.009618129107606888
+    p = p * r + 0.0555041086648216
+    p = p * r + 0.24022650695910097
+    p = p * r + 0.6931471805599453
+    return times_power_of_two(1.0 + r * p, shifted)
 
 
 @inline
@@ -98,11 +120,8 @@ def sincos(x: Any) -> Any:
 
 
 @inline
-def sin(x: Any) -> Any:
-    """Sine alone, for ``|x| < 1e6``."""
-    shifted = x * _INV_PI + _ROUND
-    n = shifted - _ROUND
-    r = (x - n * _PI_1) - n * _PI_2ND
+def _sine(r: Any) -> Any:
+    """Sine between -pi/2 and pi/2."""
     u = r * r
     s = 2.731444766986399e-15
     s = s * u - 7.643970296798572e-13
@@ -112,7 +131,24 @@ def sin(x: Any) -> Any:
     s = s * u - 0.00019841269841254974
     s = s * u + 0.008333333333333316
     s = s * u - 0.16666666666666666
-    return negate_if_bit(r + (r * u) * s, shifted, 0)
+    return r + (r * u) * s
+
+
+@inline
+def sin(x: Any) -> Any:
+    """Sine alone, for ``|x| < 1e6``."""
+    shifted = x * _INV_PI + _ROUND
+    n = shifted - _ROUND
+    return negate_if_bit(_sine((x - n * _PI_1) - n * _PI_2ND), shifted, 0)
+
+
+@inline
+def cos(x: Any) -> Any:
+    """Cosine alone, for ``|x| < 1e6``."""
+    # cos(x) = (-1)^n sin((n + 1/2) pi - x)
+    shifted = (x * _INV_PI - 0.5) + _ROUND
+    n = (shifted - _ROUND) + 0.5
+    return negate_if_bit(_sine((n * _PI_1 - x) + n * _PI_2ND), shifted, 0)
 
 
 @inline
@@ -177,6 +213,13 @@ def exp2_rough(x: Any) -> Any:
     p = 0.05550360297541146 * r + 0.2402265069591007
     p = p * r + 0.6931471805599453
     return times_power_of_two(1.0 + r * p, shifted)
+
+
+@inline
+def hypot_rough(x: Any, y: Any) -> Any:
+    """Length of a hypotenuse with sides of at least 0, to 2.2 %: for step sizes, not for physics."""
+    longer = maximum(x, y)
+    return maximum(longer, multiply_add(0.898, longer, 0.486 * minimum(x, y)))
 
 
 @inline

@@ -122,11 +122,11 @@ class Display:
         self._drawn = False
         self._lock, self._over = threading.RLock(), threading.Event()
 
-    def __call__(self, what: str, done: float, total: float) -> None:
+    def __call__(self, what: str, done: float, total: float, expected_s: float = 0.0) -> None:
         """Take a report."""
         with self._lock:
             if what != self._work.what:
-                self._work = Work(what, self._clock(), done)
+                self._work = Work(what, self._clock(), done, expected_s=expected_s)
             self._work.done, self._work.total, self._work.heard = done, total, self._clock()
 
     def show(self) -> None:
@@ -176,6 +176,8 @@ class Work:
         As last reported; without a total, only the time is known.
     heard : float
         When the last report came [s].
+    expected_s : float
+        Time that all of it will take as far as is known beforehand [s]; 0 if it is not.
     """
 
     what: str
@@ -184,6 +186,7 @@ class Work:
     done: float = 0.0
     total: float = 0.0
     heard: float = 0.0
+    expected_s: float = 0.0
 
     def line(self, now: float) -> str:
         """Say how far it is, and how long it will take."""
@@ -195,8 +198,11 @@ class Work:
         if share == 1:
             return text
         took, more = self.heard - self.started, self.done - self.begun
-        left = took * (self.total - self.done) / more - (now - self.heard) if more > 0 else 0.0
-        return f"{text}, {duration(left)} left" if left > 0 else f"{text}, {duration(elapsed)} so far"
+        if more > 0:
+            left, about = took * (self.total - self.done) / more - (now - self.heard), ""
+        else:
+            left, about = self.expected_s - elapsed, "about "
+        return f"{text}, {about}{duration(left)} left" if left > 0 else f"{text}, {duration(elapsed)} so far"
 
 
 @contextlib.contextmanager

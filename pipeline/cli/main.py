@@ -63,11 +63,18 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     from magpend_core.models.parameters import ParameterError
     from pipeline.compute.execute import TaskFailedError
     from pipeline.spec.problems import SpecError
-    from pipeline.store.directory import DamagedError, LockedError, StoreError
+    from pipeline.store.errors import (
+        DamagedError,
+        IncompleteError,
+        LockedError,
+        StoreError,
+        UnreadableError,
+    )
 
     return [
         ((LockedError,), Exit.LOCKED),
         ((DamagedError,), Exit.DAMAGED),
+        ((IncompleteError, UnreadableError), Exit.FAILED),
         ((SpecError, ParameterError, StoreError), Exit.REFUSED),
         ((TaskFailedError, ArithmeticError, OSError), Exit.FAILED),
     ]

@@ -43,8 +43,8 @@ def simulate(
 ) -> None:
     """Integrate one trajectory: states and the model's quantities as CSV or NetCDF, and a figure.
 
-    The initial state is given by name, such as --psi1 0.2 or --psi1-deg 12 for the pendulum, --x 0.5 for
-    duffing; what is not given is 0. Time 0 is the instant of a section.
+    The initial state is given by the model's names: --NAME VALUE, or --NAME-deg VALUE of an angle or its
+    rate; what is not given is 0. Time 0 is the instant of a section.
     """
     from pipeline.cli import console
     from pipeline.compute import simulate as simulation

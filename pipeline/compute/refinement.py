@@ -72,7 +72,7 @@ class Orbits:
         ----------
         cells
             `section`, shape (cell, n_keep, n_states) [SI], `status`, `orbit_period` and `turns`, shape
-            (cell, link). Orbits are the same if their sections are the same cyclic sequence within the
+            (cell, angle). Orbits are the same if their sections are the same cyclic sequence within the
             tolerance and their turns are equal.
         """
         section, period, turns = cells["section"], cells["orbit_period"], cells["turns"]

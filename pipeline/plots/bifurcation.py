@@ -205,6 +205,13 @@ class Diagram:
         return drawn.assign_attrs(title="bifurcation diagram", parameter=self.parameter)
 
 
+def with_diagram(data: xr.Dataset, drawn: xr.Dataset) -> xr.Dataset:
+    """Add what a diagram shows to the data of a figure, under names that end in ``_diagram``."""
+    drawn = drawn.drop_vars([c for c in drawn.coords if c in data.variables or c in data.dims])
+    renamed = drawn.rename({str(n): f"{n}_diagram" for n in (*drawn.data_vars, *drawn.dims)})
+    return data.merge(renamed).assign_attrs(data.attrs)
+
+
 def _fixed(ds: xr.Dataset) -> dict[str, Any]:
     return {str(k): v.variable for k, v in ds.coords.items() if not v.ndim and v.dtype.kind == "f"}
 

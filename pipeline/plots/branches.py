@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.bifurcation import Diagram
+from pipeline.plots.bifurcation import Diagram, with_diagram
 from pipeline.plots.door import Run, frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
@@ -86,10 +86,7 @@ def plot_branches(
     chosen = [
         i for i in range(ds.sizes["branch"]) if max_period is None or int(ds["orbit_period"][i]) <= max_period
     ]
-    for i in chosen:
-        for x, y, stable in _pieces(ds, i, measure):
-            ax.plot(x, y, scalex=below is None, scaley=below is None, **(_STABLE if stable else _UNSTABLE))
-    names = _mark(ax, ds, chosen, measure, below is None)
+    names = _draw_lines(ax, ds, chosen, measure, below is None)
     if below is None:
         ax.margins(y=0.08)
         style.limits(ax, frame)
@@ -97,16 +94,22 @@ def plot_branches(
     parameter, units = (str(ds.attrs[key]) for key in ("parameter", "parameter_units"))
     style.label_axes(ax, labels.swept_label(parameter, units), measure.label)
     style.caption(ax, labels.caption(below.view.ds if below else ds, drop=[below.parameter] if below else []))
-    handles = _handles(ds, chosen)
-    style.legend_above(fig, [*(below.handles() if below is not None else []), *handles], size=fig.look.tick)
+    handles = [*(below.handles() if below is not None else []), *_handles(ds, chosen)]
+    style.legend_above(fig, handles, size=fig.look.tick)
     style.finish(fig)
     if below is not None:
         drawn = below.draw([pixels.Panel(ax, tuple(range(len(below.view.layers))))])
-        drawn = drawn.drop_vars([c for c in drawn.coords if c in fig.data.variables or c in fig.data.dims])
-        renamed = drawn.rename({str(n): f"{n}_diagram" for n in (*drawn.data_vars, *drawn.dims)})
-        fig.data = fig.data.merge(renamed)
+        fig.data = with_diagram(fig.data, drawn)
     _name(ax, names)
     return fig
+
+
+def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
+    """Draw branches and mark their bifurcations; return the names of these."""
+    for i in chosen:
+        for x, y, stable in _pieces(ds, i, measure):
+            ax.plot(x, y, scalex=scale, scaley=scale, **(_STABLE if stable else _UNSTABLE))
+    return _mark(ax, ds, chosen, measure, scale)
 
 
 def _stored(ds: xr.Dataset) -> xr.Dataset:

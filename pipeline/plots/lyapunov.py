@@ -12,7 +12,7 @@ from matplotlib.collections import PolyCollection
 
 from pipeline.analysis.chaos.lyapunov import GOOD
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.bifurcation import Diagram
+from pipeline.plots.bifurcation import Diagram, with_diagram
 from pipeline.plots.door import Run, frame_of, noted, values_of
 from pipeline.plots.motions import motion_codes, motions_of
 from pipeline.products.figures import LyapunovFigureOptions
@@ -85,9 +85,7 @@ def plot_lyapunov(
     style.legend_above(fig, [*diagram.handles(), *low_handles])
     fig.align_ylabels([top, bottom])
     style.finish(fig)
-    drawn = diagram.draw([pixels.Panel(top, tuple(range(len(diagram.view.layers))))])
-    above_data = drawn.rename({name: f"{name}_diagram" for name in drawn.data_vars})
-    fig.data = data.merge(above_data, compat="override", join="override").assign_attrs(data.attrs)
+    fig.data = with_diagram(data, diagram.draw([pixels.Panel(top, tuple(range(len(diagram.view.layers))))]))
     return fig
 
 

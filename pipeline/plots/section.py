@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -62,24 +63,8 @@ def plot_section(
         an angle.
     """
     part = _one_point(ds, at)
-    model = model_of(part)
-    names = states or model.portraits[0]
-    for name in names:
-        style.check_choice("state", name, model.state_names)
-    turns = [degrees and model.state(name).unit.startswith("rad") for name in names]
-    if degrees and not any(turns):
-        raise ValueError(f"neither {names[0]} nor {names[1]} is an angle; draw them without degrees")
-    measures = [labels.state_measure(part, n, turn) for n, turn in zip(names, turns, strict=True)]
-
-    def coordinates(block: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-        section = block["section"].transpose(*block["status"].dims, "period_index", "state")
-        x, y = (m.shown(section.sel(state=m.name).values) for m in measures)
-        return x, y
-
-    view = make_view(part, ("section",), coordinates)
-    view = View(part, view.names, coordinates, view.n_points, ("",), view.motions)
-    if attractors is not None:
-        view = _by_attractor(view, part, attractors)
+    measures = _measures(part, states, degrees)
+    view = _view(part, measures, attractors)
     found = survey(view, xlim=frame.xlim, ylim=frame.ylim)
     fig = style.new_figure(4.8, xr.Dataset(), frame)
     ax = fig.add_subplot()
@@ -100,6 +85,30 @@ def plot_section(
     fixed = {str(k): v.variable for k, v in part.coords.items() if not v.ndim and v.dtype.kind == "f"}
     fig.data = data.assign_coords(fixed).assign_attrs(title="stroboscopic section")
     return fig
+
+
+def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -> list[labels.Measure]:
+    """How the states to the right and upwards are drawn."""
+    model = model_of(part)
+    names = states or model.portraits[0]
+    for name in names:
+        style.check_choice("state", name, model.state_names)
+    turns = [degrees and model.state(name).unit.startswith("rad") for name in names]
+    if degrees and not any(turns):
+        raise ValueError(f"neither {names[0]} nor {names[1]} is an angle; draw them without degrees")
+    return [labels.state_measure(part, n, turn) for n, turn in zip(names, turns, strict=True)]
+
+
+def _view(part: xr.Dataset, measures: list[labels.Measure], attractors: xr.Dataset | None) -> View:
+    """The points, in the colours of motions or of attractors; directions are not told apart."""
+
+    def coordinates(block: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+        section = block["section"].transpose(*block["status"].dims, "period_index", "state")
+        x, y = (m.shown(section.sel(state=m.name).values) for m in measures)
+        return x, y
+
+    view = replace(make_view(part, ("section",), coordinates), layers=("",))
+    return view if attractors is None else _by_attractor(view, part, attractors)
 
 
 def _one_point(ds: xr.Dataset, at: Mapping[str, float] | None) -> xr.Dataset:
@@ -144,7 +153,7 @@ def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
     )  # fmt: skip
     codes = (chosen["attractor_id"].clip(-1) + 1).astype(np.int32)
     marked = part.assign_coords(_kind=(codes.dims, codes.values))
-    return View(marked, view.names, view.coordinates, view.n_points, view.layers, motions)
+    return replace(view, ds=marked, motions=motions)
 
 
 def draw(run: Run, options: SectionOptions) -> style.DataFigure:

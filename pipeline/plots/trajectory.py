@@ -63,9 +63,10 @@ def plot_trajectory(
     section = {name: np.interp(strobe, time, values) for name, values in series.items()}
     drawing = model.drawing if "parameters" in ds.attrs else None
     rows = [*_units(model), *_others(ds, model)]
-    height = max(4.0, 1.25 * len(rows) + 0.8, 1.6 * (len(model.portraits) + (drawing is not None)) + 0.8)
+    n_panels = len(model.portraits) + (drawing is not None)
+    height = max(4.0, 1.25 * len(rows) + 0.8, 1.6 * n_panels + 0.8)
     fig = style.new_figure(height, _data(ds, series, drawing), frame)
-    left, right = _grids(fig, len(rows), len(model.portraits) + (drawing is not None))
+    left, right = _grids(fig, len(rows), n_panels)
     axes = [fig.add_subplot(spec) for spec in left]
     _draw_series(axes, ds, time, series, rows, degrees)
     for k, pair in enumerate(model.portraits):
@@ -73,22 +74,27 @@ def plot_trajectory(
         style.style_axes(ax)
         draw_portrait(ax, ds, pair, Motion(series, section, _colour(k)), degrees=degrees)
     handles = _handles(ds, model, bool(strobe.size))
-    if drawing is not None:
-        path = fig.add_subplot(right[-1])
-        style.style_axes(path)
-        parameters = parameters_of(ds).as_dict()
-        shown = draw_path(path, drawing, parameters, Motion(series, section, "0.35"))
-        handles.append(Line2D([], [], color="0.35", linewidth=1.2, label=f"path of the {drawing.trace}"))
-        handles += fixed_handles(drawing, parameters, shown)
+    path = fig.add_subplot(right[-1]) if drawing is not None else None
+    if drawing is not None and path is not None:
+        handles += _draw_path(path, ds, drawing, Motion(series, section, "0.35"))
     if frame.xlim:
         axes[-1].set_xlim(*style.check_range("xlim", frame.xlim))
     style.caption(axes[0], _place(ds))
     style.legend_above(fig, handles)
     fig.align_ylabels(axes)
     style.finish(fig)
-    if drawing is not None:
+    if path is not None:
         equalise(path)
     return fig
+
+
+def _draw_path(ax: Axes, ds: xr.Dataset, drawing: Drawing, motion: Motion) -> list[Any]:
+    """Draw the path of the traced point; return handles for a legend."""
+    style.style_axes(ax)
+    parameters = parameters_of(ds).as_dict()
+    shown = draw_path(ax, drawing, parameters, motion)
+    line = Line2D([], [], color=motion.colour, linewidth=1.2, label=f"path of the {drawing.trace}")
+    return [line, *fixed_handles(drawing, parameters, shown)]
 
 
 def _place(ds: xr.Dataset) -> str:

@@ -22,14 +22,14 @@ T = TypeVar("T")
 class Listener(Protocol):
     """What shows progress."""
 
-    def __call__(self, what: str, done: float, total: float) -> None:
-        """Take that `done` of `total` parts of a piece of work are finished."""
+    def __call__(self, what: str, done: float, total: float, expected_s: float = 0.0) -> None:
+        """Take that `done` of `total` parts of a piece of work are finished; see `report`."""
 
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
-def report(what: str, done: float, total: float) -> None:
+def report(what: str, done: float, total: float, expected_s: float = 0.0) -> None:
     """Say that `done` of `total` parts of a piece of work are finished.
 
     Parameters
@@ -37,11 +37,13 @@ def report(what: str, done: float, total: float) -> None:
     what
         The work in a word or two, such as ``following branches``.
     done, total
-        In any unit; `total` may grow while the work shows how much there is.
+        In any unit; `total` may grow while the work shows how much there is, and is 0 if nobody knows.
+    expected_s
+        About how long the rest will take, for as long as nothing better is known [s].
     """
     listener = _listener.get()
     if listener is not None:
-        listener(what, done, total)
+        listener(what, done, total, expected_s)
 
 
 def is_heard() -> bool:

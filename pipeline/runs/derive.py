@@ -29,7 +29,16 @@ from pipeline.products.registry import ANALYSES
 from pipeline.runs.naming import named
 from pipeline.runs.versions import code_version
 from pipeline.spec.problems import SpecError, unknown_name, validated
-from pipeline.store import directory as store
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import DERIVED
+from pipeline.store.products import (
+    leftover_products,
+    open_product,
+    product_paths,
+    read_product_attrs,
+    remove_product,
+    write_product,
+)
 from pipeline.store.run import Run
 
 if TYPE_CHECKING:
@@ -99,9 +108,9 @@ def derive(
     ------
     SpecError
         If the analysis or an option is unknown or out of bounds, or the run has not what it takes.
-    store.RefusedError
+    RefusedError
         If there is no run.
-    store.DamagedError
+    DamagedError
         If a chunk of the cube is damaged.
     """
     if name not in ANALYSES:
@@ -111,15 +120,15 @@ def derive(
     run = AnalysedRun.of(source, echo)
     wanted = prepared(run, analysis, wanted)
     key = _key(run, analysis, wanted)
-    path = run.directory / store.DERIVED / f"{name}-{key['derived_key'][:8]}.zarr"
+    path = run.directory / DERIVED / f"{name}-{key['derived_key'][:8]}.zarr"
     try:
-        ds = store.open_product(path)
+        ds = open_product(path)
         if all(ds.attrs.get(part) == value for part, value in key.items()):
             run.echo(f"{name}: taken from {path}")
             return _placed(ds, path)
     except FileNotFoundError:
         pass
-    except store.DamagedError as error:
+    except DamagedError as error:
         run.echo(f"{name}: damaged ({error}); computing it again")
     return _kept(run, path, _compute(run, analysis, wanted).assign_attrs(key))
 
@@ -149,7 +158,7 @@ def refused(directory: Path) -> Iterator[None]:
         raise
     except ValueError as error:
         if "checksum" in str(error).lower():
-            raise store.DamagedError(
+            raise DamagedError(
                 f"{directory}: a chunk is damaged; look with: magpend verify {directory}"
             ) from None
         if hasattr(error, "problems"):  # parameters out of bounds say enough themselves
@@ -179,11 +188,11 @@ def _compute(run: AnalysedRun, analysis: Analysis, options: Options) -> xr.Datas
 
 def _kept(run: AnalysedRun, path: Path, result: xr.Dataset) -> xr.Dataset:
     try:
-        store.write_product(path, result)
+        write_product(path, result)
     except PermissionError as error:
         run.echo(f"{path.name}: not kept ({error})")
         return result
-    return _placed(store.open_product(path), path)
+    return _placed(open_product(path), path)
 
 
 def _placed(ds: xr.Dataset, path: Path) -> xr.Dataset:
@@ -198,25 +207,25 @@ def stale(source: Source) -> list[Path]:
     belong to a process at work and is not listed.
     """
     run = Run.open(source)
-    folder = run.directory / store.DERIVED
+    folder = run.directory / DERIVED
 
     def is_stale(path: Path) -> bool:
         try:
-            attrs = store.read_product_attrs(path)
-        except store.DamagedError:
+            attrs = read_product_attrs(path)
+        except DamagedError:
             return True
         name = str(attrs.get("derived_product"))
         if name not in ANALYSES or attrs.get("cube_digest") != run.digest:
             return True
         return bool(attrs.get("analysis_version") != code_version(name))
 
-    products = [path for path in sorted(folder.glob("*.zarr")) if is_stale(path)]
-    return products + store.leftover_products(folder, older_than=_LEFTOVER_SECONDS)
+    products = [path for path in product_paths(folder) if is_stale(path)]
+    return products + leftover_products(folder, older_than=_LEFTOVER_SECONDS)
 
 
 def prune(source: Source) -> list[Path]:
     """Remove what `stale` lists; returns it."""
     found = stale(source)
     for path in found:
-        store.remove_product(path)
+        remove_product(path)
     return found

@@ -18,8 +18,8 @@ from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell, seconds_per_period
 from pipeline.spec.parsing import Spec
 
-BRANCHES, POINTS = 32, 4
-"""Size of the sample: two groups of lanes, and of a continuation some points of each branch."""
+BRANCHES, MOST_BRANCHES, POINTS = 32, 256, 8
+"""Size of a sample: two groups of lanes or more, and of a continuation some points of each branch."""
 
 SPEED_S = 0.25
 """Time for each of the two stretches in which the speed is measured, by the rule of thumb [s]."""
@@ -60,18 +60,18 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
     compiled_s = warm_up(spec)
     most, products = periods_per_cell(spec)
     spec = replace(spec, products={})
-    inputs = _sample(spec, plan, np.random.default_rng(0), pairs=False)
+    inputs = _sample(spec, plan, np.random.default_rng(0), BRANCHES, pairs=False)
     ratio, measured, seconds = _speed(spec, inputs, most)
     how = f"measured: {inputs.frequency_hz.size} of its cells over {measured} periods, {seconds:.1f} s"
     periods = most
     if spec.integration.stop_when_closed:
-        periods = _periods_until_closed(spec, plan, most)
+        periods = _periods_until_closed(spec, plan, most, ratio)
         how += f"; a cell takes {periods:.0f} of at most {most:.0f} periods until it has closed"
     per_cell = ratio * mean_seconds_per_period(spec) * (periods + products)
     return Estimate(per_cell * plan.n_cells, how, compiled_s)
 
 
-def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, *, pairs: bool) -> Inputs:
+def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *, pairs: bool) -> Inputs:
     """Inputs of cells drawn from all over the run.
 
     With `pairs` the points of a continuation's branch are neighbours two by two: where the second one
@@ -81,7 +81,7 @@ def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, *, pairs: bool) ->
     n_points = 1 if plan.path is None else plan.shape[plan.path]
     in_task = math.prod(plan.block) // n_points
     branches = [n for i, n in enumerate(plan.shape) if i != plan.path]
-    chosen = rng.choice(math.prod(branches), min(BRANCHES, in_task, math.prod(branches)), replace=False)
+    chosen = rng.choice(math.prod(branches), min(n_branches, in_task, math.prod(branches)), replace=False)
     parts = []
     for flat in np.sort(chosen):
         place = list(np.unravel_index(flat, branches)) if branches else []
@@ -139,25 +139,33 @@ def _integrate(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[dict[str, np
     return values, time.process_time() - started
 
 
-def _periods_until_closed(spec: Spec, plan: Plan, most: float) -> float:
-    """Mean periods of a cell in a run that stops when orbits have closed."""
+def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> float:
+    """Mean periods of a cell in a run that stops when orbits have closed.
+
+    A first sample says about how many cells there is time for.
+    """
     from pipeline.compute.task import integrate
 
-    rng, counts = np.random.default_rng(1), []
-    left = CLOSING_S
+    rng, n_keep = np.random.default_rng(1), spec.integration.n_keep
+    found, n_branches, left = np.empty(0), BRANCHES, CLOSING_S
     while left > 0:
-        inputs = _sample(spec, plan, rng, pairs=True)
-        by_rule = float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).sum())
-        cap = int(min(most, max(CLOSING_S / by_rule, LEAST_PERIODS + spec.integration.n_keep)))
-        integration = spec.integration.model_copy(update={"n_transient": cap - spec.integration.n_keep})
+        inputs = _sample(spec, plan, rng, n_branches, pairs=True)
+        a_period = ratio * float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).mean())
+        if not len(found):
+            cap = int(
+                min(most, max(CLOSING_S / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS))
+            )
+            integration = spec.integration.model_copy(update={"n_transient": cap - n_keep})
         started = time.process_time()
         values = integrate(replace(spec, integration=integration), inputs)
         left -= time.process_time() - started
         periods = values["n_periods"]
-        counts.append(periods[:, 1::2] if periods.shape[1] > 1 else periods)
-        if plan.n_cells <= BRANCHES:
+        found = np.append(found, periods[:, 1::2] if periods.shape[1] > 1 else periods)
+        per_branch = float(found.mean()) * a_period * periods.shape[1]
+        n_branches = int(np.clip(left / per_branch, 1, MOST_BRANCHES))
+        if len(found) >= plan.n_cells or n_branches < BRANCHES:
             break
-    return mean_with_tail(np.concatenate([c.ravel() for c in counts]).astype(float), cap, most)
+    return mean_with_tail(found, cap, most)
 
 
 def mean_with_tail(periods: np.ndarray, cap: float, most: float) -> float:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from pipeline.layout.vocabulary import axis_name, grid_dim, is_grid_dim, model_of, parameter_name
+from pipeline.layout.vocabulary import axis_name, grid_dim, is_grid_dim, parameter_name
 from pipeline.products.product import Options
 from pipeline.spec.problems import SpecError, unknown_name
 from pipeline.spec.tables import FREQUENCY
@@ -42,8 +42,8 @@ def named(run: Run, options: Options) -> Options:
                 changes["at"][axis] = number
             except SpecError as error:
                 problems += error.problems
-    model = model_of(run.cube()) if {"parameter", "second", "state"} & fields.keys() else None
-    if model is not None:
+    model = run.model
+    if {"parameter", "second", "state"} & fields.keys():
         for role in {"parameter", "second"} & fields.keys():
             changes[role] = parameter_name(given[role])
             problems += _unknown("parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY))

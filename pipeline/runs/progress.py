@@ -48,6 +48,8 @@ class Progress:
         Prints a line.
     clock
         Seconds that only ever grow.
+    expected_s
+        Time that the missing cells will take, by the rule of thumb [s].
     """
 
     def __init__(
@@ -58,7 +60,9 @@ class Progress:
         terminal: bool,
         echo: Callable[[str], None],
         clock: Callable[[], float] = time.monotonic,
+        expected_s: float = 0.0,
     ) -> None:
+        self._expected_s = expected_s
         self._total, self._before, self._done = total, done, done
         self._echo, self._clock = echo, clock
         self._started = self._last_line = clock()
@@ -67,7 +71,7 @@ class Progress:
     def __enter__(self) -> Self:
         if self._bar is not None:
             self._bar.start()
-        report(WORK, self._done, self._total)
+        report(WORK, self._done, self._total, self._expected_s)
         return self
 
     def __exit__(

@@ -13,6 +13,7 @@ from typing import Any
 
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.products.reporting import report
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
 from pipeline.runs.workflows import default_directory, find_spec
@@ -124,12 +125,16 @@ def _complete(
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )
+    report("compiling the kernel", 0, 0)
     seconds = task.warm_up(spec)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
     job = partial(task.run_task, str(info.directory.absolute()), info.digest)
     started = time.perf_counter()
-    with Progress(plan.n_cells, before, terminal=sys.stdout.isatty(), echo=echo) as progress:
+    cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(missing)))
+    expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
+    terminal = sys.stdout.isatty()
+    with Progress(plan.n_cells, before, terminal=terminal, echo=echo, expected_s=expected_s) as progress:
         for result in execute.run_tasks(job, missing, workers=workers, scheduler=scheduler):
             log_timing(info.directory, {**result, "at_s": round(time.perf_counter() - started, 4)})
             progress.add(result["cells"])

@@ -47,7 +47,7 @@ def open_run(path: str | Path | Run, *, chunks: Any = None) -> xr.Dataset:
     Examples
     --------
     >>> ds = open_run("runs/quickstart")                                    # doctest: +SKIP
-    >>> ds.section.sel(state="psi1").sel(frequency=2.2, method="nearest")   # doctest: +SKIP
+    >>> ds.section.isel(state=0).sel(frequency=2.2, method="nearest")       # doctest: +SKIP
     """
     return Run.open(path).cube(chunks)
 

@@ -248,13 +248,20 @@ def step_ratio(room: float) -> float:
 
 
 @inlined
+def hypot_rough(x, y):
+    """Hypotenuse to 2.2 %, by two straight lines, as the engine takes it."""
+    longer = max(x, y)
+    return max(longer, 0.898 * longer + 0.486 * min(x, y))
+
+
+@inlined
 def layer_limit(value: float, rate: float, width: float, jump: float, slack: float) -> float:
     """Longest step beside a layer at value = 0 that `value` nears or leaves at `rate`."""
     speed = abs(rate)
     c = step_ratio(slack * speed / (width * jump))
     if value * rate < 0.0:
         return max(c * abs(value) / (1.0 + c), c * width) / speed
-    return c * math.sqrt(value * value + width * width) / speed
+    return c * hypot_rough(abs(value), width) / speed
 
 
 @inlined
@@ -271,7 +278,7 @@ def limited_step(
     h = min(h, layer_limit(y[3] - y[2], dy[3] - dy[2], 1.0 / m.eps, m.jump2, slack))
     h = min(h, layer_limit(x, dx, 1.0 / m.eps_mag, m.jump_magnet * math.exp(-across * across), slack))
     c, passed, remaining = edge_ratio, t - start, end - t
-    h = min(h, c * math.sqrt(passed * passed + m.edge_width * m.edge_width))
+    h = min(h, c * hypot_rough(passed, m.edge_width))
     h = min(h, max(c / (1.0 + c) * remaining, c * m.edge_width))
     if remaining <= h:
         return remaining

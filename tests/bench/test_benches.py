@@ -42,6 +42,14 @@ def test_kernel__limiter_is_back_after_the_run_without(bench):
     assert before == module.SLACK
 
 
+def test_cheap__prints_all_variants(bench, capsys):
+    cheap = bench("cheap")
+    cheap.main(TINY)
+    printed = capsys.readouterr().out
+    for name in (*cheap.VARIANTS, "largest difference"):
+        assert name in printed
+
+
 def test_peers__models_are_the_same(bench):
     line = bench("peers").check_models(bench("magpend_core").load_preset(), seed=1)
     assert "scalar model" in line

@@ -100,13 +100,14 @@ def made(tmp_path, write_spec):
     from pipeline.layout.identity import identity_of
     from pipeline.layout.plan import make_plan
     from pipeline.spec.parsing import load_spec
-    from pipeline.store import directory as store
+    from pipeline.store.commits import write_task
+    from pipeline.store.setup import create
 
     path = write_spec(SWEEP)
     spec = load_spec(path)
     plan = make_plan(spec)
     identity = identity_of(spec, plan, "test-kernel")
-    info = store.create(tmp_path / "run", spec, plan, identity, SWEEP)
+    info = create(tmp_path / "run", spec, plan, identity, SWEEP)
 
     def values(index: int) -> dict[str, np.ndarray]:
         shape = tuple(s.stop - s.start for s in plan.task(index))
@@ -121,7 +122,7 @@ def made(tmp_path, write_spec):
         return made_up
 
     def commit(index: int) -> None:
-        store.write_task(info, plan, index, values(index), {"bounded": plan.cells_in(index)})
+        write_task(info, plan, index, values(index), {"bounded": plan.cells_in(index)})
 
     return SimpleNamespace(info=info, plan=plan, spec=spec, identity=identity, values=values, commit=commit)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System, positions
-from magpend_core.engine.vecmath import TWO_PI, sincos
+from magpend_core.engine.vecmath import TWO_PI, cos
 from magpend_core.models.duffing.models import PARAMETERS, QUANTITIES, STATES
 
 AT = positions(tuple(p.name for p in PARAMETERS))
@@ -24,7 +24,7 @@ def _constants(frequency: Any, p: Any, out: Any) -> None:
 
 @inline
 def _forcing(t: Any, c: Any) -> Any:
-    return c[C.amplitude] * sincos(c[C.omega] * t)[1]
+    return c[C.amplitude] * cos(c[C.omega] * t)
 
 
 @inline

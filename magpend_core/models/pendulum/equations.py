@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 from magpend_core.engine.jit import inline
 from magpend_core.engine.simd import absolute, maximum, sqrt
-from magpend_core.engine.vecmath import TWO_OVER_PI, TWO_PI, atan, exp, sin, wrapped
+from magpend_core.engine.vecmath import LOG2_E, TWO_OVER_PI, TWO_PI, atan, exp2_falling, sin, wrapped
 
 VACUUM_PERMEABILITY = 1.25663706212e-6  # N/A2, CODATA 2018
 
@@ -52,7 +52,7 @@ class LinkConstants(NamedTuple):
     mu: Any  # m
     stribeck_floor: Any  # 2 mu0/pi
     stribeck_drop: Any  # 2 (1 - mu0)/pi
-    c0: Any  # s/rad
+    c0: Any  # s/rad, times log2(e): for powers of two
     eps: Any  # s/rad
     per_eps: Any  # rad/s
     omega: Any  # rad/s, of the drive
@@ -72,13 +72,13 @@ class FittedConstants(NamedTuple):
     half_alpha2: Any
     beta1: Any  # rad
     beta2: Any
-    per_gamma1: Any  # 1/rad
+    per_gamma1: Any  # 1/rad, times sqrt(log2(e)): for powers of two
     per_gamma2: Any
     p1: Any
     p2: Any
     r1: Any  # rad
     r2: Any
-    per_c1: Any  # 1/rad
+    per_c1: Any  # 1/rad, times sqrt(log2(e))
     per_c2: Any
     m: Any  # slope of the middle of the peaks
     n: Any  # rad
@@ -125,7 +125,8 @@ def link_constants(frequency: Any, p: Any) -> Any:
     return LinkConstants(
         B1, B2, N12, m1 * g * e1 + m2 * g * l1, m2 * g * e2, B1 * B2,
         m1 * g, m2 * g, m1 * e1, m2 * e2, m2 * l1, m1 * e1 + m2 * l1,
-        T1, T2, 2.0 * c, c, mu, TWO_OVER_PI * mu0, TWO_OVER_PI * (1.0 - mu0), p[AT.c0], eps, 1.0 / eps,
+        T1, T2, 2.0 * c, c, mu, TWO_OVER_PI * mu0, TWO_OVER_PI * (1.0 - mu0),
+        LOG2_E * p[AT.c0], eps, 1.0 / eps,
         TWO_PI * frequency, phase, offset, amplitude, eps_drive,
         B2 * per_det, eps / max(jump1, 1e-30), eps / max(jump2, 1e-30),
     )  # fmt: skip
@@ -157,7 +158,7 @@ def drive(t: Any, k: Any) -> Any:
 @inline
 def stribeck(v: Any, k: Any) -> Any:
     """Factor of the dry friction at relative velocity `v` [rad/s], in (-1, 1) (Eq. 7-8)."""
-    return atan(k.eps * v) * (k.stribeck_drop * exp(-(k.c0 * absolute(v))) + k.stribeck_floor)
+    return atan(k.eps * v) * (k.stribeck_drop * exp2_falling(-(k.c0 * absolute(v))) + k.stribeck_floor)
 
 
 @inline
@@ -169,8 +170,8 @@ def magnet_moment(psi1: Any, psi_rel: Any, k: Any) -> Any:
     v1 = (psi1 + (k.p1 * psi_rel + k.r1)) * k.per_c1
     u2 = (psi_rel + k.beta2) * k.per_gamma2
     v2 = (psi1 + (k.p2 * psi_rel + k.r2)) * k.per_c2
-    half_f1 = k.half_alpha1 * exp(-(u1 * u1 + v1 * v1))
-    half_f2 = k.half_alpha2 * exp(-(u2 * u2 + v2 * v2))
+    half_f1 = k.half_alpha1 * exp2_falling(-(u1 * u1 + v1 * v1))
+    half_f2 = k.half_alpha2 * exp2_falling(-(u2 * u2 + v2 * v2))
     step = TWO_OVER_PI * atan(k.eps_mag * (psi1 - (k.m * psi_rel + k.n)))
     return (half_f1 - half_f2) * step + (half_f1 + half_f2)
 
@@ -225,31 +226,49 @@ class _LoadTerms(NamedTuple):
 
 
 @inline
-def _newton_step(a1: Any, a2: Any, a1_free: Any, a2_free: Any, effect: Any, f: Any, k: Any) -> Any:
-    """One Newton step for a = a_free + P N(a).
+def _loads_and_components(a1: Any, a2: Any, f: Any, k: Any) -> Any:
+    """Loads of both joints, then forces along and across link 1 in joint 1, then in 2 (see `loads`)."""
+    along_a = f.sine * a2
+    across_a = f.cosine * a2
+    along1 = f.along10 - along_a
+    across1 = f.across10 + (k.m1_e1_m2_l1 * a1 + across_a)
+    along2 = f.along0 - along_a
+    across2 = f.across0 + (k.m2_l1 * a1 + across_a)
+    load1 = sqrt(along1 * along1 + across1 * across1)
+    load2 = sqrt(along2 * along2 + across2 * across2)
+    return load1, load2, along1, across1, along2, across2
+
+
+@inline
+def _newton_change(r1: Any, r2: Any, loads_there: Any, effect: Any, f: Any, k: Any) -> Any:
+    """Change of (a1, a2) by a Newton step, for the residual (r1, r2) of a = a_free + P N(a).
 
     With K = P dN/da, about 2e-3 in size, the inverse of 1 - K is taken as 1 + K.
     """
     p11, p12, p21, p22 = effect
-    along_a = f.sine * a2
-    across_a = f.cosine * a2
-    along = f.along0 - along_a
-    across = f.across0 + (k.m2_l1 * a1 + across_a)
-    along1 = f.along10 - along_a
-    across1 = f.across10 + (k.m1_e1_m2_l1 * a1 + across_a)
-    load1 = sqrt(along1 * along1 + across1 * across1)
-    load2 = sqrt(along * along + across * across)
-    r1 = (a1_free - a1) + (p11 * load1 + p12 * load2)
-    r2 = (a2_free - a2) + (p21 * load1 + p22 * load2)
+    load1, load2, along1, across1, along2, across2 = loads_there
     # change of the loads along (r1, r2); weightless joints have load 0 and no gradient
     sine = f.sine * r2
     cosine = f.cosine * r2
     change1 = (across1 * (k.m1_e1_m2_l1 * r1 + cosine) - along1 * sine) / maximum(load1, 1e-290)
-    change2 = (across * (k.m2_l1 * r1 + cosine) - along * sine) / maximum(load2, 1e-290)
-    return (
-        a1 + (r1 + (p11 * change1 + p12 * change2)),
-        a2 + (r2 + (p21 * change1 + p22 * change2)),
-    )
+    change2 = (across2 * (k.m2_l1 * r1 + cosine) - along2 * sine) / maximum(load2, 1e-290)
+    return r1 + (p11 * change1 + p12 * change2), r2 + (p21 * change1 + p22 * change2)
+
+
+@inline
+def _solve_implicit(a1_free: Any, a2_free: Any, effect: Any, f: Any, k: Any) -> Any:
+    """Solve a = a_free + P N(a), where N are the bearing loads, by two Newton steps from a_free."""
+    p11, p12, p21, p22 = effect
+    there = _loads_and_components(a1_free, a2_free, f, k)
+    r1 = p11 * there[0] + p12 * there[1]
+    r2 = p21 * there[0] + p22 * there[1]
+    change1, change2 = _newton_change(r1, r2, there, effect, f, k)
+    a1, a2 = a1_free + change1, a2_free + change2
+    there = _loads_and_components(a1, a2, f, k)
+    r1 = (a1_free - a1) + (p11 * there[0] + p12 * there[1])
+    r2 = (a2_free - a2) + (p21 * there[0] + p22 * there[1])
+    change1, change2 = _newton_change(r1, r2, there, effect, f, k)
+    return a1 + change1, a2 + change2
 
 
 @inline
@@ -289,5 +308,4 @@ def solve_accelerations(
     across10 = across0 + k.m1_g * s1
     effect = (p11, p12, p21, p22)
     terms = _LoadTerms(along0, across0, along10, across10, k.m2_e2 * s12, k.m2_e2 * c12)
-    a1, a2 = _newton_step(a1_free, a2_free, a1_free, a2_free, effect, terms, k)
-    return _newton_step(a1, a2, a1_free, a2_free, effect, terms, k)
+    return _solve_implicit(a1_free, a2_free, effect, terms, k)

@@ -11,7 +11,7 @@ from typing import Any
 
 from magpend_core.engine.jit import inline
 from magpend_core.engine.simd import absolute, copysign, maximum, sqrt
-from magpend_core.engine.vecmath import TWO_OVER_PI, atan, exp, wrapped
+from magpend_core.engine.vecmath import LN2, TWO_OVER_PI, atan, exp2_falling, wrapped
 from magpend_core.models.pendulum.equations import magnet_moment, stribeck
 
 
@@ -19,9 +19,9 @@ from magpend_core.models.pendulum.equations import magnet_moment, stribeck
 def stribeck_slope(v: Any, k: Any) -> Any:
     """Derivative of `equations.stribeck` [s/rad]."""
     x = k.eps * v
-    decay = k.stribeck_drop * exp(-(k.c0 * absolute(v)))
+    decay = k.stribeck_drop * exp2_falling(-(k.c0 * absolute(v)))
     steep = k.eps / (1.0 + x * x) * (decay + k.stribeck_floor)
-    return steep - atan(x) * (decay * k.c0) * copysign(1.0, v)
+    return steep - atan(x) * (decay * (LN2 * k.c0)) * copysign(1.0, v)
 
 
 @inline
@@ -33,15 +33,15 @@ def magnet_moment_slopes(psi1: Any, psi_rel: Any, k: Any) -> Any:
     v1 = (psi1 + (k.p1 * psi_rel + k.r1)) * k.per_c1
     u2 = (psi_rel + k.beta2) * k.per_gamma2
     v2 = (psi1 + (k.p2 * psi_rel + k.r2)) * k.per_c2
-    half_f1 = k.half_alpha1 * exp(-(u1 * u1 + v1 * v1))
-    half_f2 = k.half_alpha2 * exp(-(u2 * u2 + v2 * v2))
+    half_f1 = k.half_alpha1 * exp2_falling(-(u1 * u1 + v1 * v1))
+    half_f2 = k.half_alpha2 * exp2_falling(-(u2 * u2 + v2 * v2))
     x = k.eps_mag * (psi1 - (k.m * psi_rel + k.n))
     step = TWO_OVER_PI * atan(x)
     step_slope = TWO_OVER_PI * k.eps_mag / (1.0 + x * x)
-    by_psi1_1 = -2.0 * v1 * k.per_c1 * half_f1
-    by_psi1_2 = -2.0 * v2 * k.per_c2 * half_f2
-    by_rel_1 = -2.0 * (u1 * k.per_gamma1 + v1 * k.p1 * k.per_c1) * half_f1
-    by_rel_2 = -2.0 * (u2 * k.per_gamma2 + v2 * k.p2 * k.per_c2) * half_f2
+    by_psi1_1 = (-2.0 * LN2) * v1 * k.per_c1 * half_f1
+    by_psi1_2 = (-2.0 * LN2) * v2 * k.per_c2 * half_f2
+    by_rel_1 = (-2.0 * LN2) * (u1 * k.per_gamma1 + v1 * k.p1 * k.per_c1) * half_f1
+    by_rel_2 = (-2.0 * LN2) * (u2 * k.per_gamma2 + v2 * k.p2 * k.per_c2) * half_f2
     bumps = half_f1 - half_f2
     by_psi1 = (by_psi1_1 - by_psi1_2) * step + (by_psi1_1 + by_psi1_2) + bumps * step_slope
     by_rel = (by_rel_1 - by_rel_2) * step + (by_rel_1 + by_rel_2) - bumps * step_slope * k.m

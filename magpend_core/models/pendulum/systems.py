@@ -7,7 +7,7 @@ from typing import Any
 
 from magpend_core.engine.jit import inline, specialise
 from magpend_core.engine.system import System, positions
-from magpend_core.engine.vecmath import exp, sincos, wrapped
+from magpend_core.engine.vecmath import LN2, LOG2_E, exp, sincos, wrapped
 from magpend_core.models.model import Model
 from magpend_core.models.pendulum import jacobian, quantities
 from magpend_core.models.pendulum.equations import (
@@ -38,9 +38,10 @@ def _fitted_magnet(p: Any, values: Any, out: Any) -> None:
     p1, p2, r1, r2, l1, l2, h = p[AT.p1], p[AT.p2], p[AT.r1], p[AT.r2], p[AT.l1], p[AT.l2], p[AT.h]
     jump = (abs(alpha1) + abs(alpha2)) * values.compliance1
     per_magnet_jump = eps_mag / max(jump, 1e-30)
+    root = math.sqrt(LOG2_E)
     magnet = FittedConstants(
-        0.5 * alpha1, 0.5 * alpha2, p[AT.beta1], p[AT.beta2], 1.0 / p[AT.gamma1], 1.0 / p[AT.gamma2],
-        p1, p2, r1, r2, 1.0 / p[AT.c1], 1.0 / p[AT.c2], -0.5 * (p1 + p2), -0.5 * (r1 + r2),
+        0.5 * alpha1, 0.5 * alpha2, p[AT.beta1], p[AT.beta2], root / p[AT.gamma1], root / p[AT.gamma2],
+        p1, p2, r1, r2, root / p[AT.c1], root / p[AT.c2], -0.5 * (p1 + p2), -0.5 * (r1 + r2),
         eps_mag, 1.0 / eps_mag, l1, l2, h, 1.0 / h, l1 / h, l2 / h, p[AT.delta] * p[AT.delta],
         per_magnet_jump,
     )  # fmt: skip
@@ -95,7 +96,7 @@ def _fitted_layers(y: Any, dy: Any, c: Any) -> Any:
     psi_rel = wrapped(y[1] - y[0])
     u = (psi_rel + k.beta1) * k.per_gamma1
     x = wrapped(y[0]) - (k.m * psi_rel + k.n)
-    magnet = (x, y[2] - k.m * (y[3] - y[2]), k.per_eps_mag, k.per_magnet_jump * exp(u * u))
+    magnet = (x, y[2] - k.m * (y[3] - y[2]), k.per_eps_mag, k.per_magnet_jump * exp(LN2 * (u * u)))
     friction1, friction2 = _friction_layers(y, dy, LinkConstants(*c[:N_LINK]))
     return friction1, friction2, magnet
 

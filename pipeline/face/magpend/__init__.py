@@ -83,10 +83,10 @@ def __getattr__(name: str) -> Any:
         return metadata.version("magpend")
     if name in _HOME_OF:
         value = getattr(import_module(_HOME_OF[name]), name)
-    elif name.startswith(("plot_", "save_")):
-        value = getattr(import_module("pipeline.plots"), name)
     elif not name.startswith("_") and name in _analyses():
         value = _analysis(name)
+    elif not name.startswith("_") and name in _plots():
+        value = getattr(import_module("pipeline.plots"), name)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value

@@ -21,9 +21,12 @@ NAMES = (
     "exp2_rough",
     "wrapped",
     "log",
+    "cos",
+    "exp2_falling",
+    "hypot_rough",
 )
 exp, sincos, sin, atan = vecmath.exp, vecmath.sincos, vecmath.sin, vecmath.atan
-log = vecmath.log
+log, cos, exp2_falling, hypot_rough = vecmath.log, vecmath.cos, vecmath.exp2_falling, vecmath.hypot_rough
 log2_rough, exp2_rough, wrapped = vecmath.log2_rough, vecmath.exp2_rough, vecmath.wrapped
 
 
@@ -42,12 +45,18 @@ def _of_lanes(x, out):
         store(out, 6 * n + i, exp2_rough(v))
         store(out, 7 * n + i, wrapped(v))
         store(out, 8 * n + i, log(v))
+        store(out, 9 * n + i, cos(v))
+        store(out, 10 * n + i, exp2_falling(v))
+        store(out, 11 * n + i, hypot_rough(v, 1.0))
 
 
 @njit(**OPTIONS)
 def _of_number(v):
     sine, cosine = sincos(v)
-    return exp(v), sine, cosine, sin(v), atan(v), log2_rough(v), exp2_rough(v), wrapped(v), log(v)
+    return (
+        exp(v), sine, cosine, sin(v), atan(v), log2_rough(v), exp2_rough(v), wrapped(v), log(v),
+        cos(v), exp2_falling(v), hypot_rough(v, 1.0),
+    )  # fmt: skip
 
 
 def evaluate(x):
@@ -82,8 +91,27 @@ CASES = {
     "sine of sincos": (mpmath.sin, 1.6, SINE_RANGES),
     "cosine of sincos": (mpmath.cos, 1.6, SINE_RANGES),
     "sin": (mpmath.sin, 2.0, SINE_RANGES),
+    "cos": (mpmath.cos, 2.0, SINE_RANGES),
+    "exp2_falling": (
+        lambda x: mpmath.mpf(2) ** x,
+        1.0,
+        ((-1.0, 0.0), (-20.0, 0.0), (-1000.0, 0.0), (-1e-6, 0.0)),
+    ),
     "log": (mpmath.log, 1.0, ((0.5, 2.0), (0.99, 1.01), (1e-6, 1e6), (1e-300, 1e-290))),
-    "atan": (mpmath.atan, 3.5, ((-0.42, 0.42), (0.414, 0.436), (-3.0, 3.0), (-1e3, 1e3), (-1e-6, 1e-6))),
+    "atan": (
+        mpmath.atan,
+        3.5,
+        (
+            (-0.42, 0.42),
+            (0.198, 0.21),
+            (0.66, 0.7),
+            (1.49, 1.55),
+            (5.0, 5.1),
+            (-3.0, 3.0),
+            (-1e3, 1e3),
+            (-1e-6, 1e-6),
+        ),
+    ),
 }
 
 
@@ -102,7 +130,12 @@ def test_atan__over_all_magnitudes():
 
 @pytest.mark.parametrize(
     ("name", "function", "first"),
-    [("sine of sincos", mpmath.sin, 2), ("sin", mpmath.sin, 2), ("cosine of sincos", mpmath.cos, 1)],
+    [
+        ("sine of sincos", mpmath.sin, 2),
+        ("sin", mpmath.sin, 2),
+        ("cosine of sincos", mpmath.cos, 1),
+        ("cos", mpmath.cos, 1),
+    ],
 )
 def test_sines__near_their_zeros_lose_only_the_rest_of_pi(name, function, first):
     # the two parts of pi/2 leave out 4e-27, so n of them n * 4e-27: at most 3e-27 |x|
@@ -163,7 +196,7 @@ def test_sines__square_sum_and_quadrants():
 
 def test_nan__stays_nan_in_sines_and_atan():
     values = evaluate([np.nan])
-    for name in ("sine of sincos", "cosine of sincos", "sin", "atan", "wrapped"):
+    for name in ("sine of sincos", "cosine of sincos", "sin", "cos", "atan", "wrapped"):
         assert np.isnan(values[name]).all(), name
 
 
@@ -188,6 +221,18 @@ def test_exp2_rough__is_within_8e_4():
     assert abs(evaluate(x)["exp2_rough"] / np.exp2(x) - 1.0).max() < 8e-4
     whole = np.arange(-1000.0, 1001.0, 8.0)
     assert (evaluate(whole)["exp2_rough"] == np.exp2(whole)).all()
+
+
+def test_hypot_rough__is_within_2_percent():
+    x = np.concatenate([points((0.0, 1.0), (0.0, 20.0)), [0.0, np.inf]])
+    values = evaluate(x)["hypot_rough"]
+    assert abs(values[:-1] / np.hypot(x[:-1], 1.0) - 1.0).max() < 0.022
+    assert values[-1] == np.inf
+
+
+def test_exp2_falling__limits_and_special_values():
+    values = evaluate([0.0, -0.0, -1000.0, -1e300, -np.inf, -3.0])["exp2_falling"]
+    assert values.tolist() == [1.0, 1.0, *[2.0**-1000] * 3, 0.125]
 
 
 def test_wrapped__takes_off_whole_turns():

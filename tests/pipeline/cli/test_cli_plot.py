@@ -36,8 +36,8 @@ def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
         "attractors": [*one, "--state", "psi2"], "regimes": ["--show", "number"],
     }  # fmt: skip
     names = {
-        "basins": "basins_q_1.5_frequency_2.6", "fractions": "fractions_q_1.5",
-        "gallery": "gallery_q_1.5_frequency_2.6", "attractors": "attractors_psi2_q_1.5",
+        "basins": "basins_q_1.5_frequency_2.6_degrees_shade", "fractions": "fractions_q_1.5",
+        "gallery": "gallery_q_1.5_frequency_2.6", "attractors": "attractors_q_1.5_psi2",
         "regimes": "regimes_number",
     }  # fmt: skip
     for verb, options in figures.items():
@@ -85,6 +85,8 @@ def test_plot__continuation_with_loops(main, write_spec, walk_text, tmp_path):
     code, _, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
     assert code == 0, err
     assert "hysteresis: computed" in err
-    with xr.open_dataset(tmp_path / "run" / "figures" / "attractors_psi1.nc", engine="scipy") as stored:
+    with xr.open_dataset(
+        tmp_path / "run" / "figures" / "attractors_degrees_psi1.nc", engine="scipy"
+    ) as stored:
         assert {"value", "share", "present"} <= set(stored.data_vars)
         assert stored["value"].attrs["units"] == "deg"

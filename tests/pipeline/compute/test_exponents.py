@@ -96,12 +96,12 @@ def test_lyapunov__failed_cells_have_none(tmp_path):
 
 def test_lyapunov__pending_cells_have_none(tmp_path):
     from pipeline.layout.identity import identity_of
-    from pipeline.store import directory as store
+    from pipeline.store.setup import create
 
     (tmp_path / "spec.toml").write_text(SPEC)
     spec = load_spec(tmp_path / "spec.toml")
     plan = make_plan(spec)
-    store.create(tmp_path / "run", spec, plan, identity_of(spec, plan, "test"), SPEC)
+    create(tmp_path / "run", spec, plan, identity_of(spec, plan, "test"), SPEC)
     found = open_run(tmp_path / "run")
     assert (found.lyapunov_flag == LyapunovFlag.ABSENT).all()
     assert np.isnan(found.lyapunov).all()

@@ -8,8 +8,8 @@ import xarray as xr
 from matplotlib.lines import Line2D
 
 from magpend_core.models.parameters import ParameterError
-from pipeline.analysis.branches import product as derived_branches
 from pipeline.plots import plot_branches, plot_curves, plot_multipliers
+from pipeline.runs.derive import derive
 from pipeline.spec.problems import SpecError
 
 
@@ -111,14 +111,14 @@ def test_plot_curves__lines():
         ({"parameter": "ep"}, "did you mean eps"),
         ({"parameter": "c"}, "--from and --to"),
         ({"low": 2.5, "high": 2.4}, "is empty"),
-        ({"max_period": 0}, "max_period = 0"),
+        ({"max_period": -1}, "max_period = -1"),
         ({"low": -1.0}, "greater than 0"),
         ({"parameter": "m1", "low": -1.0, "high": 1.0}, "m1 = -1.0 is out of bounds"),
     ],
 )
 def test_branches__bad_input(made, options, message):
     with pytest.raises((SpecError, ParameterError), match=message):
-        derived_branches.branches(made.info.directory, **options)
+        derive(made.info.directory, "branches", options)
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def test_branches__command(magpend, tmp_path):
     """The shipped workflow's small size, its table, a figure."""
     assert magpend("run", "branches_2_3hz", "--smoke", "--workers", 0, "--out", "run").returncode == 0
     options = ("--from", 2.45, "--to", 2.7, "--period", 2, "--generations", 1)
-    done = magpend("branches", "run", *options, "--csv", "table.csv")
+    done = magpend("analyse", "branches", "run", *options, "--csv", "table.csv")
     assert done.returncode == 0, done.stderr
     rows = [line.split(",") for line in (tmp_path / "table.csv").read_text().splitlines()]
     halvings = [row for row in rows if row[2:5] == ["period_doubling", "supercritical", "1"]]

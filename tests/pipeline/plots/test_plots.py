@@ -358,7 +358,7 @@ def test_plots__import_neither_kernels_nor_executor():
     code = (
         "import sys, pipeline.plots; "
         "print([m for m in ('numba', 'zarr', 'dask', 'distributed', 'matplotlib.pyplot', "
-        "'pipeline.compute.execute', 'pipeline.store.directory') if m in sys.modules])"
+        "'pipeline.compute.execute', 'pipeline.store.run') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -218,8 +218,8 @@ def test_plot_basins__third_start_axis_must_be_chosen(grid):
     with pytest.raises(ValueError, match=r"3 of the initial states are left.*such as psi1_dot_0=0"):
         plot_basins(more)
     assert plot_basins(more, at={"psi1_dot_0": 1.0}).axes[0].get_xlabel().startswith(r"$\psi_1")
-    assert r"\dot{\psi}_2" not in plot_basins(more, at={"psi2_0": 0.2}).axes[0].get_xlabel()
-    assert plot_basins(more, at={"psi2_0": 0.2}).axes[0].get_ylabel() == r"$\dot{\psi}_1(0)$ [rad/s]"
+    assert r"\dot{\psi}_2" not in plot_basins(more, at={"psi2_0": 0.25}).axes[0].get_xlabel()
+    assert plot_basins(more, at={"psi2_0": 0.25}).axes[0].get_ylabel() == r"$\dot{\psi}_1(0)$ [rad/s]"
 
 
 def test_plot_basins__data_beside_the_figure(grid, tmp_path):

@@ -17,7 +17,8 @@ from pipeline.runs import derive as deriving
 from pipeline.runs import versions
 from pipeline.runs.derive import AnalysedRun, derive
 from pipeline.spec.problems import SpecError
-from pipeline.store import directory as store
+from pipeline.store.commits import withdraw
+from pipeline.store.errors import DamagedError
 from pipeline.store.run import Run
 
 QUICK = {"polish": False, "rule_n_anchors": 16}
@@ -125,7 +126,7 @@ def test_derive__other_options_and_further_cells_compute_again(made, compute):
     assert compute.calls == 3
     assert not after["mean"].equals(before["mean"])
     assert len(products(made)) == 3
-    store.withdraw(made.info, ["000001.json"])
+    withdraw(made.info, ["000001.json"])
     xr.testing.assert_identical(derive(directory, "mean", {"a": 1}), before)
     assert compute.calls == 3
 
@@ -214,7 +215,7 @@ def test_derive__damage_is_said_and_mended(whole, compute, harm):
 def test_derive__a_damaged_cube_is_no_result(whole, compute):
     chunk = next((whole.info.directory / "cube.zarr" / "section").glob("c.*"))
     flip(chunk)
-    with pytest.raises(store.DamagedError, match="magpend verify"):
+    with pytest.raises(DamagedError, match="magpend verify"):
         derive(whole.info.directory, "mean")
     assert not products(whole)
 

@@ -18,7 +18,8 @@ from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import InterruptedRunError, run
 from pipeline.runs.status import state
 from pipeline.spec.parsing import parse_spec
-from pipeline.store import directory as store
+from pipeline.store.errors import LockedError, RefusedError
+from pipeline.store.runfile import read_run
 
 MANY = """
 [axes]
@@ -154,9 +155,7 @@ def test_run__changed_spec_is_refused(write_spec, sweep_text, tmp_path, bytes_of
         lambda: run(changed, tmp_path / "run", workers=0),
         lambda: list(describe_plan(changed, tmp_path / "run")),
     ):
-        with pytest.raises(
-            store.RefusedError, match=r"spec\.integration\.rtol: 1e-06 in the directory, 1e-05 now"
-        ):
+        with pytest.raises(RefusedError, match=r"spec\.integration\.rtol: 1e-06 in the directory, 1e-05 now"):
             function()
     assert bytes_of(tmp_path / "run") == before
 
@@ -167,16 +166,16 @@ def test_run__other_kernel_is_refused(write_spec, sweep_text, tmp_path, monkeypa
     path = write_spec(sweep_text)
     run(path, tmp_path / "run", workers=0, echo=silent)
     monkeypatch.setattr(magpend_core, "kernel_version", lambda: "newer")
-    with pytest.raises(store.RefusedError, match=r"kernel_version: \w+ in the directory, newer now"):
+    with pytest.raises(RefusedError, match=r"kernel_version: \w+ in the directory, newer now"):
         run(path, tmp_path / "run", workers=0, echo=silent)
 
 
 def test_task__other_kernel_on_a_worker_is_refused(write_spec, sweep_text, tmp_path, monkeypatch):
     run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
-    digest = store.read_run(tmp_path / "run").digest
+    digest = read_run(tmp_path / "run").digest
     task._prepare.cache_clear()
     monkeypatch.setattr(task, "kernel_version", lambda: "older")
-    with pytest.raises(store.RefusedError, match="would not compute the same run"):
+    with pytest.raises(RefusedError, match="would not compute the same run"):
         task.run_task(str(tmp_path / "run"), digest, 0)
 
 
@@ -184,7 +183,7 @@ def test_run__locked(write_spec, sweep_text, tmp_path):
     from filelock import FileLock
 
     (tmp_path / "run").mkdir()
-    with FileLock(tmp_path / "run" / "lock", is_singleton=False), pytest.raises(store.LockedError):
+    with FileLock(tmp_path / "run" / "lock", is_singleton=False), pytest.raises(LockedError):
         run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
 
 

@@ -9,7 +9,8 @@ from magpend_core import Status
 from magpend_core.models import load_model
 from pipeline import open_run
 from pipeline.layout.schema import base_variables
-from pipeline.store import directory as store
+from pipeline.store.errors import RefusedError
+from pipeline.store.view import CommittedStore
 
 VARIABLES = base_variables(load_model())
 
@@ -51,13 +52,13 @@ def test_open_run__reads_no_chunk_before_it_is_used(made, monkeypatch):
     for index in range(made.plan.n_tasks):
         made.commit(index)
     asked = []
-    original = store.CommittedStore.get
+    original = CommittedStore.get
 
     async def get(self, key, *arguments, **options):
         asked.append(key)
         return await original(self, key, *arguments, **options)
 
-    monkeypatch.setattr(store.CommittedStore, "get", get)
+    monkeypatch.setattr(CommittedStore, "get", get)
     names = tuple(f"{v.name}/c" for v in VARIABLES)
     for chunks in (None, {}):
         ds = open_run(made.info.directory, chunks=chunks)
@@ -72,5 +73,5 @@ def test_open_run__reads_no_chunk_before_it_is_used(made, monkeypatch):
 
 
 def test_open_run__no_run_there(tmp_path):
-    with pytest.raises(store.RefusedError, match="no run directory"):
+    with pytest.raises(RefusedError, match="no run directory"):
         open_run(tmp_path)

@@ -15,9 +15,13 @@ from pipeline import open_run
 from pipeline.layout.schema import base_variables
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store import commits as store_commits
-from pipeline.store import directory as store
 from pipeline.store import files, runfile
+from pipeline.store.commits import marker_path, read_commits, sweep, write_task
+from pipeline.store.errors import DamagedError, LockedError, RefusedError
+from pipeline.store.files import writer_lock
 from pipeline.store.run import Run
+from pipeline.store.runfile import read_run
+from pipeline.store.setup import check, create
 
 VARIABLES = base_variables(load_model())
 
@@ -60,12 +64,12 @@ def test_write_task__reads_back(made):
     made.commit(1)
     assert_data(made.info.directory, made, 1)
     assert_pending(made.info.directory, made.plan, 0)
-    assert set(store.read_commits(made.info, made.plan)) == {1}
+    assert set(read_commits(made.info, made.plan)) == {1}
 
 
 def test_write_task__fill_values_leave_files(made):
     made.commit(0)
-    marker = json.loads(store.marker_path(made.info.directory, 0).read_text())
+    marker = json.loads(marker_path(made.info.directory, 0).read_text())
     assert sorted({key.split("/")[0] for key in marker["objects"]}) == sorted(v.name for v in VARIABLES)
     for key in marker["objects"]:
         assert (made.info.directory / "cube.zarr" / key).is_file()
@@ -75,7 +79,7 @@ def test_write_task__refuses_wrong_shapes_and_cut_chunks(made):
     values = made.values(0)
     values["status"] = values["status"][..., :1]
     with pytest.raises(ValueError, match="status"):
-        store.write_task(made.info, made.plan, 0, values, {})
+        write_task(made.info, made.plan, 0, values, {})
     with pytest.raises(ValueError, match="cuts chunks"):
         store_commits.chunk_keys("x", (slice(1, 4),), (4,), (8,))
     with pytest.raises(ValueError, match="cuts chunks"):
@@ -121,9 +125,9 @@ def test_write_task__crash_between_steps_leaves_pending(made, monkeypatch, modul
         with pytest.raises(CrashError):
             made.commit(0)
     assert_pending(made.info.directory, made.plan, 0)
-    commits = store.read_commits(made.info, made.plan)
+    commits = read_commits(made.info, made.plan)
     assert set(commits) == {1}
-    store.sweep(made.info, commits)
+    sweep(made.info, commits)
     assert_data(made.info.directory, made, 1)
     made.commit(0)
     assert_data(made.info.directory, made, 0)
@@ -145,7 +149,7 @@ def test_write_task__crash_before_the_marker_is_renamed(made, monkeypatch):
     leftovers = list((made.info.directory / "commits").iterdir())
     assert len(leftovers) == 1
     assert_pending(made.info.directory, made.plan, 0)
-    assert store.sweep(made.info, {}) == 1 + CUBE_WRITES
+    assert sweep(made.info, {}) == 1 + CUBE_WRITES
     assert list((made.info.directory / "commits").iterdir()) == []
 
 
@@ -179,7 +183,7 @@ def test_write_task__order_of_syncs(made, monkeypatch):
 
 def test_read__leftover_chunk_is_not_data(made):
     made.commit(0)
-    store.marker_path(made.info.directory, 0).unlink()
+    marker_path(made.info.directory, 0).unlink()
     assert_pending(made.info.directory, made.plan, 0)
     ds = open_run(made.info.directory, chunks={})
     assert (ds.status.compute() == 0).all()
@@ -200,31 +204,31 @@ def test_read__leftover_chunk_is_not_data(made):
 )
 def test_read_commits__invalid_markers_do_not_count(made, change):
     made.commit(0)
-    path = store.marker_path(made.info.directory, 0)
+    path = marker_path(made.info.directory, 0)
     changed = change(path.read_text())
     assert changed != path.read_text()
     path.write_text(changed)
-    assert store.read_commits(made.info, made.plan) == {}
+    assert read_commits(made.info, made.plan) == {}
     assert_pending(made.info.directory, made.plan, 0)
 
 
 def test_read_commits__missing_or_short_chunk(made):
     made.commit(0)
     made.commit(1)
-    objects = store.read_commits(made.info, made.plan)[0].objects
+    objects = read_commits(made.info, made.plan)[0].objects
     chunk = made.info.directory / "cube.zarr" / next(k for k in objects if k.startswith("section"))
     whole = chunk.read_bytes()
     chunk.write_bytes(whole[:-1])
-    assert set(store.read_commits(made.info, made.plan)) == {1}
+    assert set(read_commits(made.info, made.plan)) == {1}
     chunk.unlink()
-    assert set(store.read_commits(made.info, made.plan)) == {1}
+    assert set(read_commits(made.info, made.plan)) == {1}
     assert_pending(made.info.directory, made.plan, 0)
 
 
 @pytest.mark.parametrize("name", [v.name for v in VARIABLES])
 def test_flipped_bit__is_never_read_as_data(made, name):
     made.commit(0)
-    key = next(k for k in store.read_commits(made.info, made.plan)[0].objects if k.startswith(f"{name}/"))
+    key = next(k for k in read_commits(made.info, made.plan)[0].objects if k.startswith(f"{name}/"))
     chunk = made.info.directory / "cube.zarr" / key
     whole = chunk.read_bytes()
     run = Run.open(made.info.directory)
@@ -274,26 +278,26 @@ def test_sweep__touches_nothing_else(made):
         (directory / name / "kept.txt").write_text("x")
     (directory / "cube.zarr/section/c.0.0.abc.partial").write_bytes(b"x")
     before = sorted(p for p in directory.rglob("*") if p.is_file() and not p.name.endswith("partial"))
-    assert store.sweep(made.info, store.read_commits(made.info, made.plan)) == 1
+    assert sweep(made.info, read_commits(made.info, made.plan)) == 1
     assert sorted(p for p in directory.rglob("*") if p.is_file()) == before
 
 
 def test_check__difference_key_by_key(made):
-    assert store.check(made.info.directory, made.identity) == made.info
+    assert check(made.info.directory, made.identity) == made.info
     other = {**made.identity, "kernel_version": "newer"}
-    with pytest.raises(store.RefusedError, match="kernel_version: test-kernel in the directory, newer now"):
-        store.check(made.info.directory, other)
+    with pytest.raises(RefusedError, match="kernel_version: test-kernel in the directory, newer now"):
+        check(made.info.directory, other)
 
 
 def test_check__directories_that_are_not_empty_are_refused(made, tmp_path):
     foreign = tmp_path / "foreign"
     foreign.mkdir()
-    assert store.check(foreign, made.identity) is None
+    assert check(foreign, made.identity) is None
     (foreign / "thesis.tex").write_text("x")
-    with pytest.raises(store.RefusedError, match=r"thesis\.tex"):
-        store.check(foreign, made.identity)
-    with pytest.raises(store.RefusedError, match="is a file"):
-        store.check(foreign / "thesis.tex", made.identity)
+    with pytest.raises(RefusedError, match=r"thesis\.tex"):
+        check(foreign, made.identity)
+    with pytest.raises(RefusedError, match="is a file"):
+        check(foreign / "thesis.tex", made.identity)
 
 
 def test_create__crash_during_set_up_starts_again(made, monkeypatch, tmp_path):
@@ -301,24 +305,24 @@ def test_create__crash_during_set_up_starts_again(made, monkeypatch, tmp_path):
     with monkeypatch.context() as patch:
         crash_at(patch, runfile, "write_atomically", 1)
         with pytest.raises(CrashError):
-            store.create(directory, made.spec, made.plan, made.identity, "text")
-    with pytest.raises(store.RefusedError, match="no run directory"):
-        store.read_run(directory)
-    assert store.check(directory, made.identity) is None
-    store.create(directory, made.spec, made.plan, made.identity, "text")
-    assert store.check(directory, made.identity) is not None
+            create(directory, made.spec, made.plan, made.identity, "text")
+    with pytest.raises(RefusedError, match="no run directory"):
+        read_run(directory)
+    assert check(directory, made.identity) is None
+    create(directory, made.spec, made.plan, made.identity, "text")
+    assert check(directory, made.identity) is not None
 
 
 def test_read_run__damaged(made):
     path = made.info.directory / "run.json"
     for text in (path.read_text()[:-20], path.read_text().replace('"n_keep": 3', '"n_keep": 4')):
         path.write_text(text)
-        with pytest.raises(store.DamagedError, match="rebuilt"):
-            store.read_run(made.info.directory)
+        with pytest.raises(DamagedError, match="rebuilt"):
+            read_run(made.info.directory)
 
 
 def _hold(directory, ready, done):
-    with store.writer_lock(directory):
+    with writer_lock(directory):
         ready.set()
         done.wait(30)
 
@@ -330,12 +334,12 @@ def test_writer_lock__another_process(tmp_path):
     process.start()
     try:
         assert ready.wait(60)
-        with pytest.raises(store.LockedError, match="another magpend run"), store.writer_lock(tmp_path):
+        with pytest.raises(LockedError, match="another magpend run"), writer_lock(tmp_path):
             pass
     finally:
         process.kill()
         process.join()
-    with store.writer_lock(tmp_path):
+    with writer_lock(tmp_path):
         pass
 
 
@@ -344,7 +348,7 @@ def test_same_bytes__whatever_the_order(made, tmp_path, bytes_of):
         made.commit(index)
     first = bytes_of(made.info.directory)
     shutil.rmtree(made.info.directory)
-    store.create(made.info.directory, made.spec, made.plan, made.identity, made.info.spec_text)
+    create(made.info.directory, made.spec, made.plan, made.identity, made.info.spec_text)
     for index in reversed(range(made.plan.n_tasks)):
         made.commit(index)
         made.commit(index)

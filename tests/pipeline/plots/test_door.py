@@ -1,0 +1,236 @@
+"""From options to files: names, values between those of an axis, provenance, sizes."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.colors import to_hex
+
+from magpend_core.models import load_model
+from pipeline.analysis.selection import place
+from pipeline.plots import Frame, draw_figure, save_data, save_figure
+from pipeline.plots.bifurcation import plot_bifurcation
+from pipeline.plots.style import COLUMN_MM
+from pipeline.products.product import Options, default_of
+from pipeline.products.registry import FIGURES
+
+PENDULUM = "\n".join(f"{k} = {v!r}" for k, v in load_model("pendulum").load().as_dict().items())
+
+
+def make_cube(n=5, n_keep=3):
+    """Cells of two starts over the frequency."""
+    size = 0.1 + 0.01 * np.arange(n)[:, None] + 0.001 * np.arange(n_keep)
+    section = np.stack([np.stack([size, size, 10 * size, -size], -1)] * 2, axis=1)
+    return xr.Dataset(
+        {
+            "section": (("frequency", "initial_condition", "period_index", "state"), section),
+            "status": (("frequency", "initial_condition"), np.full((n, 2), 2, np.int8)),
+            "turns": (("frequency", "initial_condition", "link"), np.zeros((n, 2, 2), np.int32)),
+        },
+        coords={
+            "frequency": ("frequency", 2.0 + 0.05 * np.arange(n), {"units": "Hz"}),
+            "state": ["psi1", "psi2", "psi1_dot", "psi2_dot"],
+        },
+        attrs={"model": "pendulum", "parameters": PENDULUM, "source": "magpend 9, kernel abc"},
+    )
+
+
+class FakeRun:
+    """What figures use of a run."""
+
+    digest = "c" * 64
+    info = SimpleNamespace(
+        title="a run", digest="d" * 64, versions={"numpy": "9.9"},
+        provenance={"host": "node7", "created": "2026-01-02T03:04:05+00:00", "git_commit": "f" * 40},
+    )  # fmt: skip
+
+    def __init__(self):
+        self.said, self.derived = [], []
+        self.echo = self.said.append
+
+    def cube(self, chunks=None):
+        return make_cube()
+
+    def derive(self, name, **options):
+        self.derived.append(name)
+        raise AssertionError("computed before the options were looked at")
+
+
+def options_of(name, **given):
+    return FIGURES[name].options.model_validate(given)
+
+
+def other_value(model, name):
+    """A valid value of an option that is not its default."""
+    default = default_of(model, name)
+    special = {
+        "at": {"frequency": 2.05}, "xlim": (2.0, 2.1), "ylim": (0.0, 1.0), "layout": "side", "per": "period",
+        "show": "number", "colour": "attractor", "width": 85.0, "state": "psi2", "quantity": "energy.max",
+        "against": "psi2",
+        "second_low": 0.5, "second_high": 0.7, "over": "other/run", "parameter": "q", "low": 2.0,
+        "high": 2.5, "shown": 2,
+    }  # fmt: skip
+    if name in special:
+        return special[name]
+    if isinstance(default, bool):
+        return not default
+    return default + 1 if isinstance(default, int) else 0.123 if isinstance(default, float) else "other"
+
+
+@pytest.mark.parametrize("name", list(FIGURES))
+def test_label__every_option_that_changes_the_picture_changes_the_name(name):
+    model = FIGURES[name].options
+    required = {
+        key: {"second": "q"}.get(key, 1.0) for key, field in model.model_fields.items() if field.is_required()
+    }
+    base = model.model_construct(**required)
+    seen = {base.label(): "nothing"}
+    for key in model.model_fields:
+        if key in ("out", "format"):
+            continue
+        label = model.model_construct(**{**required, key: other_value(model, key)}).label()
+        assert label not in seen, f"{key} and {seen.get(label)} give the same file name {label!r}"
+        seen[label] = key
+
+
+def test_label__values_that_differ_late_give_other_names():
+    labels = {options_of("gallery", at={"frequency": f}).label() for f in (2.2, 2.2000001, 2.2000002)}
+    assert len(labels) == 3
+    assert options_of("gallery", at={"frequency": 2.2}).label() == "_frequency_2.2"
+
+
+def test_label__a_quantity_replaces_the_state():
+    assert options_of("bifurcation", state="psi1", quantity="energy.max").label() == "_energy.max"
+
+
+def test_options__out_and_format_are_no_part_of_the_name():
+    assert options_of("regimes", out="a.png", format="pdf").label() == ""
+
+
+@pytest.mark.parametrize("value", [2.05, 2.05 + 4e-8])
+def test_place__value_of_the_axis(value):
+    assert place(make_cube()["frequency"], value) == 1
+
+
+def test_place__value_between_names_its_neighbours():
+    with pytest.raises(ValueError, match=r"2\.053 is not on its axis; the nearest values are 2\.05 and 2\.1"):
+        place(make_cube()["frequency"], 2.053)
+    with pytest.raises(ValueError, match=r"lies off its axis, which runs from 2 to 2\.2"):
+        place(make_cube()["frequency"], 3.0)
+
+
+@pytest.mark.parametrize("name", ["gallery", "basins", "section", "dimension", "fractions"])
+def test_draw_figure__value_between_is_refused_before_anything_is_computed(name):
+    run = FakeRun()
+    with pytest.raises(ValueError, match=r"nearest values are 2\.05 and 2\.1"):
+        draw_figure(run, name, options_of(name, state="psi1", at={"frequency": 2.053})
+                    if "state" in FIGURES[name].options.model_fields
+                    else options_of(name, at={"frequency": 2.053}))  # fmt: skip
+    assert run.derived == []
+
+
+def test_draw_figure__nearest_is_said_and_shown():
+    run = FakeRun()
+    given = options_of("section", state="psi1", at={"frequency": 2.053}, nearest=True)
+    figure = draw_figure(run, "section", given)
+    assert run.said == ["frequency = 2.053 is not on its axis; drawn at the nearest, 2.05"]
+    assert figure.axes[0].get_title(loc="left") == "$f$ = 2.05\N{NO-BREAK SPACE}Hz"
+    assert float(figure.data["frequency"]) == 2.05
+
+
+def test_draw_figure__provenance_beside_and_inside(tmp_path):
+    figure = draw_figure(FakeRun(), "bifurcation", options_of("bifurcation", state="psi2", width=85.0))
+    path = save_data(figure, save_figure(figure, tmp_path / "a.png"))
+    with xr.open_dataset(path, engine="scipy") as stored:
+        attrs = stored.attrs
+        assert stored["y"].attrs["units"] == "rad"
+        assert stored["y"].size == 30
+    assert attrs["figure"] == "bifurcation"
+    assert json.loads(attrs["options"]) == {"state": "psi2", "width": 85.0}
+    assert attrs["digest"] == "d" * 64
+    assert attrs["cube_digest"] == "c" * 64
+    assert json.loads(attrs["versions"]) == {"numpy": "9.9"}
+    assert (attrs["host"], attrs["git_commit"]) == ("node7", "f" * 40)
+    assert attrs["created"].startswith("2026-01-02")
+    assert attrs["model"] == "pendulum"
+    for suffix in (".png", ".svg", ".pdf"):
+        written = save_figure(figure, tmp_path / f"a{suffix}").read_bytes()
+        if suffix != ".pdf":
+            assert b"node7" in written
+            assert b"d" * 64 in written
+        assert b"bifurcation diagram" in written or suffix == ".pdf"
+
+
+def test_save_figure__fonts_are_outlines_and_texts_stay_texts(tmp_path):
+    figure = plot_bifurcation(make_cube())
+    written = save_figure(figure, tmp_path / "a.pdf").read_bytes()
+    # type 42 embeds TrueType outlines; type 3 would be drawings without a name that journals take
+    assert b"/Type3" not in written
+    assert b"/FontFile2" in written
+    assert b"drive frequency [Hz]</text>" in save_figure(figure, tmp_path / "a.svg").read_bytes()
+
+
+@pytest.mark.parametrize("width", [COLUMN_MM, 120.0, 178.0])
+def test_frame__width_in_millimetres_and_legible_letters(width):
+    figure = plot_bifurcation(make_cube(), frame=Frame(width))
+    assert figure.get_size_inches()[0] * 25.4 == pytest.approx(width)
+    figure.draw_without_rendering()
+    right, top = figure.get_size_inches() * figure.dpi
+    ax = figure.axes[0]
+    ticks = [
+        tick.label1
+        for axis, low, high in ((ax.xaxis, *ax.get_xlim()), (ax.yaxis, *ax.get_ylim()))
+        for tick in axis.get_major_ticks()
+        if low <= tick.get_loc() <= high
+    ]
+    for text in (t for t in [ax.xaxis.label, ax.yaxis.label, *ticks] if t.get_text()):
+        assert text.get_fontsize() >= 7.0
+        box = text.get_window_extent()
+        assert box.x0 >= -1
+        assert box.y0 >= -1
+        assert box.x1 <= right + 1
+        assert box.y1 <= top + 1
+    boxes = sorted((t.get_window_extent() for t in ax.get_xticklabels() if t in ticks), key=lambda b: b.x0)
+    assert len(boxes) > 2
+    assert all(a.x1 < b.x0 for a, b in itertools.pairwise(boxes))
+
+
+def test_frame__limits_show_and_keep_a_part():
+    figure = plot_bifurcation(make_cube(), frame=Frame(xlim=(2.04, 2.11), ylim=(0.105, 0.125)))
+    ax = figure.axes[0]
+    assert ax.get_xlim() == (2.04, 2.11)
+    assert ax.get_ylim() == (0.105, 0.125)
+    assert sorted(set(np.round(figure.data["x"].values, 6))) == [2.05, 2.1]
+    with pytest.raises(ValueError, match=r"xlim = 2, 2: must be two different"):
+        plot_bifurcation(make_cube(), frame=Frame(xlim=(2.0, 2.0)))
+
+
+def test_bifurcation__fixed_values_are_shown():
+    cube = xr.concat([make_cube(), make_cube()], xr.DataArray([1.0, 1.5], dims="q", name="q"))
+    cube["q"].attrs = {"units": "N m"}
+    figure = plot_bifurcation(cube.transpose("frequency", "q", "initial_condition", ...), at={"q": 1.5})
+    assert figure.axes[0].get_title(loc="left") == "q = 1.5\N{NO-BREAK SPACE}N m"
+
+
+def test_options__every_figure_has_the_common_ones():
+    for figure in FIGURES.values():
+        assert issubclass(figure.options, Options)
+        assert {"at", "nearest", "degrees", "width", "xlim", "ylim"} <= set(figure.options.model_fields)
+
+
+def test_motions__words_have_colours_and_neutral_ones_are_grey():
+    from pipeline.plots.motions import motions_of
+    from pipeline.plots.style import BLUE, GREY
+
+    found = motions_of(make_cube())
+    assert found.words == load_model("pendulum").classifier.words
+    assert found.colours[found.words.index("left")] == BLUE
+    assert {to_hex(found.colours[c]) for c in load_model("pendulum").classifier.neutral} == {GREY.lower()}
+    own = [found.colours[c] for c in found.drawn if found.colours[c] != GREY]
+    assert len(set(own)) == len(own)
+    assert not motions_of(make_cube().assign_attrs(model="duffing")).told

@@ -1,0 +1,98 @@
+"""Figures of Lyapunov exponents: units at a fixed frequency, many cells, scales fair to both signs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pipeline.plots import Frame, plot_convergence, plot_lyapunov, plot_lyapunov_map
+from pipeline.plots.convergence import MOST_LINES
+from pipeline.plots.exponent_map import _scale
+
+FREQUENCY = 0.25
+
+
+def make_cube(n_cells=3, dims=(), sizes=(), exponents=(0.3, -0.4)):
+    """Exponents of cells at a fixed frequency, a scalar coordinate as in cubes that sweep none."""
+    shape = (*sizes, n_cells)
+    names = (*dims, "initial_condition")
+    blocks = np.zeros((*shape, 8, 2)) + np.array(exponents)
+    blocks += 0.02 * np.random.default_rng(0).standard_normal(blocks.shape)
+    return xr.Dataset(
+        {
+            "section": ((*names, "period_index", "state"), np.zeros((*shape, 2, 2))),
+            "status": (names, np.full(shape, 2, np.int8)),
+            "orbit_period": (names, np.zeros(shape, np.int16)),
+            "lyapunov": ((*names, "exponent"), blocks.mean(-2)),
+            "lyapunov_stderr": ((*names, "exponent"), np.full((*shape, 2), 0.01)),
+            "lyapunov_blocks": ((*names, "block", "exponent"), blocks),
+            "lyapunov_flag": (names, np.ones(shape, np.int8)),
+            "divergence": (names, np.full(shape, -0.1)),
+        },
+        coords={
+            "state": ["x", "v"], "exponent": [1, 2], "frequency": ((), FREQUENCY, {"units": "Hz"}),
+            **{d: (d, np.arange(n, dtype=float), {"units": "1"}) for d, n in zip(dims, sizes, strict=True)},
+        },
+        attrs={"model": "duffing", "parameters": "", "lyapunov_n_periods": 64},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("per", ["s", "period"])
+def test_plot_convergence__per_period_at_one_fixed_frequency(per):
+    ds = make_cube()
+    figure = plot_convergence(ds, per=per)
+    factor = 1.0 if per == "s" else 1.0 / FREQUENCY
+    np.testing.assert_allclose(figure.data["exponent_value"], ds["lyapunov"][:, 0] * factor)
+    assert figure.axes[0].get_title(loc="left") == "$f$ = 0.25\N{NO-BREAK SPACE}Hz"
+
+
+def test_plot_convergence__many_cells_are_bands():
+    many = plot_convergence(make_cube(10_000))
+    few = plot_convergence(make_cube(MOST_LINES))
+    assert len(few.axes[0].get_lines()) > MOST_LINES
+    assert len(many.axes[0].get_lines()) < 5
+    bands = [c for c in many.axes[0].collections if str(c.get_gid()).startswith("quantiles:running")]
+    assert len(bands) == 2
+    running = many.data["running"].values
+    outer, inner = (c.get_paths()[0].vertices for c in bands)
+    assert outer[:, 1].min() == pytest.approx(np.quantile(running, 0.05, axis=0).min())
+    assert inner[:, 1].max() == pytest.approx(np.quantile(running, 0.75, axis=0).max())
+    median = next(line for line in many.axes[0].get_lines() if line.get_gid() == "running:chaotic")
+    np.testing.assert_allclose(median.get_ydata(), np.median(running, axis=0))
+    # every stored exponent still has its point
+    assert (
+        sum(len(line.get_xdata()) for line in many.axes[2].get_lines() if len(line.get_xdata()) > 2) == 10_000
+    )
+
+
+def test_plot_lyapunov_map__says_that_it_shows_the_maximum_over_cells():
+    ds = make_cube(3, ("F", "delta"), (4, 3))
+    ds["lyapunov"][1, 1] = [[-0.2, -0.4], [0.5, -0.4], [0.1, -0.4]]
+    figure = plot_lyapunov_map(ds)
+    bar = figure.axes[1]
+    assert "maximum over the cells" in bar.get_ylabel()
+    assert float(figure.data["exponent_value"].sel(F=1.0, delta=1.0)) == 0.5
+    (mesh,) = [c for c in figure.axes[0].collections if c.get_gid() == "map"]
+    assert mesh.norm.vmin == -mesh.norm.vmax
+    assert figure.axes[0].get_title(loc="left").startswith("$f$ = 0.25")
+
+
+def test_scale__same_depth_on_both_sides_of_zero():
+    norm, extend = _scale(np.array([[-0.1, 0.2, 0.3, np.nan]]))
+    assert (norm.vmin, norm.vmax, extend) == (-0.3, 0.3, "neither")
+    # one cell far out does not pale all others, and the bar says so
+    grid = np.concatenate([np.linspace(-0.3, 0.3, 200), [-40.0]])
+    norm, extend = _scale(grid)
+    assert norm.vmax < 0.4
+    assert norm.vmin == -norm.vmax
+    assert extend == "both"
+
+
+def test_plot_lyapunov__over_a_parameter_at_a_fixed_frequency():
+    ds = make_cube(3, ("F",), (6,))
+    figure = plot_lyapunov(ds, per="period", spectrum=True, frame=Frame(85.0, ylim=(-2.0, 2.0)))
+    np.testing.assert_allclose(figure.data["exponent_value"], ds["lyapunov"] / FREQUENCY)
+    assert figure.axes[1].get_ylim() == (-2.0, 2.0)
+    assert figure.axes[0].get_ylabel() == "$x$ [m]"
+    assert "x_diagram" in figure.data

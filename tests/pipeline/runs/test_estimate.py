@@ -1,0 +1,112 @@
+"""What a dry run says of the time, and what it measures for it."""
+
+from __future__ import annotations
+
+import time
+import tomllib
+
+import numpy as np
+import pytest
+
+from pipeline.compute.task import compute, warm_up
+from pipeline.layout.cells import CellMap
+from pipeline.layout.plan import make_plan
+from pipeline.runs.estimate import _points, _sample, estimate, mean_with_tail
+from pipeline.runs.preview import describe_plan
+from pipeline.spec.parsing import parse_spec
+
+CLOSING = """
+kind = "sweep"
+[axes]
+frequency_hz = { start = 2.0, stop = 3.0, num = 5 }
+[initial_conditions]
+kind = "random"
+n = 64
+psi1_deg = [-40, 40]
+psi2_deg = [-40, 40]
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 400
+n_keep = 16
+stop_when_closed = true
+closure_tolerance = 1e-2
+"""
+
+
+def read(text):
+    spec = parse_spec(tomllib.loads(text))
+    return spec, make_plan(spec)
+
+
+def test_mean_with_tail__all_ended():
+    assert mean_with_tail(np.array([3.0, 5.0]), 10, 1000) == 4.0
+    assert mean_with_tail(np.array([10.0, 10.0]), 10, 10) == 10.0
+
+
+@pytest.mark.parametrize("most", [2_000, 100_000])
+def test_mean_with_tail__exponential(most):
+    periods = np.random.default_rng(0).exponential(800, 20_000)
+    seen = mean_with_tail(np.minimum(periods, 1000), 1000, most)
+    assert seen == pytest.approx(np.minimum(periods, most).mean(), rel=0.03)
+
+
+def test_mean_with_tail__nothing_ends():
+    assert mean_with_tail(np.full(8, 100.0), 100, 5000) == 5000
+
+
+def test_points__pairs_are_neighbours():
+    for n_points in (1, 2, 3, 9, 200):
+        for seed in range(20):
+            single = _points(n_points, np.random.default_rng(seed), pairs=False)
+            assert (np.diff(single) > 0).all()
+            assert 0 <= single[0] <= single[-1] < n_points
+            pairs = _points(n_points, np.random.default_rng(seed), pairs=True)
+            assert pairs.max() < n_points
+            if n_points > 1:
+                assert (pairs[1::2] - pairs[::2] == 1).all()
+
+
+def test_sample__cells_of_the_run(walk_text, sweep_text):
+    spec, plan = read(walk_text)
+    inputs = _sample(spec, plan, np.random.default_rng(0), 32, pairs=False)
+    assert inputs.initial_states.shape == (2, 4)  # what a task has
+    assert set(inputs.frequency_hz.ravel()) <= set(spec.axes["frequency_hz"].array())
+    spec, plan = read(sweep_text)
+    inputs = _sample(spec, plan, np.random.default_rng(0), 32, pairs=True)
+    assert inputs.frequency_hz.shape == (24, 1)
+    assert len(np.unique(inputs.frequency_hz)) == 5
+
+
+def test_estimate__within_a_factor_of_what_it_takes():
+    """Loosely: the machine may be busy. What was measured on a quiet one is within a fifth or so."""
+    spec, plan = read(CLOSING)
+    warm_up(spec)
+    cells = CellMap(spec)
+    for block in plan.tasks():
+        compute(spec, cells, block)
+    started = time.process_time()
+    for block in plan.tasks():
+        compute(spec, cells, block)
+    true = time.process_time() - started
+    found = estimate(spec, plan)
+    assert true / 3 < found.core_seconds < 3 * true
+    assert "until it has closed" in found.how
+    assert plan.core_seconds > found.core_seconds
+
+
+def test_describe_plan__says_what_the_time_rests_on(write_spec, sweep_text, tmp_path):
+    lines = describe_plan(write_spec(sweep_text), tmp_path / "run")
+    first = next(lines)
+    assert first == "small sweep"
+    assert "measured: 24 of its cells" in list(lines)[-1]
+    assert not (tmp_path / "run").exists()
+
+
+def test_describe_plan__complete_run_takes_nothing(write_spec, sweep_text, tmp_path):
+    from pipeline.runs.run import run
+
+    run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=lambda line: None)
+    assert list(describe_plan(tmp_path / "spec.toml", tmp_path / "run"))[-1] == (
+        "time: nothing is left to compute"
+    )
