@@ -83,12 +83,10 @@ def _attractor(one: xr.Dataset) -> Row:
     if "mirror_partner" in one:
         row["mirror_partner"] = int(one["mirror_partner"])
         row["mirror_distance"] = float(one["mirror_distance"])
+    row["n_cells"] = int(one["n_cells"])
     if "match_basis" in one:
         row["match_basis"] = words_of(one["match_basis"])[int(one["match_basis"])]
-    basis = (
-        {"match_basis": words_of(one["match_basis"])[int(one["match_basis"])]} if "match_basis" in one else {}
-    )
-    return row | {"n_cells": int(one["n_cells"])} | basis
+    return row
 
 
 def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
@@ -137,7 +135,8 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dic
     if "side" in rows[0]:
         words["side"] = distinct(r["side"] for r in rows)
     words |= {**ranges(ds, rows, dims), "cells": str(sum(r["n_cells"] for r in rows))}
-    words["id rests on"] = _evidence([r["match_basis"] for r in rows if "match_basis" in r])
+    if "match_basis" in rows[0]:
+        words["id rests on"] = _evidence([r["match_basis"] for r in rows])
     if "fraction" in rows[0]:
         words["max share"] = largest_share(ds, rows, dims)
     if "mirror_partner" in rows[0]:
