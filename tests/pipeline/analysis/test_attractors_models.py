@@ -7,7 +7,8 @@ import pytest
 import xarray as xr
 
 from magpend_core import load_model, sections
-from pipeline.analysis.attractors.attractors import identify, lifetimes, match
+from pipeline.analysis.attractors.attractors import identify, match
+from pipeline.analysis.attractors.lifetimes import lifetimes
 from pipeline.analysis.attractors.portraits import portraits
 from pipeline.analysis.attractors.settling_table import settling_table
 from pipeline.analysis.attractors.table import attractors_table

@@ -7,8 +7,9 @@ import pytest
 import xarray as xr
 
 from magpend_core import load_preset, sections
-from pipeline.analysis.attractors.attractors import identify, lifetimes
+from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.attractors.following import LEG, leap
+from pipeline.analysis.attractors.lifetimes import lifetimes
 from pipeline.analysis.attractors.orbits import Orbit
 from pipeline.analysis.attractors.spirals import Recurrence, near_closed
 from pipeline.analysis.sets import Geometry
