@@ -78,6 +78,16 @@ def test_docs__commands_and_options_exist(page, words):
             assert takes_names or word.partition("=")[0] in flags, (page, word)
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_docs__names_in_python_exist(page):
+    import magpend
+
+    for block in blocks("python", PAGES[page]):
+        compile(block, page, "exec")
+        for name in re.findall(r"\bmagpend\.(\w+)", block):
+            assert hasattr(magpend, name), (page, name)
+
+
 def test_reference__names_everything():
     """Commands, workflows and variables are listed with their names."""
     listed = PAGES["docs/reference/commands.md"]
