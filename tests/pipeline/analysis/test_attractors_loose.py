@@ -90,7 +90,7 @@ def test_identify__tolerance_follows_the_run():
     tight = ds.assign_attrs(closure_tolerance=1e-7)
     assert identify(tight, polish=False).attrs["identify_tolerance"] == pytest.approx(1e-4)
     with pytest.raises(ValueError, match="tolerance"):
-        identify(ds, polish=False, tolerance=0.0)
+        identify(ds, polish=False, tolerance=-1e-3)
 
 
 # ---- by hand ------------------------------------------------------------------------------------

@@ -67,12 +67,16 @@ def test_summarise__running_means_end_at_the_mean(cube):
 def test_summarise__motion(cube):
     cube["status"][2, 1] = Status.PERIODIC
     cube["lyapunov_flag"][0, 1] = 4
-    found = summarise(cube).motion.values
-    # 1.0 and 0.6 are both positive, 0.01 is within three errors, and a closed orbit is regular
+    cube["status"][1, 0] = Status.PERIODIC
+    summary = summarise(cube)
+    found = summary.motion.values
+    # 1.0 and 0.6 are both positive; 0.01 is within three errors, which is regular where the orbit closed; a
+    # cell that closed with a positive exponent is not
+    assert summary.contradicts.values.tolist() == [[0, 0], [0, 0], [0, 1]]
     assert found.tolist() == [
         [Motion.HYPERCHAOTIC, Motion.UNKNOWN],
-        [Motion.UNDECIDED, Motion.REGULAR],
-        [Motion.HYPERCHAOTIC, Motion.REGULAR],
+        [Motion.REGULAR, Motion.REGULAR],
+        [Motion.HYPERCHAOTIC, Motion.UNDECIDED],
     ]
     assert summarise(cube.isel(exponent=slice(1))).motion.values[0, 0] == Motion.CHAOTIC
     cube["lyapunov_flag"][0, 0] = 3  # only the first exponent is resolved
