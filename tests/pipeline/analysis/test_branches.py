@@ -534,8 +534,8 @@ def test_explore__right_family(right_family):
     _, orbits, branches = right_family
     single, double = branches
     abrupt, halving = only(single, "period_doubling")
-    assert orbits.values(abrupt.point.u)[0] == pytest.approx(2.3722244, abs=2e-7)
-    assert orbits.values(halving.point.u)[0] == pytest.approx(2.4986082, abs=2e-7)
+    assert orbits.values(abrupt.point.u)[0] == pytest.approx(2.372224517, abs=1.5e-8)
+    assert orbits.values(halving.point.u)[0] == pytest.approx(2.498608281, abs=1.5e-8)
     assert (abrupt.criticality, halving.criticality) == ("subcritical", "supercritical")
     assert abrupt.child is halving.child is double
     assert double.ends == ("start", "period_halving")
