@@ -40,9 +40,9 @@ def test_inputs__sweep_cell_by_cell(sweep_text):
 def test_inputs__branches_walk_up_and_down(walk_text):
     spec = parse_spec(tomllib.loads(walk_text.replace("[axes]", "[axes]\nq = { values = [1.5, 1.6] }")))
     cells = CellMap(spec)
-    assert cells.dims == ("frequency", "q", "branch")  # the frequency first, whatever the file's order
-    assert cells.shape == (6, 2, 10)
-    inputs = cells.inputs((slice(0, 6), slice(1, 2), slice(4, 7)))
+    assert cells.dims == ("q", "frequency", "branch")
+    assert cells.shape == (2, 6, 10)
+    inputs = cells.inputs((slice(1, 2), slice(0, 6), slice(4, 7)))
     path = spec.axes["frequency_hz"].array()
     assert (inputs.frequency_hz == [path, path[::-1], path[::-1]]).all()
     assert (inputs.parameters[..., NAMES.index("q")] == 1.6).all()

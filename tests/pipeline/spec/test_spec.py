@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import tomllib
 
@@ -198,20 +197,3 @@ def test_spec__degrees_convert_once():
     states = initial_states(parse_spec(tomllib.loads(text)).initial_conditions).at(np.arange(2))
     expected = [[math.pi / 2, -math.pi / 4, 0, 0], [math.pi, 0, 2 * math.pi, -math.pi]]
     assert np.allclose(states, expected, rtol=1e-15)
-
-
-def test_parse_spec__order_of_axes_is_not_that_of_the_file():
-    """What reads run.json, whose keys are sorted, sees the dims of what wrote it."""
-    from pipeline.layout.identity import canonical, digest_of, identity_of
-    from pipeline.layout.plan import make_plan
-
-    data = {
-        "kind": "sweep",
-        "axes": {name: {"values": [1.5, 1.6]} for name in ("q", "frequency_hz", "eps_drive")},
-        "initial_conditions": {"kind": "grid"},
-    }
-    one = parse_spec(data)
-    again = parse_spec(json.loads(canonical(one.as_dict())))
-    assert list(one.axes) == list(again.axes) == ["frequency_hz", "eps_drive", "q"]
-    first, second = (digest_of(identity_of(spec, make_plan(spec), "k")) for spec in (one, again))
-    assert first == second
