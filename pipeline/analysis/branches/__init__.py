@@ -50,7 +50,7 @@ The dataset
 Dims ``branch``, ``point`` (in the order along a branch), ``phase`` (section points of an orbit in the order
 of time), ``state``, ``multiplier`` (by falling modulus), ``bifurcation``, and the model's dim of angles.
 Beyond a branch's own points and phases values are NaN, counts -1. ``side`` is there if the model has words
-for motions; parameters in which the branches differ are variables of their own name. Attributes
+for motions; parameters with other values than the run's own are variables of their name. Attributes
 ``parameter``, ``parameter_units``, ``model``, and ``left_out``: a line for each attractor that was not
 followed.
 
