@@ -285,7 +285,8 @@ def test_attracting__all_periods_or_a_line_for_what_is_left_out():
         "attractor 2 at frequency 0.15 to 0.2 (2 points): its period is 7; take it with --period 7"
         in left_out
     )
-    assert any(line.startswith("attractor 0 at frequency 0.2: outside of frequency 0.1 to 0.17") for line in left_out)
+    outside = "attractor 0 at frequency 0.2: outside of frequency 0.1 to 0.17"
+    assert any(line.startswith(outside) for line in left_out)
 
 
 @pytest.fixture(scope="module")
