@@ -28,7 +28,7 @@ points = [[1.2, 0.0], [-1.2, 0.0]]
 rtol = 1e-9
 atol = 1e-9
 n_transient = 300
-n_keep = 40
+n_keep = 200
 """
 
 
@@ -124,3 +124,12 @@ def test_curves__in_the_plane_of_amplitude_and_damping(directory):
         derive(directory, "curves", {**plane, "second": "dampin"})
     with pytest.raises(SpecError, match="own parameter"):
         derive(directory, "curves", {**plane, "second": "amplitude"})
+
+
+def test_branches__from_recurrences_in_chaos(directory):
+    """Unstable orbits inside of the chaos, where no closed orbit attracts."""
+    options = {"parameter": "amplitude", "low": 0.45, "high": 0.55, "recurrences": 2, "generations": 0}
+    ds = derive(directory, "branches", options)
+    assert ds.sizes["branch"] >= 2
+    assert (ds["n_unstable"].values[:, 0] > 0).any()
+    assert float(ds["residual"].max()) < 1e-9
