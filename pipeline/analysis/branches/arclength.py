@@ -1,7 +1,7 @@
 """Pseudo-arclength continuation of the solutions of a problem (Keller 1977).
 
-The predictor is a step along the tangent, bent as the curve was between the last two points; the corrector is
-Newton's method in the plane normal to the tangent, so that folds in the parameter are nothing special.
+The predictor is the cubic through the last two points, a step along the tangent; the corrector is Newton's
+method in the plane normal to the tangent, so that folds in the parameter are nothing special.
 Unknowns are scaled; lengths are Euclidean in them.
 """
 
@@ -137,7 +137,7 @@ def walk(problem: Problem, start: Point, settings: Settings, stop: Stop, between
     step = settings.first_step
     while len(found.points) < settings.max_points:
         here = found.points[-1]
-        guess = here.u + step * here.tangent + _bend(found.points, step)
+        guess = _ahead(found.points, step)
         there = yield from correct(problem, guess, here.tangent, settings)
         if (
             there is None
@@ -161,16 +161,25 @@ def walk(problem: Problem, start: Point, settings: Settings, stop: Stop, between
     return found
 
 
-def _bend(points: list[Point], step: float) -> np.ndarray:
-    """Second order of the predictor, from the last change of the tangent."""
+def cubic(a: Point, b: Point, share: float) -> np.ndarray:
+    """The cubic through two points with their tangents, at a share of the chord; beyond 1 it goes on."""
+    length = float(np.linalg.norm(b.u - a.u))
+    s, rest = share, 1.0 - share
+    middle = rest**2 * (1.0 + 2.0 * s) * a.u + s**2 * (3.0 - 2.0 * s) * b.u
+    return np.asarray(middle + length * s * rest * (rest * a.tangent - s * b.tangent))
+
+
+def _ahead(points: list[Point], step: float) -> np.ndarray:
+    """Predict the point a step ahead, in the plane normal to the tangent there."""
     here = points[-1]
+    straight = here.u + step * here.tangent
     if len(points) < 2:
-        return np.zeros_like(here.u)
-    before = points[-2]
-    length = float(np.linalg.norm(here.u - before.u))
+        return straight
+    length = float(np.linalg.norm(here.u - points[-2].u))
     if step > 2.0 * length:
-        return np.zeros_like(here.u)
-    return np.asarray(0.5 * step**2 / length * (here.tangent - before.tangent))
+        return straight
+    bent = cubic(points[-2], here, 1.0 + step / length)
+    return np.asarray(bent - (here.tangent @ (bent - straight)) * here.tangent)
 
 
 def _is_near(here: Point, there: Point, step: float, settings: Settings) -> bool:

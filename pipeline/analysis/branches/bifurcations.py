@@ -1,4 +1,4 @@
-"""Bifurcations on a branch of orbits: noticed by test functions, located by regula falsi with bisection."""
+"""Bifurcations on a branch of orbits: noticed by test functions, located by inverse interpolation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.analysis.branches.arclength import Point, Settings, correct
+from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic
 from pipeline.analysis.branches.lockstep import Steps
 from pipeline.analysis.branches.problems import OrbitProblem, doubling_test, torus_test
 
@@ -148,28 +148,50 @@ def locate(
     chord = b.u - a.u
     length = float(np.linalg.norm(chord))
     low, high = (0.0, a, test(a)), (1.0, b, test(b))
-    weights = [low[2], high[2]]  # Illinois: the value of an end that stays twice is halved
-    least = WIDTH / length
+    known = [low[::2], high[::2]]
+    least, last = WIDTH / length, np.inf
     for trial in range(60):
         if high[0] - low[0] <= least:
             break
-        share = weights[0] / (weights[0] - weights[1]) if trial % 3 < 2 else 0.5
-        at = low[0] + share * (high[0] - low[0])
-        # a guess very near an end would leave the bracket wide: step over the root
+        root = _root(known[-3:]) if trial % 6 < 5 else 0.5 * (low[0] + high[0])
+        if not low[0] < root < high[0]:
+            root = 0.5 * (low[0] + high[0])
+        # once it stands still, an end of the bracket is put on each side of it
+        away = 0.4 * least if abs(root - last) < 0.3 * least else 0.0
+        last, at = root, root - away if root - low[0] > least else root + away
         at = min(max(at, low[0] + 0.4 * least), high[0] - 0.4 * least)
-        middle = yield from correct(problem, a.u + at * chord, chord / length, settings, along=a.tangent)
+        middle = yield from correct(problem, _between(a, b, at), chord / length, settings, along=a.tangent)
         if middle is None:
             return None
         value = test(middle)
+        known.append((at, value))
         if value * low[2] > 0.0:
-            low, weights = (at, middle, value), [value, 0.5 * weights[1]]
+            low = (at, middle, value)
         else:
-            high, weights = (at, middle, value), [0.5 * weights[0], value]
+            high = (at, middle, value)
     scale = problem.family.scales[0]
     bracket = abs(high[1].u[-1] - low[1].u[-1]) * scale
     nearest = low if abs(low[2]) <= abs(high[2]) else high
     rises = bool(low[1].tangent[-1] > 0.0)
     return Bifurcation(kind, nearest[1], float(bracket), n_unstable(low[1]), n_unstable(high[1]), rises)
+
+
+def _root(known: list[tuple[float, float]]) -> float:
+    """Where a function vanishes, by inverse interpolation of (argument, value); NaN for equal values."""
+    total = 0.0
+    for i, (at, value) in enumerate(known):
+        others = [v for j, (_, v) in enumerate(known) if j != i]
+        if value in others:
+            return float("nan")
+        total += at * float(np.prod([v / (v - value) for v in others]))
+    return total
+
+
+def _between(a: Point, b: Point, share: float) -> np.ndarray:
+    """Guess of the orbit at a share of the chord, in the plane normal to it."""
+    chord = b.u - a.u
+    bent = cubic(a, b, share)
+    return np.asarray(bent + (share - (bent - a.u) @ chord / (chord @ chord)) * chord)
 
 
 def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:

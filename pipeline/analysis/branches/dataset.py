@@ -72,11 +72,12 @@ def dataset_of(
 
 
 def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | None) -> dict[str, Any]:
-    """Parameters in which the branches differ, beside the one that is followed."""
+    """Parameters in which branches differ from the run's own values, beside the one that is followed."""
     if parameters is None or not branches:
         return {}
     values = np.array([b.family.parameters for b in branches])
-    chosen = [i for i, n in enumerate(parameters.names) if n != parameter and np.ptp(values[:, i]) > 0.0]
+    own = (values != parameters.pack()).any(axis=0)
+    chosen = [i for i, n in enumerate(parameters.names) if n != parameter and own[i]]
     names = [parameters.names[i] for i in chosen]
     units = [parameter_units(n, parameters.model) for n in names]
     return {

@@ -110,7 +110,8 @@ def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str
     if max_period and one.period > max_period:
         return f"its period is {one.period}; take it with --period {one.period}"
     if not interval[0] <= one.start.value <= interval[1]:
-        return f"outside of the interval {interval[0]:g} to {interval[1]:g}; widen it with --from and --to"
+        low, high = interval
+        return f"outside of {one.start.family.free[0]} {low:g} to {high:g}; widen it with --from and --to"
     return ""
 
 

@@ -39,7 +39,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
     """Located bifurcations by rising parameter value, one dict for each; see `branches_table`.
 
     The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``. Parameters
-    in which the branches differ follow, and ``side`` where the model has words for motions.
+    that have other values than the run's own follow, and ``side`` where the model has words for motions.
     """
     kinds, criticality = words(ds["kind"]), ["" if w == "unknown" else w for w in words(ds["criticality"])]
     sides = words(ds["bifurcation_side"]) if "bifurcation_side" in ds else None

@@ -1,0 +1,135 @@
+"""Branches and curves of a run: what is asked for, what is refused, what is left out, what is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.analysis.branches.table import branches_table, curves_table
+from pipeline.products.reporting import reporting
+from pipeline.runs.derive import derive
+from pipeline.runs.run import run
+from pipeline.spec.problems import SpecError
+
+SPEC = """
+kind = "sweep"
+model = "duffing"
+[parameters]
+preset = "twin-well"
+frequency_hz = 0.1909859317
+[parameters.overrides]
+damping = 0.3
+[axes]
+amplitude = { values = [0.25, 0.275, 0.289, 0.5] }
+[initial_conditions]
+kind = "list"
+points = [[1.2, 0.0], [-1.2, 0.0]]
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 300
+n_keep = 200
+"""
+
+
+ALONG = {"parameter": "amplitude", "low": 0.24, "high": 0.3}
+SHORT = {**ALONG, "max_period": 2}
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory):
+    """A run over the cascade of a twin-well oscillator: periods 1, 2, 4 and chaos."""
+    folder = tmp_path_factory.mktemp("branches")
+    (folder / "spec.toml").write_text(SPEC)
+    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
+    return folder / "run"
+
+
+def test_attractors__ids_through_the_cascade(directory):
+    """The orbits of each well have one id, from period 1 to 4; the chaos beyond has another one."""
+    ds = derive(directory, "attractors")
+    periods = ds["orbit_period"].values.T.tolist()
+    assert sorted(periods)[1:] == [[1, 2, 0, 0], [1, 2, 4, 0]]
+    basis = ds["match_basis"].values
+    words = ds["match_basis"].attrs["flag_meanings"].split()
+    assert {words[b] for b in basis[1:3, :2].ravel()} == {"doubling", "absent"}
+    assert ds["kind"].values[3].tolist() == [0, 0, 2]
+
+
+def test_branches__all_periods_or_a_line(directory):
+    heard = []
+    with reporting(lambda what, done, total, *_: heard.append((what, done, total))):
+        ds = derive(directory, "branches", ALONG)
+    assert sorted(set(ds["orbit_period"].values.tolist())) == [1, 2, 4]
+    assert any("following branches" in what and 0 < done <= total for what, done, total in heard)
+    lines = branches_table(ds).lines
+    assert any("bounded set" in line and "--recurrences" in line for line in lines)
+    short = derive(directory, "branches", SHORT)
+    left_out = [line for line in branches_table(short).lines if "take it with --period 4" in line]
+    assert len(left_out) == 1
+    assert "amplitude 0.289" in left_out[0]
+    # a stored result says it again
+    again = derive(directory, "branches", SHORT)
+    assert branches_table(again).lines == branches_table(short).lines
+
+
+def test_branches__none_to_begin_with(directory):
+    ds = derive(directory, "branches", {"parameter": "amplitude", "low": 0.4, "high": 0.6})
+    assert ds.sizes["branch"] == 0
+    lines = branches_table(ds).lines
+    assert lines[0].startswith("no branch")
+    assert any("outside of amplitude 0.4 to 0.6" in line for line in lines)
+
+
+def test_branches__along_the_frequency_by_either_name(directory):
+    """Of a run that does not sweep it."""
+    options = {"low": 0.18, "high": 0.2, "max_period": 1, "generations": 0}
+    one = derive(directory, "branches", {"parameter": "frequency", **options})
+    other = derive(directory, "branches", {"parameter": "frequency_hz", **options})
+    assert one.attrs["derived_key"] == other.attrs["derived_key"]
+    assert one.attrs["parameter"] == "frequency"
+    assert one.attrs["parameter_units"] == "Hz"
+    # the branches begin at other amplitudes, and say so
+    assert set(np.round(one["amplitude"].values, 3)) == {0.25}
+    for row in branches_table(one).rows:
+        assert [name for name in row if "frequency" in name] == ["frequency_hz"]
+        assert row["amplitude"] == 0.25
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"parameter": "amplitud"}, "did you mean amplitude"),
+        ({"parameter": "damping"}, "give the interval with --from and --to"),
+        ({"parameter": "amplitude", "low": 0.3, "high": 0.2}, "must be less than --to"),
+        ({"parameter": "frequency", "low": -1.0, "high": 1.0}, "greater than 0"),
+        ({"max_period": -1}, "max_period"),
+    ],
+)
+def test_branches__refusals(directory, options, message):
+    with pytest.raises(SpecError, match=message):
+        derive(directory, "branches", options)
+
+
+def test_curves__in_the_plane_of_amplitude_and_damping(directory):
+    """Both wells' first doublings: two curves over each other, by the mirror symmetry."""
+    plane = {"second": "damping", "second_low": 0.25, "second_high": 0.4, "max_period": 1, **ALONG}
+    ds = derive(directory, "curves", plane)
+    rows = curves_table(ds).rows
+    assert {(row["type"], row["period"]) for row in rows} == {("period_doubling", 1)}
+    assert len(rows) == 2
+    assert rows[0]["damping_max"] == pytest.approx(rows[1]["damping_max"], rel=0.05)
+    assert ds["second"].attrs["units"] == "1/s"
+    with pytest.raises(SpecError, match="did you mean damping"):
+        derive(directory, "curves", {**plane, "second": "dampin"})
+    with pytest.raises(SpecError, match="own parameter"):
+        derive(directory, "curves", {**plane, "second": "amplitude"})
+
+
+def test_branches__from_recurrences_in_chaos(directory):
+    """Unstable orbits inside of the chaos, where no closed orbit attracts."""
+    options = {"parameter": "amplitude", "low": 0.45, "high": 0.55, "recurrences": 2, "generations": 0}
+    ds = derive(directory, "branches", options)
+    assert ds.sizes["branch"] >= 2
+    assert (ds["n_unstable"].values[:, 0] > 0).any()
+    assert float(ds["residual"].max()) < 1e-9
