@@ -6,7 +6,7 @@
 
 An orbit of period p is a fixed point of the p-fold stroboscopic map; its branch is followed by
 pseudo-arclength continuation, whether it is stable or not. `problems` has the equations, `lockstep`
-evaluates many of them in one call of the engine, `arclength` walks, `bifurcations` notices and locates,
+evaluates many of them in one call of the engine, `arclength` traces, `bifurcations` notices and locates,
 `following` makes one branch, `exploring` all that hang together, `curves` continues located points in two
 parameters. `connecting` says which orbits found along an axis lie on one branch. Any
 `magpend_core.engine.system.System` will do; names, units and the class of a motion are the model's.

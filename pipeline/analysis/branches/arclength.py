@@ -18,14 +18,14 @@ from pipeline.analysis.branches.problems import Problem, Value
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """How to walk.
+    """How to trace.
 
     Attributes
     ----------
     first_step, longest_step, shortest_step : float
-        Arclengths; below the shortest a walk ends.
+        Arclengths; below the shortest a trace ends.
     max_points : int
-        Points of one walk.
+        Points of one trace.
     tolerance : float
         Largest scaled residual of a point.
     max_iterations : int
@@ -59,7 +59,7 @@ class Point:
 
 
 @dataclass(eq=False)
-class Walk:
+class Trace:
     """Points in their order, and why there are no more."""
 
     points: list[Point] = field(default_factory=list)
@@ -124,16 +124,16 @@ Between = Callable[[Point, Point], "Steps[bool]"]
 """What is done between two neighbouring points; False asks for a shorter step."""
 
 Stop = Callable[[list[Point]], str]
-"""Looks at the points so far; a word ends the walk."""
+"""Looks at the points so far; a word ends the trace."""
 
 
-def walk(problem: Problem, start: Point, settings: Settings, stop: Stop, between: Between) -> Steps[Walk]:
+def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, between: Between) -> Steps[Trace]:
     """Follow the solutions from a point along its tangent.
 
     `between` may refuse a step, which is then tried with half the length; `stop` is asked after every
     point. The start is the first of the points.
     """
-    found = Walk([start])
+    found = Trace([start])
     step = settings.first_step
     while len(found.points) < settings.max_points:
         here = found.points[-1]

@@ -100,7 +100,7 @@ _CHANGES = {FOLD: 1, DOUBLING: 1, TORUS: 2, BRANCHING: 1}
 
 @dataclass(eq=False)
 class Watch:
-    """Looks for bifurcations between neighbouring points of a walk and keeps those that it locates."""
+    """Looks for bifurcations between neighbouring points of a trace and keeps those that it locates."""
 
     problem: OrbitProblem
     settings: Settings

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.analysis.branches.arclength import Point, Settings, correct, walk
+from pipeline.analysis.branches.arclength import Point, Settings, correct, trace
 from pipeline.analysis.branches.following import first_point, half_orbit, has_halved, opposite
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import Family, OrbitProblem
@@ -111,7 +111,7 @@ def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> l
     lines
         Orbits along one parameter each, all others fixed; numbers are unique within a line.
     settings
-        How to walk; arclengths are in units of the families' scales.
+        How to trace; arclengths are in units of the families' scales.
 
     Returns
     -------
@@ -122,7 +122,7 @@ def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> l
     points = run_together([_tangent(one, settings) for one in everyone])
     known = iter(points)
     result: list[Links] = []
-    walks: list[tuple[Links, Found, int, Steps[tuple[str, Link | None]]]] = []
+    traces: list[tuple[Links, Found, int, Steps[tuple[str, Link | None]]]] = []
     for line in lines:
         start = {one.number: next(known) for one in line}
         found = _neighbours([one for one in line if start[one.number] is not None], start)
@@ -132,9 +132,9 @@ def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> l
             for way in (1, -1):
                 targets = [] if point is None else _targets(one, line, way, found)
                 if point is not None and targets:
-                    walks.append((found, one, way, _follow(one, point, targets, way, settings)))
-    answers = run_together([steps for *_, steps in walks], "connecting orbits")
-    for (found, one, way, _), (outcome, link) in zip(walks, answers, strict=True):
+                    traces.append((found, one, way, _follow(one, point, targets, way, settings)))
+    answers = run_together([steps for *_, steps in traces], "connecting orbits")
+    for (found, one, way, _), (outcome, link) in zip(traces, answers, strict=True):
         (found.up if way > 0 else found.down)[one.number] = outcome
         if link is not None:
             found.links.append(link)
@@ -201,7 +201,7 @@ def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[
 
 @dataclass(eq=False)
 class _Meeting:
-    """Looks along a walk for the orbits that it can meet."""
+    """Looks along a trace for the orbits that it can meet."""
 
     family: Family
     targets: Sequence[Found]
@@ -229,7 +229,7 @@ class _Meeting:
         return True
 
     def stop(self, points: list[Point]) -> str:
-        """Say why the walk is over, if it is."""
+        """Say why the trace is over, if it is."""
         here = points[-1]
         if self.met is not None:
             return LINKED
@@ -250,7 +250,7 @@ def _follow(
         meeting = _Meeting(family, targets, way, settings)
         if here.tangent[-1] * way < 0.0:
             here = opposite(here)
-        found = yield from walk(OrbitProblem(family), here, settings, meeting.stop, meeting.between)
+        found = yield from trace(OrbitProblem(family), here, settings, meeting.stop, meeting.between)
         if meeting.met is not None:
             return LINKED, Link(one.number, meeting.met.number, n_doublings)
         if found.end != "period_halving":

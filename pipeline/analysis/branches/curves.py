@@ -11,7 +11,7 @@ import xarray as xr
 
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
-from pipeline.analysis.branches.arclength import Point, Settings, Walk, correct, kernel_of, walk
+from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import KINDS, TORUS, multipliers_of
 from pipeline.analysis.branches.following import opposite
 from pipeline.analysis.branches.lockstep import Steps, run_together
@@ -64,7 +64,7 @@ def curves_from(
     max_period
         Longest period of the orbits taken.
     settings
-        How to walk; arclengths are in units of the intervals.
+        How to trace; arclengths are in units of the intervals.
 
     Returns
     -------
@@ -89,13 +89,13 @@ def continue_curves(
         [_first(problem, u, settings) for problem, (_, _, _, u) in zip(problems, starts, strict=True)]
     )
     found = [(s, p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
-    walks = run_together(
+    traces = run_together(
         [_follow(p, way, bounds, settings) for _, p, f in found for way in (opposite(f), f)],
         "following curves",
     )
     curves: list[Curve] = []
     for i, ((number, family, kind, _), _, first) in enumerate(found):
-        back, ahead = walks[2 * i : 2 * i + 2]
+        back, ahead = traces[2 * i : 2 * i + 2]
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
         if not any(_passes(curve, kind, family, first) for curve in curves):
             curves.append(Curve(family, kind, points, (back.end, ahead.end), number))
@@ -149,7 +149,7 @@ def _follow(
     start: Point,
     bounds: tuple[tuple[float, float], tuple[float, float]],
     settings: Settings,
-) -> Steps[Walk]:
+) -> Steps[Trace]:
     """One way along a curve; the point beyond a bound is dropped."""
 
     def stop(points: list[Point]) -> str:
@@ -164,7 +164,7 @@ def _follow(
             return "closed"
         return ""
 
-    found = yield from walk(problem, start, settings, stop, _anything)
+    found = yield from trace(problem, start, settings, stop, _anything)
     if found.end in ("bound", "resonance"):
         found.points.pop()
     return found

@@ -261,10 +261,10 @@ def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
         what,
     )
     for (parent, one, _), half in zip(ready, halves, strict=True):
-        if len(half.walk.points) < 5 or one.child is not None:
+        if len(half.trace.points) < 5 or one.child is not None:
             continue
         family = replace(parent.family, period=2 * parent.family.period)
-        child = Branch(family, half.walk.points, half.bifurcations, ("start", half.walk.end), one)
+        child = Branch(family, half.trace.points, half.bifurcations, ("start", half.trace.end), one)
         one.child, one.criticality = child, _criticality(one, child, 0)
         branches.append(child)
         if child.ends[1] == "period_halving":

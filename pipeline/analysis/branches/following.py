@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from pipeline.analysis.branches.arclength import Point, Settings, Walk, correct, kernel_of, walk
+from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import FOLD, Bifurcation, Watch
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import Family, OrbitProblem
@@ -47,13 +47,13 @@ class Branch:
 class Half:
     """One way from a start."""
 
-    walk: Walk
+    trace: Trace
     bifurcations: list[Bifurcation] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
 class _Stop:
-    """Says when a walk is over."""
+    """Says when a trace is over."""
 
     family: Family
     low: float
@@ -124,7 +124,7 @@ def half_branch(
     """Follow orbits from a point along its tangent; the last point lies on the bound that was passed."""
     problem = OrbitProblem(family)
     watch = Watch(problem, settings, skip_first=from_bifurcation)
-    found = yield from walk(problem, start, settings, _Stop(family, low, high), watch.between)
+    found = yield from trace(problem, start, settings, _Stop(family, low, high), watch.between)
     n_last = len(found.points) - 2
     if found.end == "bound":
         yield from _cut(problem, found, low, high, settings)
@@ -148,7 +148,7 @@ def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
     )
 
 
-def _cut(problem: OrbitProblem, found: Walk, low: float, high: float, settings: Settings) -> Steps[None]:
+def _cut(problem: OrbitProblem, found: Trace, low: float, high: float, settings: Settings) -> Steps[None]:
     """Replace the point beyond the bound by one on it."""
     family = problem.family
     before, beyond = found.points[-2:]
@@ -167,9 +167,9 @@ def _cut(problem: OrbitProblem, found: Walk, low: float, high: float, settings: 
 
 def joined(family: Family, backward: Half, forward: Half) -> Branch:
     """One branch of two halves from the same start: first the backward one, reversed."""
-    if forward.walk.end == "closed":
-        return Branch(family, forward.walk.points, forward.bifurcations, ("closed", "closed"))
-    back = [Point(p.u, -p.tangent, p.value, p.n_iterations) for p in reversed(backward.walk.points)]
+    if forward.trace.end == "closed":
+        return Branch(family, forward.trace.points, forward.bifurcations, ("closed", "closed"))
+    back = [Point(p.u, -p.tangent, p.value, p.n_iterations) for p in reversed(backward.trace.points)]
     n = len(back) - 1
     turned = [
         Bifurcation(
@@ -182,9 +182,9 @@ def joined(family: Family, backward: Half, forward: Half) -> Branch:
         one.after += n
     return Branch(
         family,
-        back + forward.walk.points[1:],
+        back + forward.trace.points[1:],
         turned + forward.bifurcations,
-        (backward.walk.end, forward.walk.end),
+        (backward.trace.end, forward.trace.end),
     )
 
 
@@ -230,8 +230,8 @@ def crossing_half(
         first = yield from correct(problem, at.point.u + step * direction, normal, settings)
         if first is not None:
             found = yield from half_branch(family, first, low, high, settings)
-            found.walk.points.insert(0, start)
+            found.trace.points.insert(0, start)
             for one in found.bifurcations:
                 one.after += 1
             return found
-    return Half(Walk([start], "stuck"))
+    return Half(Trace([start], "stuck"))

@@ -39,7 +39,7 @@ Steps = Generator[Query, Value, T]
 def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
     """Run computations to their ends and return their results, in their order.
 
-    With a name for the work it is reported how far it is. A walk's length is not known before its end: it
+    With a name for the work it is reported how far it is. A trace's length is not known before its end: it
     counts by the part of the parameter's interval that it has seen, up to nine tenths.
     """
     results: list[T | None] = [None] * len(computations)

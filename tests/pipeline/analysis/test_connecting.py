@@ -112,7 +112,7 @@ def test_connect__beyond_a_fold_is_another_branch():
     (found,) = connect([orbits])
     assert not found.links
     assert found.up == {0: "apart"}
-    # cut short, the walk says nothing
+    # cut short, the trace says nothing
     (found,) = connect([orbits], Settings(max_points=3))
     assert found.up == {0: "open"}
 
