@@ -71,8 +71,7 @@ def run(
     if plot:
         _diagram(state.directory)
     else:
-        figure = preview.first_figure(state.plan)
-        console.result(f"plot it with: magpend plot {figure} {state.directory}")
+        console.result(f"plot it with: {preview.figure_command(state.plan, state.directory)}")
 
 
 def _diagram(directory: Path) -> None:
@@ -96,10 +95,14 @@ def verify(
     directory: Directory,
     repair: Annotated[
         bool,
-        typer.Option("--repair", help="Withdraw damaged tasks, so that the next run computes them again."),
+        typer.Option(
+            "--repair",
+            help="Rebuild damaged metadata and coordinates; withdraw damaged tasks, which the next run "
+            "computes again.",
+        ),
     ] = False,
 ) -> None:
-    """Check every committed byte against the commit records."""
+    """Check every committed byte against the commit records, and the set-up's against run.json."""
     from pipeline.cli import console
     from pipeline.runs import verify as verification
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +12,9 @@ from pipeline.cli.common import read_pairs
 from pipeline.cli.models import DEFAULT, names
 from pipeline.cli.options import completing
 from pipeline.cli.plot import check_figure_path
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
 """States are options by their own names, which the model decides."""
@@ -48,6 +52,7 @@ def simulate(
     """
     from pipeline.cli import console
     from pipeline.compute import simulate as simulation
+    from pipeline.store.provenance import provenance, versions
 
     simulation.check_output(out)
     target = figure or out.with_suffix(".png")
@@ -60,11 +65,21 @@ def simulate(
         overrides=overrides, n_transient=transient, n_periods=periods, samples_per_period=samples,
         rtol=rtol, atol=atol,
     )  # fmt: skip
+    ds = ds.assign_attrs(versions=json.dumps(versions()), **provenance())
     console.result(f"series: {simulation.write_series(ds, out)}")
     if not no_figure:
-        from pipeline.plots import plot_trajectory, save_figure
+        _draw(ds, target, out)
 
-        console.result(f"figure: {save_figure(plot_trajectory(ds), target)}")
+
+def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
+    """Write the figure of a series and, unless the series is that already, the data beside it."""
+    from pipeline.cli import console
+    from pipeline.plots import plot_trajectory, save_data, save_figure
+
+    figure = plot_trajectory(ds)
+    console.result(f"figure: {save_figure(figure, target)}")
+    if target.with_suffix(".nc").resolve() != series.resolve():
+        console.result(f"data: {save_data(figure, target)}")
 
 
 def _states(words: list[str]) -> dict[str, float]:

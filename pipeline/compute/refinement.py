@@ -75,7 +75,9 @@ class Orbits:
             (cell, angle). Orbits are the same if their sections are the same cyclic sequence within the
             tolerance and their turns are equal.
         """
-        section, period, turns = cells["section"], cells["orbit_period"], cells["turns"]
+        section, period = cells["section"], cells["orbit_period"]
+        # a model without angles has no turns
+        turns = cells.get("turns", np.zeros((len(section), 0), np.int32))
         found = np.full(len(section), NO_ORBIT)
         closed = (cells["status"] == Status.PERIODIC) & (period > 0) & (period <= section.shape[1])
         rest = np.flatnonzero(closed)

@@ -75,7 +75,7 @@ class InitialStates:
 
 
 def parameter_axes(spec: Spec) -> tuple[ParameterAxis, ...]:
-    """Return the swept parameters in the order of the file."""
+    """Return the swept parameters in the order of the cube's dims."""
     return tuple(
         ParameterAxis(FREQUENCY_DIM if name == FREQUENCY else name, name, axis.array())
         for name, axis in spec.axes.items()

@@ -186,10 +186,9 @@ def _name(ax: Axes, names: list[_Name]) -> None:
     """
     figure = ax.figure
     points = 72.0 / figure.dpi
-    lines = [ax.transData.transform(np.asarray(line.get_xydata())) * points for line in ax.get_lines()]
-    ink = np.concatenate([_dense(line) for line in lines]) if lines else np.zeros((0, 2))
+    ink = np.concatenate([np.zeros((0, 2)), *(_ink(line, points) for line in ax.get_lines())])
     box = ax.get_window_extent()
-    bounds = np.array([[box.x0, box.y0], [box.x1, box.y1]]) * points
+    bounds = np.array([[box.x0, box.y0], [box.x1, box.y1]]) * points + [[2.0], [-2.0]]
     taken: list[np.ndarray] = []
     for name in names:
         width, height = 0.55 * _NAME_PT * len(name.text), 0.9 * _NAME_PT
@@ -207,10 +206,11 @@ def _name(ax: Axes, names: list[_Name]) -> None:
             break
 
 
-def _dense(line: np.ndarray) -> np.ndarray:
-    """Points of a polyline [pt], some 3 pt apart, so that none of its pieces is passed over."""
+def _ink(drawn: Line2D, points: float) -> np.ndarray:
+    """Where a line or its markers are [pt]; lines every 3 pt, so that none of their pieces is passed over."""
+    line = drawn.get_transform().transform(np.asarray(drawn.get_xydata(), dtype=np.float64)) * points
     line = line[np.isfinite(line).all(axis=1)]
-    if len(line) < 2:
+    if len(line) < 2 or drawn.get_linestyle() == "None":
         return line
     steps = np.hypot(*np.diff(line, axis=0).T)
     parts = np.minimum(np.ceil(steps / 3.0), 60).astype(int)

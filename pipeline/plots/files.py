@@ -69,9 +69,13 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
 
 
 def save_data(fig: DataFigure, path: str | Path) -> Path:
-    """Write the data of a figure as NetCDF beside it: the same path with the suffix ``.nc``."""
+    """Write the data of a figure as NetCDF beside it: the same path with the suffix ``.nc``.
+
+    What is empty is left out: a dim of length 0 is NetCDF's sign for one that may grow.
+    """
     target = Path(path).with_suffix(".nc")
-    fig.data.to_netcdf(target, engine="scipy", format="NETCDF3_64BIT")
+    empty = [name for name, variable in fig.data.variables.items() if variable.size == 0]
+    fig.data.drop_vars(empty).to_netcdf(target, engine="scipy", format="NETCDF3_64BIT")
     return target
 
 

@@ -95,7 +95,8 @@ class _Layout:
     @property
     def panel(self) -> tuple[float, float]:
         height = _PANEL_IN if self.each * self.beside > 2 else 1.35
-        return self.pitch - self.left - 0.08, height
+        # a lone panel is no wider than legible
+        return min(self.pitch - self.left - 0.08, 2.6 * height), height
 
     @property
     def row(self) -> float:

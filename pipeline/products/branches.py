@@ -10,7 +10,7 @@ _ROOM = "pipeline.analysis.branches.product"
 class BranchOptions(Options):
     """Which orbits are followed, and how far."""
 
-    parameter: str = option("frequency_hz", "What is varied: frequency, or a parameter's name.")
+    parameter: str = option("frequency_hz", "What is varied: the drive's frequency, or a parameter's name.")
     low: float | None = option(None, "Least value; by default what the run spans.", unit="SI", flag="--from")
     high: float | None = option(None, "Largest value; by default what the run spans.", unit="SI", flag="--to")
     max_period: int = option(
@@ -30,7 +30,7 @@ class BranchOptions(Options):
 class CurveOptions(BranchOptions):
     """Which bifurcations are continued, in which plane."""
 
-    second: str = option(..., "Second parameter's name, such as q, or frequency.")
+    second: str = option(..., "Second parameter: its name, such as q, or the drive's frequency_hz.")
     second_low: float = option(..., "Its least value.", unit="SI", flag="--second-from")
     second_high: float = option(..., "Its largest value.", unit="SI", flag="--second-to")
     curve_period: int = option(1, "Longest period of the orbits.", unit="drive periods", ge=1)

@@ -68,6 +68,10 @@ class LyapunovFigureOptions(StateOptions):
     as_map: bool = option(False, "A map over two parameters instead of a diagram over one.", flag="--map")
     per: Per = option("s", "Exponents per second or per drive period.")
 
+    def label(self) -> str:
+        """What the file's name says; no state on a map."""
+        return _without(self, "state") if self.as_map else super().label()
+
 
 class ConvergenceOptions(FigureOptions):
     """How exponents converge."""

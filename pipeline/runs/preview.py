@@ -17,17 +17,37 @@ from pipeline.store.commits import read_commits
 from pipeline.store.files import local_path
 from pipeline.store.setup import check
 
+MANY_SECTIONS = 500
+"""Kept sections from which the section of a single parameter point is worth a look."""
+
 
 def first_figure(plan: Plan) -> str:
-    """Name of the figure of ``magpend plot`` that shows a run as a whole."""
-    swept = [d for d in plan.dims if not is_start_dim(d)]
-    long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
-    n_swept, n_grid = sum(d in swept for d in long), sum(is_grid_dim(d) for d in long)
+    """Name of the figure of ``magpend plot`` that shows a run as a whole: exponents where it has them."""
+    n_swept, n_grid = _long(plan)
+    if any(v.name == "lyapunov" for v in plan.variables):
+        return "lyapunov" if n_swept else "convergence"
     if n_swept >= 2:
         return "regimes"
-    if n_swept == 0 and n_grid >= 2:
+    if n_swept == 1:
+        return "bifurcation"
+    if n_grid >= 2:
         return "basins"
-    return "bifurcation" if swept else "gallery"
+    if plan.sizes.get("period_index", 0) >= MANY_SECTIONS:
+        return "section"
+    return "bifurcation" if any(not is_start_dim(d) for d in plan.dims) else "gallery"
+
+
+def figure_command(plan: Plan, directory: Path) -> str:
+    """Return the command that draws `first_figure` of a run."""
+    name = first_figure(plan)
+    as_map = name == "lyapunov" and _long(plan)[0] >= 2
+    return f"magpend plot {name} {directory}" + (" --map" if as_map else "")
+
+
+def _long(plan: Plan) -> tuple[int, int]:
+    """Numbers of swept parameters and of axes of a grid of initial states with more than one value."""
+    long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
+    return sum(not is_start_dim(d) for d in long), sum(is_grid_dim(d) for d in long)
 
 
 def check_diagram(spec: str | Path, *, smoke: bool = False) -> None:

@@ -81,6 +81,11 @@ def temporary_beside(path: Path) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
 
 
+def is_temporary(name: str) -> bool:
+    """Whether a file was being written when it was left: a name of `temporary_beside`."""
+    return name.startswith(".") and name.endswith(TEMPORARY)
+
+
 def entry_of(data: bytes) -> dict[str, Any]:
     """Size and sha256 of a content, as commit records and ``run.json`` hold them."""
     return {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}

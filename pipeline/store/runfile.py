@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.layout.identity import canonical, digest_of
+from pipeline.layout.identity import digest_of
 from pipeline.layout.schema import FORMAT
 from pipeline.spec.parsing import Spec
 from pipeline.store.errors import DamagedError, RefusedError
@@ -115,5 +115,7 @@ def write_run(
         "provenance": provenance(),
         "skeleton": skeleton,
     }
-    write_atomically(directory / RUN_FILE, canonical(content))
+    # not sorted: the order of the axes is that of the cube's dims
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    write_atomically(directory / RUN_FILE, text)
     return read_run(directory)

@@ -18,8 +18,8 @@ from pipeline.store.files import (
     CUBE,
     OWN_NAMES,
     RUN_FILE,
-    TEMPORARY,
     files_below,
+    is_temporary,
     is_there,
     local_path,
     refuse_links,
@@ -99,13 +99,14 @@ def _refuse_foreign(directory: Path, digest: str) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    return path.name in OWN_NAMES or (path.name.startswith(f".{RUN_FILE}") and path.name.endswith(TEMPORARY))
+    return path.name in OWN_NAMES or (path.name.startswith(f".{RUN_FILE}") and is_temporary(path.name))
 
 
 def _holds_something(path: Path) -> bool:
+    """Whether something is there but an empty folder, or what a set-up was writing when it was stopped."""
     with unreadable(path):
         if path.is_dir() and not path.is_symlink():
-            return bool(os.listdir(path))
+            return not all(is_temporary(name) for name in os.listdir(path))
         return os.path.lexists(path)
 
 
@@ -160,6 +161,8 @@ def establish(
         As `check`.
     """
     info = check(directory, identity)
+    for file in directory.glob(f".{RUN_FILE}.*"):
+        file.unlink()
     if info is None:
         before = _holds_something(directory / COMMITS)
         info = create(directory, spec, plan, identity, spec_text)

@@ -55,7 +55,8 @@ Distances are in units of the states' scales (1 rad, 10 rad/s for the pendulum),
 states are in the units of the coordinate ``state_units``.
 From `identify` an id numbers the attractors of one parameter point (attribute ``matched`` 0), in
 lexicographic order of the least section point; from `match` it follows an attractor (``matched`` 1), and
-where that attractor is absent its row holds the fill values.
+where that attractor is absent its row holds the fill values. `match` adds ``match_basis`` (int8, parameter
+dims, attractor): what the id rests on there; `matching` says what an id is.
 
 `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the orbit, 3 approaching the
 orbit, 4 one of the set, 5 ended on the orbit when it was run on; `deciding.decide` has the criteria. A cell

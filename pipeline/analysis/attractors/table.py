@@ -24,6 +24,7 @@ from pipeline.analysis.tabular import (
     with_interval,
     words_of,
 )
+from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import split_dims
 from pipeline.products.product import Table
 
@@ -123,7 +124,7 @@ def _attractor_words(row: Row) -> dict[str, str]:
         words["share"] = with_interval(row)
     if "mirror_partner" in row:
         words["mirror"] = str(row["mirror_partner"]) if row["mirror_partner"] >= 0 else "-"
-    return words | {"decided": decided}
+    return words | {"letter": letter(row["attractor_id"]), "decided": decided}
 
 
 def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
@@ -135,6 +136,7 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dic
     if "side" in rows[0]:
         words["side"] = distinct(r["side"] for r in rows)
     words |= {**ranges(ds, rows, dims), "cells": str(sum(r["n_cells"] for r in rows))}
+    words["letter"] = letter(rows[0]["attractor_id"])
     if "match_basis" in rows[0]:
         words["id rests on"] = _evidence([r["match_basis"] for r in rows])
     if "fraction" in rows[0]:

@@ -20,6 +20,7 @@ from pipeline.analysis.tabular import (
     where_of,
     with_interval,
 )
+from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import split_dims
 from pipeline.products.product import Table
 
@@ -75,11 +76,15 @@ def _label(code: int) -> str:
     return "diverged" if code == DIVERGED else str(code)
 
 
+def _letter(code: int) -> str:
+    return "-" if code == DIVERGED else letter(code)
+
+
 def _basin_words(row: Row) -> dict[str, str]:
     words = {"id": _label(row["label"]), "cells": str(row["n_cells"]), "fraction": with_interval(row)}
     if row["fraction_if_all"] > row["fraction_if_none"]:
         words["with the unfinished"] = f"{row['low_if_none']:.4f} to {row['high_if_all']:.4f}"
-    return words | _inferred([row])
+    return words | {"letter": _letter(row["label"])} | _inferred([row])
 
 
 def _inferred(rows: Sequence[Row]) -> dict[str, str]:
@@ -94,6 +99,7 @@ def _label_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> 
         **ranges(ds, rows, dims),
         "cells": str(sum(r["n_cells"] for r in rows)),
         "max fraction": largest_share(ds, rows, dims),
+        "letter": _letter(rows[0]["label"]),
         **_inferred(rows),
     }
 

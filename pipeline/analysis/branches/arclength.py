@@ -1,7 +1,8 @@
 """Pseudo-arclength continuation of the solutions of a problem (Keller 1977).
 
-The predictor is a step along the tangent, the corrector is Newton's method in the plane normal to it, so
-that folds in the parameter are nothing special. Unknowns are scaled; lengths are Euclidean in them.
+The predictor is a step along the tangent, bent as the curve was between the last two points; the corrector is
+Newton's method in the plane normal to the tangent, so that folds in the parameter are nothing special.
+Unknowns are scaled; lengths are Euclidean in them.
 """
 
 from __future__ import annotations
@@ -136,7 +137,8 @@ def walk(problem: Problem, start: Point, settings: Settings, stop: Stop, between
     step = settings.first_step
     while len(found.points) < settings.max_points:
         here = found.points[-1]
-        there = yield from correct(problem, here.u + step * here.tangent, here.tangent, settings)
+        guess = here.u + step * here.tangent + _bend(found.points, step)
+        there = yield from correct(problem, guess, here.tangent, settings)
         if (
             there is None
             or not _is_near(here, there, step, settings)
@@ -157,6 +159,18 @@ def walk(problem: Problem, start: Point, settings: Settings, stop: Stop, between
             step *= 0.7
     found.end = "max_points"
     return found
+
+
+def _bend(points: list[Point], step: float) -> np.ndarray:
+    """Second order of the predictor, from the last change of the tangent."""
+    here = points[-1]
+    if len(points) < 2:
+        return np.zeros_like(here.u)
+    before = points[-2]
+    length = float(np.linalg.norm(here.u - before.u))
+    if step > 2.0 * length:
+        return np.zeros_like(here.u)
+    return np.asarray(0.5 * step**2 / length * (here.tangent - before.tangent))
 
 
 def _is_near(here: Point, there: Point, step: float, settings: Settings) -> bool:

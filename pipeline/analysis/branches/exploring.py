@@ -26,7 +26,7 @@ SAME = 1e-6
 """Scaled distance within which two orbits at one parameter value are the same."""
 
 FOLLOWING = "following branches"
-"""Name of the work in reports."""
+"""Begins the names of the work in reports."""
 
 GUESS = 0.05
 """Scaled distance from the chord of a branch within which an orbit may lie on it."""
@@ -73,11 +73,11 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
     """
     branches: list[Branch] = []
     _follow_starts(starts, branches, scope)
-    for _ in range(scope.max_generations):
+    for generation in range(scope.max_generations):
         n_known = len(branches)
         _follow_starts(_adopt(branches), branches, scope)
         _adopt(branches)
-        _switch(branches, scope)
+        _switch(branches, scope, f"{FOLLOWING} that spring from others, round {generation + 1}")
         if len(branches) == n_known:
             break
     _adopt(branches)
@@ -90,12 +90,13 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
         group = [s for s in starts if s.value == value and s.family.period <= scope.max_period]
         known = _lie_on(group, branches)
         group = [s for s, is_known in zip(group, known, strict=True) if not is_known]
-        for start, branch in zip(group, _both_ways(group, scope), strict=True):
+        what = f"{FOLLOWING} from {value:g}"
+        for start, branch in zip(group, _both_ways(group, scope, what), strict=True):
             if branch is not None and not _lie_on([start], branches)[0]:
                 branches.append(branch)
 
 
-def _both_ways(starts: Sequence[Start], scope: Scope) -> list[Branch | None]:
+def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch | None]:
     firsts = run_together(
         [
             first_point(OrbitProblem(s.family), s.family.unknowns(s.state, [s.value]), scope.settings)
@@ -109,7 +110,7 @@ def _both_ways(starts: Sequence[Start], scope: Scope) -> list[Branch | None]:
             for family, point in pairs
             for way in (opposite(point), point)
         ],
-        FOLLOWING,
+        what,
     )
     found = iter(joined(family, *halves[2 * i : 2 * i + 2]) for i, (family, _) in enumerate(pairs))
     return [None if p is None else next(found) for p in firsts]
@@ -233,7 +234,7 @@ def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
     return "supercritical" if (inner.u[-1] > at.point.u[-1]) == worse_above else "subcritical"
 
 
-def _switch(branches: list[Branch], scope: Scope) -> None:
+def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
     """Follow the branches of twice the period, and those through branch points, that are not known yet."""
     open_ends = [
         (branch, one)
@@ -257,7 +258,7 @@ def _switch(branches: list[Branch], scope: Scope) -> None:
             )
             for b, _, start in ready
         ],
-        FOLLOWING,
+        what,
     )
     for (parent, one, _), half in zip(ready, halves, strict=True):
         if len(half.walk.points) < 5 or one.child is not None:

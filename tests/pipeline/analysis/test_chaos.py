@@ -452,7 +452,7 @@ def test_commands__dimension_and_figures(main, run, tmp_path):
     code, out, err = main("analyse", "dimension", run, *few, "--csv", tmp_path / "d.csv")
     assert code == 0, err
     assert re.search(r"^  2\.4 +\d +\d+ ", out, re.MULTILINE)
-    near = ("--at", "frequency=2.4001", *few[2:])
+    near = ("--at", "frequency_hz=2.4", *few[2:])
     assert "dimension: taken from" in main("analyse", "dimension", run, *near)[2]
     code, out, err = main("plot", "convergence", run, "--at", "frequency=2.4")
     assert code == 0, err

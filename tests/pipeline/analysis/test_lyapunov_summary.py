@@ -39,9 +39,11 @@ def make_cube(rates, *, stderr=0.02, n_exponents=4, blocks=8, **dims):
             "exponent": np.arange(1, n_exponents + 1),
             "frequency": dims["frequency"],
         },
+        attrs={"model": "pendulum", "parameters": PARAMETERS},
     )
 
 
+PARAMETERS = "\n".join(f"{k} = {v!r}" for k, v in load_preset().items())
 FREQUENCY = np.array([1.0, 2.0, 4.0])
 
 

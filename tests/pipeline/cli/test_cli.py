@@ -10,11 +10,12 @@ from itertools import islice
 from pathlib import Path
 
 import pytest
+import xarray as xr
 
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
 from pipeline.runs import preview, workflows
-from pipeline.runs.preview import first_figure
+from pipeline.runs.preview import figure_command, first_figure
 from pipeline.spec.parsing import parse_spec
 
 BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
@@ -131,6 +132,24 @@ def test_first_figure__fits_the_axes(axes, starts, figure):
     assert first_figure(make_plan(parse_spec(spec))) == figure
 
 
+@pytest.mark.parametrize(
+    ("axes", "products", "n_keep", "command"),
+    [
+        ({"frequency_hz": 2, "q": 2}, {"lyapunov": {}}, 64, "magpend plot lyapunov run --map"),
+        ({"frequency_hz": 3}, {"lyapunov": {}}, 64, "magpend plot lyapunov run"),
+        ({}, {"lyapunov": {}}, 64, "magpend plot convergence run"),
+        ({"frequency_hz": 2, "q": 2}, {}, 64, "magpend plot regimes run"),
+        ({}, {}, 1000, "magpend plot section run"),
+    ],
+)
+def test_figure_command__fits_the_products(axes, products, n_keep, command):
+    spec = {"kind": "sweep", "parameters": {} if "frequency_hz" in axes else {"frequency_hz": 2.2}}
+    spec["axes"] = {name: {"values": [1.5 + i for i in range(n)]} for name, n in axes.items()}
+    spec["initial_conditions"] = {"kind": "random", "n": 3, "psi1": [0.0, 1.0]}
+    spec |= {"products": products, "integration": {"n_keep": n_keep}}
+    assert figure_command(make_plan(parse_spec(spec)), Path("run")) == command
+
+
 def test_run__plot_of_a_map_is_refused_before_it_is_computed(main, write_spec, sweep_text, tmp_path):
     write_spec(sweep_text)
     code, _, err = main("run", "spec.toml", "--plot")
@@ -207,6 +226,16 @@ def test_simulate__writes_series_and_figure(main, tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 0
     assert main("simulate", "--periods", "2", "--no-figure")[0] == 0
     assert not (tmp_path / "trajectory.png").exists()
+
+
+def test_simulate__data_and_provenance_beside_the_figure(main, tmp_path):
+    code, out, _ = main("simulate", "--psi1", "0.1", "--periods", "2", "--samples", "20", "--out", "a.csv")
+    assert code == 0
+    assert out.split() == ["series:", "a.csv", "figure:", "a.png", "data:", "a.nc"]
+    with xr.open_dataset(tmp_path / "a.nc", engine="scipy") as stored:
+        assert {"psi1", "path"} <= set(stored.data_vars)
+        assert {"created", "host", "versions", "parameters", "model"} <= set(stored.attrs)
+    assert stored.attrs["host"].encode() in (tmp_path / "a.png").read_bytes()
 
 
 def test_presets__values_units_and_source(main):

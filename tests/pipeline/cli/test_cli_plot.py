@@ -37,7 +37,7 @@ def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
     }  # fmt: skip
     names = {
         "basins": "basins_q_1.5_frequency_2.6_degrees_shade", "fractions": "fractions_q_1.5",
-        "gallery": "gallery_q_1.5_frequency_2.6", "attractors": "attractors_q_1.5_psi2",
+        "gallery": "gallery_q_1.5_frequency_2.6", "attractors": "attractors_psi2_q_1.5",
         "regimes": "regimes_number",
     }  # fmt: skip
     for verb, options in figures.items():
@@ -55,13 +55,13 @@ def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
     for arguments, message in (
         (["basins"], "frequency (2 values), q (2 values): choose a value of each, such as frequency=2.8"),
         (["basins", "--at", "q"], "--at q: must be NAME=VALUE with a number, such as frequency=2.2"),
-        (["basins", "--at", "p=1"], "unknown axis 'p'; values can be chosen of: frequency, q"),
+        (["basins", "--at", "p=1"], "unknown axis 'p'; known: frequency, q"),
         (["fractions", "--at", "q=7"], "q = 7 lies off its axis, which runs from 1.5 to 1.6"),
         (["attractors"], "one swept parameter, and 2 are left of frequency, q"),
         (["regimes", "--at", "q=1.5"], "two swept parameters, and 1 are left of frequency, q"),
         (["gallery", "--at", "q=1.5"], "frequency (2 values)"),
         (["basins", "--out", "a.gif"], "the suffix must be one of .png, .pdf, .svg"),
-        (["basins", "--threshold", "0"], "threshold = 0.0 is out of bounds"),
+        (["basins", "--threshold", "0"], "threshold = 0.0: must be greater than 0"),
     ):
         before = sorted(tmp_path.rglob("*"))
         code, _, err = main("plot", arguments[0], "run", *arguments[1:])
@@ -85,8 +85,7 @@ def test_plot__continuation_with_loops(main, write_spec, walk_text, tmp_path):
     code, _, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
     assert code == 0, err
     assert "hysteresis: computed" in err
-    with xr.open_dataset(
-        tmp_path / "run" / "figures" / "attractors_degrees_psi1.nc", engine="scipy"
-    ) as stored:
+    path = tmp_path / "run" / "figures" / "attractors_psi1_degrees.nc"
+    with xr.open_dataset(path, engine="scipy") as stored:
         assert {"value", "share", "present"} <= set(stored.data_vars)
         assert stored["value"].attrs["units"] == "deg"

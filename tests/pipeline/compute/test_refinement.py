@@ -388,3 +388,13 @@ def test_parse_spec__refine_problems(change, path, remedy):
     (problem,) = caught.value.problems
     assert problem.startswith(path)
     assert remedy in problem
+
+
+def test_orbits__model_without_angles_has_no_turns(duffing):
+    section = np.array([[[0.1, 0.2]], [[0.1, 0.2]], [[0.9, 0.0]]])
+    cells = {
+        "section": section,
+        "status": np.full(3, Status.PERIODIC, np.int8),
+        "orbit_period": np.ones(3, np.int16),
+    }
+    assert Orbits(1e-6, duffing).classes(cells).tolist() == [0, 0, 1]

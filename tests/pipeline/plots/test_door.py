@@ -166,6 +166,15 @@ def test_draw_figure__provenance_beside_and_inside(tmp_path):
         assert b"bifurcation diagram" in written or suffix == ".pdf"
 
 
+def test_save_data__what_is_empty_does_not_spoil_the_file(tmp_path):
+    """A dim of length 0 is NetCDF's for one that may grow; scipy does not read it back."""
+    figure = plot_bifurcation(make_cube())
+    figure.data = xr.Dataset({"none": (("empty", "x"), np.zeros((0, 2))), "some": ("x", [1.0, 2.0])})
+    with xr.open_dataset(save_data(figure, tmp_path / "a.png"), engine="scipy") as stored:
+        assert stored["some"].values.tolist() == [1.0, 2.0]
+        assert set(stored.variables) == {"some"}
+
+
 def test_save_figure__fonts_are_outlines_and_texts_stay_texts(tmp_path):
     figure = plot_bifurcation(make_cube())
     written = save_figure(figure, tmp_path / "a.pdf").read_bytes()

@@ -358,9 +358,23 @@ def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
             patch.setattr(skeleton, "write_atomically", crash)
             with pytest.raises(KeyboardInterrupt):
                 create(directory, made.spec, made.plan, made.identity, "text")
+        (directory / "cube.zarr/.zarr.json.abc.tmp").write_text("{")  # what a power cut leaves
+        (directory / ".run.json.abc.tmp").write_text("{")
         assert check(directory, made.identity) is None
-        create(directory, made.spec, made.plan, made.identity, "text")
+        info = establish(directory, made.spec, made.plan, made.identity, "text", silent)
+        sweep(info, {})
         assert verify_run(directory).sound
+        assert not list(directory.rglob("*.tmp"))
+
+
+def test_read_run__another_format(whole):
+    path = whole.info.directory / "run.json"
+    path.write_text(path.read_text().replace('"format": 2', '"format": 1'))
+    before = everything(whole.info.directory)
+    for use in (lambda: open_run(whole.info.directory), lambda: check(whole.info.directory, whole.identity)):
+        with pytest.raises(RefusedError, match=r"format 1, and this magpend reads 2"):
+            use()
+    assert everything(whole.info.directory) == before
 
 
 # ---- whether all is there ----------------------------------------------------------------------

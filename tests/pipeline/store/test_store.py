@@ -353,3 +353,22 @@ def test_same_bytes__whatever_the_order(made, tmp_path, bytes_of):
         made.commit(index)
         made.commit(index)
     assert bytes_of(made.info.directory) == first
+
+
+def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
+    """The order of the axes is that of the cube's dims: what reads run.json must see it."""
+    from pipeline.layout.identity import digest_of, identity_of
+    from pipeline.layout.plan import make_plan
+    from pipeline.spec.parsing import load_spec, parse_spec
+    from pipeline.store.runfile import read_run
+    from pipeline.store.setup import create
+
+    text = 'kind = "sweep"\n[axes]\n' + "".join(
+        f"{name} = {{ values = [1.5, 1.6] }}\n" for name in ("q", "frequency_hz", "eps_drive")
+    )
+    spec = load_spec(write_spec(f'{text}[initial_conditions]\nkind = "grid"\n'))
+    identity = identity_of(spec, make_plan(spec), "k")
+    create(tmp_path / "run", spec, make_plan(spec), identity, text)
+    again = parse_spec(read_run(tmp_path / "run").spec)
+    assert list(again.axes) == list(spec.axes) == ["q", "frequency_hz", "eps_drive"]
+    assert digest_of(identity_of(again, make_plan(again), "k")) == digest_of(identity)
