@@ -174,7 +174,7 @@ def artists(fig, gid):
 
 def test_plot_lyapunov__points_are_the_largest_exponents(cube):
     fig = plot_lyapunov(cube)
-    (line,) = artists(fig, "exponent:right")  # psi1 = psi2 = 0.3
+    (line,) = artists(fig, "exponent:2")  # right: psi1 = psi2 = 0.3
     drawn = sorted(zip(line.get_xdata(), line.get_ydata(), strict=True))
     expected = sorted(
         (f, v) for f, row in zip(FREQUENCY, cube.lyapunov.values[..., 0], strict=True) for v in row
@@ -188,9 +188,7 @@ def test_plot_lyapunov__points_are_the_largest_exponents(cube):
 
 def test_plot_lyapunov__bands_are_one_error_wide_and_joined(cube):
     cube["lyapunov"][0, 1, 0] = 0.97
-    (band,) = [
-        a for a in artists(plot_lyapunov(cube), "band:exponent:right") if isinstance(a, PolyCollection)
-    ]
+    (band,) = [a for a in artists(plot_lyapunov(cube), "band:exponent:2") if isinstance(a, PolyCollection)]
     spans = {(round(p.vertices[:, 1].min(), 9), round(p.vertices[:, 1].max(), 9)) for p in band.get_paths()}
     assert (0.95, 1.02) in spans  # 1.0 and 0.97 overlap
     assert (-0.32, -0.28) in spans
@@ -204,14 +202,14 @@ def test_plot_lyapunov__spectrum_per_period(cube):
         assert sorted(line.get_ydata()) == pytest.approx(
             sorted((cube.lyapunov.values[..., k] / FREQUENCY[:, None]).ravel())
         )
-    assert fig.axes[1].get_ylabel() == "exponents [1/drive period]"
+    assert fig.axes[1].get_ylabel() == "exponents [1/period]"
     assert fig.data["exponent_value"].attrs["per"] == "drive period"
 
 
 def test_plot_lyapunov__flagged_cells_are_open(cube):
     cube["lyapunov_flag"][1, 1] = 2
     fig = plot_lyapunov(cube)
-    (line,) = artists(fig, "flagged:exponent:right")
+    (line,) = artists(fig, "flagged:exponent:2")
     assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([2.0], pytest.approx([-0.3]))
     assert line.get_markerfacecolor() == "none"
     assert "flagged" in [t.get_text() for t in fig.axes[1].get_legend().get_texts()]
@@ -225,7 +223,7 @@ def test_plot_lyapunov__mistakes(cube):
     two = make_cube(np.zeros((2, 2)), frequency=[1.0, 2.0], q=[1.0, 1.5])
     with pytest.raises(ValueError, match="choose a value first"):
         plot_lyapunov(two)
-    assert plot_lyapunov(two, at={"q": 1.4}).data.sizes == {"frequency": 2, "exponent": 1}
+    assert plot_lyapunov(two, at={"q": 1.5}).data.sizes == {"frequency": 2, "exponent": 1}
 
 
 def test_plot_lyapunov_map__the_largest_over_the_cells():
