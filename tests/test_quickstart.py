@@ -98,7 +98,7 @@ def test_quickstart__run_again_does_nothing(directory):
     before = {p: p.stat().st_mtime_ns for p in (directory / "cube.zarr").rglob("*") if p.is_file()}
     done = magpend("run", "quickstart", "--out", directory)
     assert done.returncode == 0
-    assert "nothing to do" in done.stdout
+    assert "nothing to do" in done.stderr
     assert before == {p: p.stat().st_mtime_ns for p in (directory / "cube.zarr").rglob("*") if p.is_file()}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 import shlex
 import tomllib
@@ -76,6 +77,24 @@ def test_docs__commands_and_options_exist(page, words):
     for word in words:
         if word.startswith("--"):
             assert takes_names or word.partition("=")[0] in flags, (page, word)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_docs__names_in_python_exist(page):
+    import magpend
+
+    for block in blocks("python", PAGES[page]):
+        compile(block, page, "exec")
+        for name in re.findall(r"\bmagpend\.(\w+)", block):
+            assert hasattr(magpend, name), (page, name)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_docs__modules_and_files_exist(page):
+    for name in re.findall(r"`((?:pipeline|magpend_core)(?:\.\w+)+)`", PAGES[page]):
+        pkgutil.resolve_name(name)
+    for name in re.findall(r"`?((?:pipeline|magpend_core|tests|workflows)/[\w/.]+)", PAGES[page]):
+        assert "NAME" in name or (ROOT / name.rstrip(".")).exists(), name
 
 
 def test_reference__names_everything():

@@ -35,6 +35,7 @@ from magpend_core.engine.simd import (
     load_rows,
     maximum,
     minimum,
+    multiply_add,
     store,
     store_rows,
     where_less,
@@ -174,9 +175,11 @@ def run_stage(w: Any, base: int, s: int) -> None:
     h = load(w, base + ROWS.step)
     for i in range(N):
         row = base + i * WIDTH
+        # a sum of two bare products could be fused in two ways, and an optimiser that peels the loop
+        # would choose another than one that does not
         total = STAGES[s, 0] * load(w, row + ROWS.slopes)
         for j in range(1, s):
-            total = total + STAGES[s, j] * load(w, row + ROWS.slopes + j * N * WIDTH)
+            total = multiply_add(STAGES[s, j], load(w, row + ROWS.slopes + j * N * WIDTH), total)
         store(w, row + ROWS.trial, load(w, row + ROWS.state) + h * total)
     if NODES[s] != NODES[s - 1]:
         c = load_rows(w, base + ROWS.constants, NC)
@@ -209,8 +212,14 @@ def unrolled_stages(system: System) -> Callable[..., None]:
     ]
     for s in range(1, N_STAGES):
         terms = [(j, STAGES[s, j]) for j in range(s) if STAGES[s, j] != 0.0]
-        sums = (" + ".join(f"{float(a)!r} * k{j}[{i}]" for j, a in terms) for i in range(n))
-        lines.append("trial = (" + ", ".join(f"y[{i}] + h * ({x})" for i, x in enumerate(sums)) + ",)")
+        states = []
+        for i in range(n):
+            first, *rest = terms
+            total = f"{float(first[1])!r} * k{first[0]}[{i}]"
+            for j, a in rest:
+                total = f"multiply_add({float(a)!r}, k{j}[{i}], {total})"
+            states.append(f"multiply_add(h, {total}, y[{i}])")
+        lines.append(f"trial = ({', '.join(states)},)")
         if NODES[s] != NODES[s - 1]:
             lines.append(f"u = forcing(t + {float(NODES[s])!r} * h, c)")
         lines.append(f"k{s} = rhs(trial, u, c)")
@@ -229,10 +238,10 @@ def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
         row = base + i * WIDTH
         error = ERROR[0] * load(w, row + ROWS.slopes)
         for j in range(2, N_STAGES):
-            error = error + ERROR[j] * load(w, row + ROWS.slopes + j * N * WIDTH)
+            error = multiply_add(ERROR[j], load(w, row + ROWS.slopes + j * N * WIDTH), error)
         size = maximum(absolute(load(w, row + ROWS.state)), absolute(load(w, row + ROWS.trial)))
         scaled = error / (atol + rtol * size)
-        total = total + scaled * scaled
+        total = multiply_add(scaled, scaled, total)
     h = load(w, base + ROWS.step)
     return (h * h) * total * (1.0 / N_CONTROLLED)
 
@@ -671,12 +680,17 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
     return bindings
 
 
-@cache
 def engine_of(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> Callable[..., None]:
     """Compile `advance` for a system and an observer, and for the quantities to be watched.
 
     Those are given by their numbers in ``system.state_names + system.quantity_names``.
     """
+    return _engine_of(system, observer, watched)
+
+
+@cache
+def _engine_of(system: System, observer: Observer, watched: tuple[int, ...]) -> Callable[..., None]:
     bindings = engine_bindings(system, observer, watched)
-    cached = is_covered(*system.functions, observer.observe, observer.memory_size, observer.renew)
+    kept = observer.n_kept, observer.keeps_next
+    cached = is_covered(*system.functions, observer.observe, observer.memory_size, observer.renew, *kept)
     return kernel(specialise(advance, _name(system, observer, watched), **bindings), cached)

@@ -19,7 +19,17 @@ from typing import Any
 import numpy as np
 
 from magpend_core.engine.jit import inline
-from magpend_core.engine.simd import WIDTH, load, load_rows, maximum, minimum, store, store_rows, where_less
+from magpend_core.engine.simd import (
+    WIDTH,
+    load,
+    load_rows,
+    maximum,
+    minimum,
+    multiply_add,
+    store,
+    store_rows,
+    where_less,
+)
 from magpend_core.engine.system import System
 from magpend_core.engine.tableau import MIDDLE, N_STAGES
 
@@ -52,7 +62,7 @@ def evaluate_watched(w: Any, base: int) -> None:
         row = base + i * WIDTH
         total = MIDDLE[0] * load(w, row + ROWS.slopes)
         for s in range(2, N_STAGES):
-            total = total + MIDDLE[s] * load(w, row + ROWS.slopes + s * N * WIDTH)
+            total = multiply_add(MIDDLE[s], load(w, row + ROWS.slopes + s * N * WIDTH), total)
         store(w, row + ROWS.halfway, load(w, row + ROWS.state) + h * total)
     c = load_rows(w, base + ROWS.constants, NC)
     y = load_rows(w, base + ROWS.halfway, N)
@@ -77,7 +87,7 @@ def update_extremes(w: Any, base: int) -> None:
         begin = load(w, row + ROWS.begin)
         begin = where_less(0.0, h, begin, end)
         # the parabola begin + slope x + bend x^2 for x in [0, 1]
-        slope = 4.0 * middle - 3.0 * begin - end
+        slope = multiply_add(-3.0, begin, 4.0 * middle) - end
         bend = 2.0 * (begin + end) - 4.0 * middle
         turns = where_less(0.0, h, slope * (slope + 2.0 * bend), 0.0)
         vertex = where_less(turns, 0.0, begin - slope * slope / (4.0 * bend), end)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import Directory
+from pipeline.cli.common import Directory, Json
 from pipeline.cli.exits import Exit
 from pipeline.cli.options import completing
 
@@ -82,13 +82,19 @@ def _diagram(directory: Path) -> None:
     draw(directory, "bifurcation", options())
 
 
-def status(directory: Directory) -> None:
+def status(directory: Directory, json: Json = False) -> None:
     """Say how much of a run is committed and what became of its cells."""
-    from pipeline.cli import console
+    from pipeline.cli.common import tell
+    from pipeline.products.product import Table
     from pipeline.runs.status import describe_state, state
 
-    for line in describe_state(state(directory)):
-        console.result(line)
+    found = state(directory)
+    row = {
+        "directory": str(found.directory), "title": found.title, "complete": found.complete,
+        "cells": found.plan.n_cells, "committed_cells": found.n_committed, "tasks": found.plan.n_tasks,
+        "committed_tasks": len(found.done), "status": dict(found.cells),
+    }  # fmt: skip
+    tell(Table([row], describe_state(found)), None, json)
 
 
 def verify(

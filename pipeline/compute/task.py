@@ -18,7 +18,7 @@ from magpend_core import Sections, Status, kernel_version, run_branches
 from magpend_core.engine.system import System
 from pipeline.compute.refinement import infer
 from pipeline.layout.cells import CellMap, Inputs
-from pipeline.layout.identity import digest_of, identity_of
+from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import base_variables
 from pipeline.products.product import function_of
@@ -58,10 +58,11 @@ def _prepare(directory: str, digest: str) -> tuple[RunInfo, Spec, Plan, CellMap]
     info = read_run(Path(directory))
     spec = parse_spec(info.spec)
     plan = make_plan(spec)
-    if digest != info.digest or digest_of(identity_of(spec, plan, kernel_version())) != digest:
+    identity = identity_of(spec, plan, kernel_version())
+    if digest != info.digest or digest_of(identity) != digest:
+        why = "; ".join(differences(info.identity, identity)) or "another run was begun in the directory"
         raise RefusedError(
-            f"{directory}: this worker's magpend would not compute the same run "
-            f"(kernel {kernel_version()} here, {info.identity['kernel_version']} in the directory); "
+            f"{directory}: this worker's magpend would not compute the same run ({why}); "
             "install the same version everywhere."
         )
     return info, spec, plan, CellMap(spec)

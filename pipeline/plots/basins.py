@@ -63,26 +63,23 @@ def plot_basins(
     part = choose(attractors, at, axes, f"an image of basins has the axes {' and '.join(axes)}")
     data = part[["attractor_id", "status"]].transpose(*reversed(axes))
     if n_periods is not None:
-        data["n_periods"] = choose(
-            n_periods.to_dataset(name="attractor_id"), at, axes, "an image of basins has two axes"
-        )["attractor_id"].transpose(*reversed(axes))
+        times = choose(n_periods.to_dataset(name="attractor_id"), at, axes, "an image has two axes")
+        data["n_periods"] = times["attractor_id"].transpose(*reversed(axes))
     cast = palette.cast_of(attractors, part)
     codes, counts = _codes(data, cast)
     fig, ax = palette.new_panel(_stored(data, part, cast), _entries(cast, counts, codes.size), frame, 4.7)
     scale = _scale(data, part)
-    image = ax.imshow(
+    ax.imshow(
         _painted(codes, data, part, cast, scale), origin="lower",
         extent=_extent(data, attractors, axes, degrees),
         aspect="equal" if _is_square(data, attractors, axes) and not (frame.xlim or frame.ylim) else "auto",
-        interpolation="nearest",
+        interpolation="nearest", gid="basins",
     )  # fmt: skip
-    image.set_gid("basins")
     style.limits(ax, frame)
     _dress(ax, attractors, axes, degrees)
     if scale is not None:
         _draw_scale(fig, ax, scale)
-    style.caption(ax, labels.caption(part, drop=axes))
-    style.finish(fig)
+    style.complete(fig, ax, labels.caption(part, drop=axes))
     _write_letters(ax, codes, cast)
     return fig
 

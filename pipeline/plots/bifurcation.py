@@ -77,18 +77,9 @@ def plot_bifurcation(
     """
     style.check_choice("layout", layout, LAYOUTS)
     diagram = Diagram.of(ds, state=state, quantity=quantity, degrees=degrees, at=at, frame=frame)
-    names = diagram.view.layers
-    if layout == "side" and len(names) < 2:
-        raise ValueError(
-            "layout 'side' needs branches up and down, and this cube has "
-            f"{names[0] or 'no directions'} only; use layout 'overlay'"
-        )
     fig = style.new_figure(4.3, xr.Dataset(), frame)
-    everything = tuple(range(len(names)))
-    panels = _panels(fig, diagram, [(i,) for i in everything] if layout == "side" else [everything])
-    style.caption(panels[0].ax, diagram.caption)
-    style.legend_above(fig, diagram.handles(layers=layout == "overlay"))
-    style.finish(fig)
+    panels = _panels(fig, diagram, _layers(diagram.view.layers, layout))
+    style.complete(fig, panels[0].ax, diagram.caption, diagram.handles(layers=layout == "overlay"))
     fig.data = diagram.draw(panels)
     return fig
 
@@ -143,6 +134,11 @@ class Diagram:
     def x(self) -> np.ndarray:
         """Values of the swept parameter."""
         return np.asarray(self.view.ds[self.parameter].values, dtype=np.float64)
+
+    @property
+    def layers(self) -> tuple[int, ...]:
+        """Indices of all directions."""
+        return tuple(range(len(self.view.layers)))
 
     @property
     def caption(self) -> str:
@@ -201,7 +197,7 @@ class Diagram:
         }
         dims = ("layer", self.parameter)
         drawn = drawn.assign({name: (dims, values) for name, values in counts.items() if values.any()})
-        drawn = drawn.assign_coords({self.parameter: axis.variable, **_fixed(self.view.ds)})
+        drawn = drawn.assign_coords({self.parameter: axis.variable, **fixed_of(self.view.ds)})
         return drawn.assign_attrs(title="bifurcation diagram", parameter=self.parameter)
 
 
@@ -212,7 +208,8 @@ def with_diagram(data: xr.Dataset, drawn: xr.Dataset) -> xr.Dataset:
     return data.merge(renamed).assign_attrs(data.attrs)
 
 
-def _fixed(ds: xr.Dataset) -> dict[str, Any]:
+def fixed_of(ds: xr.Dataset) -> dict[str, Any]:
+    """Coordinates of the values at which all of a dataset was taken."""
     return {str(k): v.variable for k, v in ds.coords.items() if not v.ndim and v.dtype.kind == "f"}
 
 
@@ -258,6 +255,18 @@ def swept_parameter(ds: xr.Dataset) -> str:
     if not outer:
         raise ValueError("the cube sweeps no parameter: there is nothing to draw the sections over")
     return (long or outer)[0]
+
+
+def _layers(names: Sequence[str], layout: str) -> list[tuple[int, ...]]:
+    """Layers of each panel; raises ValueError if there are not two for panels side by side."""
+    if layout == "overlay":
+        return [tuple(range(len(names)))]
+    if len(names) < 2:
+        raise ValueError(
+            "layout 'side' needs branches up and down, and this cube has "
+            f"{names[0] or 'no directions'} only; use layout 'overlay'"
+        )
+    return [(i,) for i in range(len(names))]
 
 
 def _panels(fig: style.DataFigure, diagram: Diagram, layers: Sequence[tuple[int, ...]]) -> list[pixels.Panel]:

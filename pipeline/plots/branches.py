@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
@@ -53,55 +54,69 @@ def plot_branches(
         From `pipeline.analysis.branches`.
     cube
         Sweep or continuation over the same parameter, drawn below.
-    state
-        Name of the state drawn; by default the model's first.
+    state, degrees, at
+        As for `plot_bifurcation`.
     max_period
         Longest period drawn; by default all.
-    degrees
-        Degrees instead of radians.
-    at
-        Values of further parameters that the cube sweeps.
     frame
         Width of the figure and ranges of its axes.
 
     Returns
     -------
     DataFigure
-        Its `data` are the branches drawn; with the suffix ``_diagram`` what lies below them.
+        Its `data` are the branches; with the suffix ``_diagram`` what lies below them.
 
     Raises
     ------
     ValueError
-        For an unknown state, and as `plot_bifurcation` for the cube.
+        As `plot_bifurcation`.
     """
     measure = labels.state_measure(ds, state, degrees)
-    below = None
-    if cube is not None:
-        below = Diagram.of(cube, state=measure.name, degrees=degrees, at=at, frame=frame)
+    below = _below(cube, measure, degrees, at, frame)
     fig = style.new_figure(4.5, _stored(ds), frame)
     ax = fig.add_subplot()
-    style.style_axes(ax)
     if below is not None:
         below.dress(ax)
-    chosen = [
-        i for i in range(ds.sizes["branch"]) if max_period is None or int(ds["orbit_period"][i]) <= max_period
-    ]
+    chosen = _chosen(ds, max_period)
     names = _draw_lines(ax, ds, chosen, measure, below is None)
     if below is None:
-        ax.margins(y=0.08)
-        style.limits(ax, frame)
-        labels.angle_ticks(ax, measure)
-    parameter, units = (str(ds.attrs[key]) for key in ("parameter", "parameter_units"))
-    style.label_axes(ax, labels.swept_label(parameter, units), measure.label)
-    style.caption(ax, labels.caption(below.view.ds if below else ds, drop=[below.parameter] if below else []))
+        _dress(ax, frame, measure)
+    style.label_axes(
+        ax, labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"]), measure.label
+    )
     handles = [*(below.handles() if below is not None else []), *_handles(ds, chosen)]
-    style.legend_above(fig, handles, size=fig.look.tick)
-    style.finish(fig)
+    style.complete(fig, ax, below.caption if below is not None else labels.caption(ds), handles)
     if below is not None:
-        drawn = below.draw([pixels.Panel(ax, tuple(range(len(below.view.layers))))])
-        fig.data = with_diagram(fig.data, drawn)
+        fig.data = with_diagram(fig.data, below.draw([pixels.Panel(ax, below.layers)]))
     _name(ax, names)
     return fig
+
+
+def _below(
+    cube: xr.Dataset | None,
+    measure: Measure,
+    degrees: bool,
+    at: Mapping[str, float] | None,
+    frame: style.Frame,
+) -> Diagram | None:
+    """The diagram under the branches, if there is a cube for one."""
+    if cube is None:
+        return None
+    return Diagram.of(cube, state=measure.name, degrees=degrees, at=at, frame=frame)
+
+
+def _dress(ax: Axes, frame: style.Frame, measure: Measure) -> None:
+    """Set look, limits and ticks where no diagram has."""
+    style.style_axes(ax)
+    ax.margins(y=0.08)
+    style.limits(ax, frame)
+    labels.angle_ticks(ax, measure)
+
+
+def _chosen(ds: xr.Dataset, max_period: int | None) -> list[int]:
+    """Branches whose period is short enough."""
+    periods = ds["orbit_period"].values.tolist()
+    return [i for i, period in enumerate(periods) if max_period is None or period <= max_period]
 
 
 def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
@@ -161,6 +176,7 @@ class _Name:
 def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
     """Put markers on bifurcations; return names for those where a stable orbit is born or lost."""
     names = []
+    size = 3.4 if style.figure_of(ax).frame.compact else 4.5
     for k in range(ds.sizes["bifurcation"]):
         branch = int(ds["of_branch"][k])
         if branch not in chosen:
@@ -170,8 +186,9 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
         y = measure.shown(ds["bifurcation_section"].sel(state=measure.name).values[k, :period])
         stable = min(int(ds["n_unstable_before"][k]), int(ds["n_unstable_after"][k])) == 0
         ax.plot(
-            np.full(period, x), y, linestyle="none", marker=MARKERS[kind], markersize=4.5 if stable else 2.8,
-            markerfacecolor="white" if stable else "0.75", markeredgecolor="black", markeredgewidth=0.7,
+            np.full(period, x), y, linestyle="none", marker=MARKERS[kind],
+            markersize=size if stable else 0.62 * size, markerfacecolor="white" if stable else "0.75",
+            markeredgecolor="black", markeredgewidth=0.7,
             zorder=8.0 if stable else 7.0, scalex=scale, scaley=scale,
         )  # fmt: skip
         if stable:
@@ -201,7 +218,7 @@ def _name(ax: Axes, names: list[_Name]) -> None:
             ax.annotate(
                 name.text, (name.x, y), tuple(spot - anchor), textcoords="offset points", ha="center",
                 va="center", fontsize=_NAME_PT, fontfamily=style.FONT, zorder=9.0, gid=f"name:{name.text}",
-                arrowprops=_LEADER,
+                arrowprops=_LEADER, path_effects=[withStroke(linewidth=1.5, foreground="white")],
             )  # fmt: skip
             break
 

@@ -76,14 +76,11 @@ def plot_coexisting(
         ax.axvspan(low, high, gid="loop", zorder=0.5, **_SPAN)
     for number in sorted(range(len(cast.names)), key=lambda i: float(data["share"].isel(attractor=i).sum())):
         (_draw_directions if both else _draw_weighted)(ax, data.isel(attractor=number), parameter, cast)
-    ax.set_xlim(*style.span(data[parameter].values))
     ax.margins(y=0.05)
-    ax.autoscale_view(scalex=False)
-    style.limits(ax, frame)
+    style.limits(ax, frame, style.span(data[parameter].values))
     labels.angle_ticks(ax, measure)
     style.label_axes(ax, labels.parameter_label(data[parameter]), measure.label)
-    style.caption(ax, labels.caption(part, drop=[parameter]))
-    style.finish(fig)
+    style.complete(fig, ax, labels.caption(part, drop=[parameter]))
     return fig
 
 

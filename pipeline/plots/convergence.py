@@ -90,10 +90,8 @@ def plot_convergence(
     style.label_axes(bottom, str(data["period"].attrs["long_name"]), f"in the block [1/{unit}]")
     top.set_xlim(0.0, 1.01 * float(data["period"][-1]))
     style.limits(top, frame)
-    style.caption(top, data.attrs["place"])
-    style.legend_above(fig, handles)
     fig.align_ylabels([top, bottom])
-    style.finish(fig)
+    style.complete(fig, top, data.attrs["place"], handles)
     return fig
 
 

@@ -53,14 +53,9 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
         gid="correlation_sum",
     )  # fmt: skip
     bottom.semilogx(
-        radius,
-        data["local_slope"].values,
-        "o-",
-        markersize=3,
-        linewidth=0.7,
-        color="black",
+        radius, data["local_slope"].values, "o-", markersize=3, linewidth=0.7, color="black",
         gid="local_slope",
-    )
+    )  # fmt: skip
     _draw_fit(top, bottom, data)
     value, error = (float(data[f"correlation_dimension{end}"]) for end in ("", "_stderr"))
     text = f"$D_2$ = {value:.2f} ± {error:.2f}" if np.isfinite(value) else "no range to fit"

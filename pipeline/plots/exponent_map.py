@@ -93,12 +93,8 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
     bar = fig.colorbar(
         ScalarMappable(norm, "PuOr_r"), ax=ax, extend=extend, pad=0.015, aspect=32, ticks=MaxNLocator(7)
     )
-    bar.outline.set_linewidth(style.LINE_PT)
-    bar.ax.tick_params(labelsize=fig.look.tick, width=style.LINE_PT, labelfontfamily=style.FONT)
-    bar.set_label(
-        f"largest exponent [{rate_unit(data)}]\nmaximum over the cells of each point",
-        fontsize=fig.look.label,
-    )
+    text = f"largest exponent [{rate_unit(data)}]\nmaximum over the cells of each point"
+    style.style_bar(fig, bar, text)
 
 
 def _scale(grid: np.ndarray) -> tuple[Normalize, str]:

@@ -6,6 +6,7 @@ All of it comes from the model and from the coordinates of what is drawn; no nam
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -66,7 +67,12 @@ class Measure:
 
 def with_unit(name: str, unit: str) -> str:
     """Name and unit of an axis; no unit for pure numbers."""
-    return name if unit in ("", "1") else f"{name} [{unit}]"
+    return name if unit in ("", "1") else f"{name} [{raised(unit)}]"
+
+
+def raised(unit: str) -> str:
+    """Unit with its powers raised: m/s2 as m/s²."""
+    return re.sub(r"(?<=[A-Za-z])[23]", lambda power: {"2": "²", "3": "³"}[power[0]], unit)
 
 
 def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Measure:
@@ -227,7 +233,7 @@ def _value(ds: xr.Dataset, coordinate: xr.DataArray, is_start: bool) -> str:
 
 
 def _assignment(symbol: str, value: float, unit: str) -> str:
-    return f"{symbol} = {value:.6g}" + ("" if unit in ("", "1") else f"\u00a0{unit}")
+    return f"{symbol} = {value:.6g}" + ("" if unit in ("", "1") else f"\u00a0{raised(unit)}")
 
 
 def shown_at(ds: xr.Dataset, dims: Iterable[str]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,8 +67,7 @@ def plot_lyapunov(
     """
     style.check_choice("unit (per)", per, UNITS)
     demand(ds)
-    above = style.Frame(frame.width, frame.xlim)
-    diagram = Diagram.of(ds, state=state, degrees=degrees, at=at, frame=above)
+    diagram = Diagram.of(ds, state=state, degrees=degrees, at=at, frame=replace(frame, ylim=None))
     part = diagram.view.ds
     part = part.squeeze([d for d in part["status"].dims if d != diagram.parameter and part.sizes[d] == 1])
     data = exponent_values(part, per, spectrum)
@@ -81,11 +81,9 @@ def plot_lyapunov(
     if frame.ylim:
         bottom.set_ylim(*style.check_range("ylim", frame.ylim))
     style.label_axes(bottom, x=labels.parameter_label(part[diagram.parameter]))
-    style.caption(top, diagram.caption)
-    style.legend_above(fig, [*diagram.handles(), *low_handles])
     fig.align_ylabels([top, bottom])
-    style.finish(fig)
-    fig.data = with_diagram(data, diagram.draw([pixels.Panel(top, tuple(range(len(diagram.view.layers))))]))
+    style.complete(fig, top, diagram.caption, [*diagram.handles(), *low_handles])
+    fig.data = with_diagram(data, diagram.draw([pixels.Panel(top, diagram.layers)]))
     return fig
 
 

@@ -82,11 +82,8 @@ def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = st
     title = f"branch {branch}, period {int(ds['orbit_period'][branch])}"
     fixed = labels.caption(ds, with_start=False)
     style.caption(ax, style.join([title, fixed, f"{missing} beyond |μ| = {MOST:g}" if missing else ""]))
-    bar = fig.colorbar(points, ax=ax, pad=0.015, aspect=32)
-    bar.outline.set_linewidth(style.LINE_PT)
     label = labels.swept_label(str(ds.attrs["parameter"]), str(ds.attrs["parameter_units"]))
-    bar.set_label(label, fontsize=fig.look.label)
-    bar.ax.tick_params(labelsize=fig.look.tick, width=style.LINE_PT, labelfontfamily=style.FONT)
+    style.style_bar(fig, fig.colorbar(points, ax=ax, pad=0.015, aspect=32), label)
     if frame.compact:
         style.legend_below(fig, handles)
     elif handles:

@@ -12,6 +12,7 @@ import xarray as xr
 
 from pipeline.layout import vocabulary
 from pipeline.plots.motions import Motions, motion_codes, motions_of
+from pipeline.products.reporting import track
 
 DRAWN = (vocabulary.PERIODIC, vocabulary.BOUNDED, vocabulary.INFERRED)
 ABSENT = {
@@ -80,7 +81,7 @@ class View:
         """Yield loaded parts of the cube, each at most some tens of megabytes."""
         needed = {*self.names, "status", *(("section", "turns") if self.motions.told else ())}
         part = self.ds[[name for name in self.ds.data_vars if name in needed]]
-        for selection in selections(self.ds[self.names[0]]):
+        for selection in track(list(selections(self.ds[self.names[0]])), "reading the cube"):
             yield part.isel(selection).load()
 
     def points(self, block: xr.Dataset) -> Points:

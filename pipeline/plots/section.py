@@ -12,6 +12,7 @@ import xarray as xr
 from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.absent import absent_handles, say_empty
+from pipeline.plots.bifurcation import fixed_of
 from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
 from pipeline.plots.motions import Motions
 from pipeline.plots.points import View, make_view, survey
@@ -52,9 +53,8 @@ def plot_section(
     Returns
     -------
     DataFigure
-        Up to `pixels.MARKER_LIMIT` points are markers, more are counted on pixels that are the darker the
-        more there are. Its `data` hold the points, as `pipeline.plots.pixels.draw_points` says; ``x`` and
-        ``y`` are the states in the order given.
+        Up to `pixels.MARKER_LIMIT` points are markers, more are counted on pixels. Its `data` hold the
+        points, as `pipeline.plots.pixels.draw_points` says; ``x`` and ``y`` are the states.
 
     Raises
     ------
@@ -70,20 +70,18 @@ def plot_section(
     ax = fig.add_subplot()
     style.style_axes(ax)
     style.limits(ax, frame, *(_range(r, m) for r, m in zip((found.x, found.y), measures, strict=True)))
-    labels.angle_ticks(ax, measures[0], "x", 8.0)
-    labels.angle_ticks(ax, measures[1], "y")
+    for axis, m in zip("xy", measures, strict=True):
+        labels.angle_ticks(ax, m, axis, 8.0)
     style.label_axes(ax, measures[0].label, measures[1].label)
-    style.caption(ax, labels.caption(part))
     if found.empty:
         say_empty(ax, found, "in these ranges")
-    style.legend_above(fig, [*_handles(view, {code for _, code in found.classes}), *absent_handles(found)])
-    style.finish(fig)
+    handles = [*_handles(view, {code for _, code in found.classes}), *absent_handles(found)]
+    style.complete(fig, ax, labels.caption(part), handles)
     diameter = float(np.clip(260.0 / np.sqrt(max(view.n_points, 1)), _LEAST_PT, _MOST_PT))
     data = pixels.draw_points([pixels.Panel(ax, (0,))], view, diameter)
     for axis, m in zip("xy", measures, strict=True):
         data[axis].attrs = {"units": m.unit, "long_name": m.name}
-    fixed = {str(k): v.variable for k, v in part.coords.items() if not v.ndim and v.dtype.kind == "f"}
-    fig.data = data.assign_coords(fixed).assign_attrs(title="stroboscopic section")
+    fig.data = data.assign_coords(fixed_of(part)).assign_attrs(title="stroboscopic section")
     return fig
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -196,6 +197,13 @@ def few_ticks(ax: Axes, x: int = 4, y: int = 4) -> None:
     ax.yaxis.set_major_locator(MaxNLocator(y))
 
 
+def style_bar(figure: DataFigure, bar: Colorbar, text: str) -> None:
+    """Give a bar of colours the common lines and fonts, and its label."""
+    bar.outline.set_linewidth(LINE_PT)
+    bar.ax.tick_params(labelsize=figure.look.tick, width=LINE_PT, labelfontfamily=FONT)
+    bar.set_label(text, fontsize=figure.look.label)
+
+
 def label_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
     """Write the labels of the axes."""
     size = look_of(ax).label
@@ -241,6 +249,13 @@ def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | No
         frameon=False, fontsize=size, handletextpad=0.35, columnspacing=1.1, borderpad=0.1, handlelength=1.4,
         borderaxespad=0.1,
     )  # fmt: skip
+
+
+def complete(figure: DataFigure, ax: Axes, text: str, handles: Sequence[Any] = ()) -> None:
+    """Write the line above the axes and a legend above all, and `finish`."""
+    caption(ax, text)
+    legend_above(figure, handles)
+    finish(figure)
 
 
 def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:

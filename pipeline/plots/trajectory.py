@@ -79,10 +79,8 @@ def plot_trajectory(
         handles += _draw_path(path, ds, drawing, Motion(series, section, "0.35"))
     if frame.xlim:
         axes[-1].set_xlim(*style.check_range("xlim", frame.xlim))
-    style.caption(axes[0], _place(ds))
-    style.legend_above(fig, handles)
     fig.align_ylabels(axes)
-    style.finish(fig)
+    style.complete(fig, axes[0], _place(ds), handles)
     if path is not None:
         equalise(path)
     return fig
@@ -226,6 +224,8 @@ def _draw_others(ax: Axes, ds: xr.Dataset, time: np.ndarray, names: Sequence[str
     unit = str(ds[names[0]].attrs.get("units", ""))
     style.label_axes(ax, y=labels.with_unit(", ".join(symbols), unit))
     if len(names) > 1:
+        low, high = ax.get_ylim()
+        ax.set_ylim(low, high + 0.22 * (high - low))  # room for the legend
         ax.legend(loc="upper right", ncols=len(names), fontsize=style.look_of(ax).tick - 1.0, borderpad=0.2,
                   handlelength=1.0, framealpha=0.8, edgecolor="none", columnspacing=0.8,
                   handletextpad=0.3)  # fmt: skip

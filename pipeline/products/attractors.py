@@ -77,9 +77,9 @@ HYSTERESIS = Analysis(
     "hysteresis",
     "Say where a continuation meets other attractors going up than going down, and where it jumps.",
     AttractorOptions,
-    compute=f"{_ROOM}:hysteresis",
+    compute="pipeline.analysis.attractors.hysteresis_product:hysteresis",
     table="pipeline.analysis.attractors.hysteresis_table:hysteresis_table",
-    needs=f"{_ROOM}:needs_directions",
+    needs="pipeline.analysis.attractors.hysteresis_product:needs_directions",
     builds_on=("attractors",),
     figure="attractors",
 )
@@ -90,7 +90,7 @@ SETTLING = Analysis(
 
     This integrates, for minutes if there are many sets. Lifetimes are in drive periods.""",
     SettlingOptions,
-    compute=f"{_ROOM}:settling",
+    compute="pipeline.analysis.attractors.settling_product:settling",
     table="pipeline.analysis.attractors.settling_table:settling_table",
     builds_on=("attractors",),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-from pipeline.spec.problems import SpecError
+from pipeline.spec.problems import SpecError, unknown_name
 
 
 def find_spec(name: str | Path) -> Path:
@@ -22,8 +22,7 @@ def find_spec(name: str | Path) -> Path:
     shipped = shipped_workflows()
     if str(name) in shipped:
         return shipped[str(name)]
-    known = f"shipped workflows: {', '.join(shipped)}" if shipped else "no workflows are shipped"
-    raise SpecError([f"{name}: no such file, and no shipped workflow of that name ({known})."])
+    raise SpecError([f"{name}: no such file; {unknown_name('workflow', str(name), shipped)}"])
 
 
 def shipped_workflows() -> dict[str, Path]:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.spec.parsing import Spec, load_spec, parse_spec
-from pipeline.spec.problems import SpecError
-from pipeline.spec.starts import GridStarts, RandomStarts, degrees_key, state_of_key
+from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.spec.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
 from pipeline.spec.tables import FREQUENCY, Range
 
 MARK = "(zoom)"
@@ -152,6 +152,10 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
             "zoom: nothing to change; give a range such as --axis NAME=LOW:HIGH, or --at frequency_hz=2.2."
         ]
     names = [_state(spec, key) or key for key in keys]
+    known = (FREQUENCY, *state_keys(spec.model), *spec.model.parameter_names)
+    unknown = [f"zoom: {unknown_name('axis', key, known)}" for key in keys if key not in known]
+    if unknown:
+        return unknown
     problems = [f"{n}: is changed twice; keep one." for n in dict.fromkeys(names) if names.count(n) > 1]
     for key, (low, high) in changes.ranges.items():
         if not low < high:

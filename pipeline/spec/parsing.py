@@ -266,15 +266,11 @@ def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: lis
 
 
 def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
-    """Return the valid axes, the frequency first, the others by name; what is not valid leaves problems.
-
-    The order in the file does not count: ``run.json`` does not keep it, and all that read it must agree.
-    """
+    """Return the valid axes in the order of the file; what is not valid leaves problems."""
     if not _is_table(data, "axes", problems):
         return {}
     axes = {n: _validate(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
-    order = sorted(axes, key=lambda name: (name != FREQUENCY, name))
-    return {name: axis for name in order if (axis := axes[name]) is not None}
+    return {name: axis for name, axis in axes.items() if axis is not None}
 
 
 def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Starts | None:

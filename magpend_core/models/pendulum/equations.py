@@ -24,7 +24,7 @@ import math
 from typing import Any, NamedTuple
 
 from magpend_core.engine.jit import inline
-from magpend_core.engine.simd import absolute, maximum, sqrt
+from magpend_core.engine.simd import absolute, maximum, multiply_add, sqrt
 from magpend_core.engine.vecmath import LOG2_E, TWO_OVER_PI, TWO_PI, atan, exp2_falling, sin, wrapped
 
 VACUUM_PERMEABILITY = 1.25663706212e-6  # N/A2, CODATA 2018
@@ -170,16 +170,17 @@ def magnet_moment(psi1: Any, psi_rel: Any, k: Any) -> Any:
     v1 = (psi1 + (k.p1 * psi_rel + k.r1)) * k.per_c1
     u2 = (psi_rel + k.beta2) * k.per_gamma2
     v2 = (psi1 + (k.p2 * psi_rel + k.r2)) * k.per_c2
-    half_f1 = k.half_alpha1 * exp2_falling(-(u1 * u1 + v1 * v1))
-    half_f2 = k.half_alpha2 * exp2_falling(-(u2 * u2 + v2 * v2))
+    bump1 = exp2_falling(-multiply_add(u1, u1, v1 * v1))
+    half_f2 = k.half_alpha2 * exp2_falling(-multiply_add(u2, u2, v2 * v2))
     step = TWO_OVER_PI * atan(k.eps_mag * (psi1 - (k.m * psi_rel + k.n)))
-    return (half_f1 - half_f2) * step + (half_f1 + half_f2)
+    difference = multiply_add(k.half_alpha1, bump1, -half_f2)
+    return difference * step + multiply_add(k.half_alpha1, bump1, half_f2)
 
 
 @inline
 def fitted_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
     """Generalised torques (Q1, Q2) [N m] of the fitted magnet force (Eq. 20)."""
-    dx = k.l1 * s1 + k.l2 * s2
+    dx = multiply_add(k.l1, s1, k.l2 * s2)
     dy = k.h - k.l1 * c1 - k.l2 * c2
     moment = magnet_moment(psi1, psi2 - psi1, k)
     slope = dy * dx / (dx * dx + k.delta2)  # Fy/Fx
@@ -189,7 +190,7 @@ def fitted_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: 
 @inline
 def dipole_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
     """Generalised torques (Q1, Q2) [N m] of the point-dipole force (Eq. 16)."""
-    dx = k.l1 * s1 + k.l2 * s2
+    dx = multiply_add(k.l1, s1, k.l2 * s2)
     dy = k.h - k.l1 * c1 - k.l2 * c2
     r2 = dx * dx + dy * dy
     per_length = k.strength / (r2 * sqrt(r2))
@@ -231,11 +232,11 @@ def _loads_and_components(a1: Any, a2: Any, f: Any, k: Any) -> Any:
     along_a = f.sine * a2
     across_a = f.cosine * a2
     along1 = f.along10 - along_a
-    across1 = f.across10 + (k.m1_e1_m2_l1 * a1 + across_a)
+    across1 = f.across10 + multiply_add(k.m1_e1_m2_l1, a1, across_a)
     along2 = f.along0 - along_a
-    across2 = f.across0 + (k.m2_l1 * a1 + across_a)
-    load1 = sqrt(along1 * along1 + across1 * across1)
-    load2 = sqrt(along2 * along2 + across2 * across2)
+    across2 = f.across0 + multiply_add(k.m2_l1, a1, across_a)
+    load1 = sqrt(multiply_add(along1, along1, across1 * across1))
+    load2 = sqrt(multiply_add(along2, along2, across2 * across2))
     return load1, load2, along1, across1, along2, across2
 
 
@@ -250,9 +251,14 @@ def _newton_change(r1: Any, r2: Any, loads_there: Any, effect: Any, f: Any, k: A
     # change of the loads along (r1, r2); weightless joints have load 0 and no gradient
     sine = f.sine * r2
     cosine = f.cosine * r2
-    change1 = (across1 * (k.m1_e1_m2_l1 * r1 + cosine) - along1 * sine) / maximum(load1, 1e-290)
-    change2 = (across2 * (k.m2_l1 * r1 + cosine) - along2 * sine) / maximum(load2, 1e-290)
-    return r1 + (p11 * change1 + p12 * change2), r2 + (p21 * change1 + p22 * change2)
+    turned1 = multiply_add(k.m1_e1_m2_l1, r1, cosine)
+    turned2 = multiply_add(k.m2_l1, r1, cosine)
+    change1 = multiply_add(across1, turned1, -(along1 * sine)) / maximum(load1, 1e-290)
+    change2 = multiply_add(across2, turned2, -(along2 * sine)) / maximum(load2, 1e-290)
+    return (
+        r1 + multiply_add(p11, change1, p12 * change2),
+        r2 + multiply_add(p21, change1, p22 * change2),
+    )
 
 
 @inline
@@ -260,13 +266,13 @@ def _solve_implicit(a1_free: Any, a2_free: Any, effect: Any, f: Any, k: Any) -> 
     """Solve a = a_free + P N(a), where N are the bearing loads, by two Newton steps from a_free."""
     p11, p12, p21, p22 = effect
     there = _loads_and_components(a1_free, a2_free, f, k)
-    r1 = p11 * there[0] + p12 * there[1]
-    r2 = p21 * there[0] + p22 * there[1]
+    r1 = multiply_add(p11, there[0], p12 * there[1])
+    r2 = multiply_add(p21, there[0], p22 * there[1])
     change1, change2 = _newton_change(r1, r2, there, effect, f, k)
     a1, a2 = a1_free + change1, a2_free + change2
     there = _loads_and_components(a1, a2, f, k)
-    r1 = (a1_free - a1) + (p11 * there[0] + p12 * there[1])
-    r2 = (a2_free - a2) + (p21 * there[0] + p22 * there[1])
+    r1 = (a1_free - a1) + multiply_add(p11, there[0], p12 * there[1])
+    r2 = (a2_free - a2) + multiply_add(p21, there[0], p22 * there[1])
     change1, change2 = _newton_change(r1, r2, there, effect, f, k)
     return a1 + change1, a2 + change2
 
@@ -279,20 +285,21 @@ def solve_accelerations(
 
     `torque1` and `torque2` [N m] are the drive plus Q1, and Q2.
     """
-    s12 = s1 * c2 - c1 * s2
-    c12 = c1 * c2 + s1 * s2
+    # sums of two products say which is fused (see `simd.multiply_add`): the bits depend on it
+    s12 = multiply_add(s1, c2, -(c1 * s2))
+    c12 = multiply_add(c1, c2, s1 * s2)
     w1w1 = w1 * w1
     w2w2 = w2 * w2
     v2 = w2 - w1
     g1 = stribeck(w1, k)
     g2 = stribeck(v2, k)
-    r2 = k.T2 * g2 + k.viscous2 * v2
-    b1 = torque1 - (k.N12 * s12) * w2w2 - k.M1 * s1 - (k.T1 * g1 + k.viscous1 * w1) + r2
+    r2 = multiply_add(k.T2, g2, k.viscous2 * v2)
+    b1 = torque1 - (k.N12 * s12) * w2w2 - k.M1 * s1 - multiply_add(k.T1, g1, k.viscous1 * w1) + r2
     b2 = torque2 + (k.N12 * s12) * w1w1 - k.M2 * s2 - r2
     n12 = k.N12 * c12
     per_det = 1.0 / (k.B1_B2 - n12 * n12)
-    a1_free = (k.B2 * b1 - n12 * b2) * per_det
-    a2_free = (k.B1 * b2 - n12 * b1) * per_det
+    a1_free = multiply_add(k.B2, b1, -(n12 * b2)) * per_det
+    a2_free = multiply_add(k.B1, b2, -(n12 * b1)) * per_det
     # a = a_free + P N(a): what a load of one newton does to the accelerations
     u1 = (k.mu * per_det) * g1
     u2 = (k.mu * per_det) * g2
@@ -302,10 +309,10 @@ def solve_accelerations(
     p22 = -((k.B1 + n12) * u2)
     # the loads of `loads`, split into what does and does not depend on the accelerations
     m2e2w2w2 = k.m2_e2 * w2w2
-    along0 = k.m2_g * c1 + k.m2_l1 * w1w1 + m2e2w2w2 * c12
-    across0 = k.m2_g * s1 + m2e2w2w2 * s12
-    along10 = along0 + (k.m1_g * c1 + k.m1_e1 * w1w1)
-    across10 = across0 + k.m1_g * s1
+    along0 = multiply_add(m2e2w2w2, c12, multiply_add(k.m2_l1, w1w1, k.m2_g * c1))
+    across0 = multiply_add(m2e2w2w2, s12, k.m2_g * s1)
+    along10 = along0 + multiply_add(k.m1_e1, w1w1, k.m1_g * c1)
+    across10 = multiply_add(k.m1_g, s1, across0)
     effect = (p11, p12, p21, p22)
     terms = _LoadTerms(along0, across0, along10, across10, k.m2_e2 * s12, k.m2_e2 * c12)
     return _solve_implicit(a1_free, a2_free, effect, terms, k)

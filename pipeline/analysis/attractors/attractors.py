@@ -3,8 +3,9 @@
     ds = pipeline.open_run(directory)
     found = identify(ds)                 # integrates: Newton's method on one point per orbit
     named = match(found, threshold=0.3)  # does not; repeat it with other options
-    loops = hysteresis(ds, named)        # continuation in both directions
-    stay = lifetimes(ds, named)          # integrates: which bounded sets are transients, and how long
+
+What more there is to say of them is told by `hysteresis.hysteresis` (a continuation in both directions) and
+`lifetimes.lifetimes` (integrates: which bounded sets are transients, and how long).
 
 Schema
 ------
@@ -85,9 +86,7 @@ from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.deciding import DECISIONS
 from pipeline.analysis.attractors.features import ENERGY, Features
-from pipeline.analysis.attractors.hysteresis import hysteresis
 from pipeline.analysis.attractors.labelling import Found, conclude
-from pipeline.analysis.attractors.lifetimes import lifetimes
 from pipeline.analysis.attractors.matching import match
 from pipeline.analysis.attractors.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.attractors.searching import Search, search_all
@@ -97,7 +96,7 @@ from pipeline.layout.vocabulary import BOUNDED_SET, split_dims
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.chaos import ChaosOptions
 
-__all__ = ["hysteresis", "identify", "lifetimes", "match"]
+__all__ = ["identify", "match"]
 
 
 def identify(

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from pipeline.analysis.attractors.cells import Block
-from pipeline.analysis.attractors.orbits import Orbit
+from pipeline.analysis.attractors.orbits import Orbit, scaled_derivative
 from pipeline.analysis.sets import Geometry
 
 REACH = 0.3
@@ -36,10 +36,9 @@ class _Metric:
 
     @classmethod
     def of(cls, orbit: Orbit, geometry: Geometry) -> _Metric:
-        scales = np.asarray(geometry.scales)
-        matrix = orbit.derivative * scales[None, :] / scales[:, None]
+        matrix = scaled_derivative(orbit, geometry)
         slow = 0.5 * (1.0 + float(np.abs(orbit.multipliers).max()))
-        weight = solve_discrete_lyapunov((matrix / slow).T, np.eye(len(scales)))
+        weight = solve_discrete_lyapunov((matrix / slow).T, np.eye(len(matrix)))
         root = np.linalg.cholesky(0.5 * (weight + weight.T)).T
         moved = np.linalg.norm(root @ matrix @ np.linalg.inv(root), 2)
         return cls(root, matrix, float(moved))

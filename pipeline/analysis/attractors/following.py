@@ -13,9 +13,10 @@ from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.attractors.cells import Block, ClosedCells, Guesses
 from pipeline.analysis.attractors.deciding import REACH, decide
-from pipeline.analysis.attractors.orbits import Orbit, distinct, number_of, polish
+from pipeline.analysis.attractors.orbits import Orbit, distinct, number_of, polish, scaled_derivative
 from pipeline.analysis.attractors.spirals import PER_PHASE, Recurrence, near_closed
 from pipeline.analysis.sets import Geometry
+from pipeline.products.reporting import report
 
 LEG = 64
 """Drive periods between two looks at where the cells are."""
@@ -170,6 +171,7 @@ def follow(
     going = np.ones(len(start), bool)
     for leg in range(n_legs):
         rows = np.flatnonzero((ends.orbit == ON_SET) & going)
+        report("running cells on", leg, n_legs)
         if not len(rows):
             break
         section, status, period = advance(rows)
@@ -227,7 +229,7 @@ def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np
         # where it is fast, nothing is gained
         if not 1.0 < growth < LEAP ** (orbit.period / LEG):
             continue
-        values, vectors = np.linalg.eig(orbit.derivative * scales[None, :] / scales[:, None])
+        values, vectors = np.linalg.eig(scaled_derivative(orbit, geometry))
         grows = np.abs(values) > 1.0
         values, onto = values[grows], np.linalg.inv(vectors)[grows].T
         n = 2 * int(np.log(LEAP) / np.log(growth) / 2)

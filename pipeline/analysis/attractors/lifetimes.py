@@ -17,8 +17,8 @@ at 95 %.
 Schema
 ------
 Dims: the *parameter dims* and ``attractor`` as in `attractors`; ``destination``, the
-attractors by their ids, then the orbits found here; ``new_orbit``; ``sample``, cells by rising hash
-of their sections; ``state``.
+attractors by their ids, then the orbits found here; ``new_orbit``, one at least; ``sample``, cells by
+rising hash of their sections; ``state``.
 
 ======================= ========================= ============= ===========================================
 variable                own dims                  dtype, fill   meaning
@@ -38,7 +38,7 @@ variable                own dims                  dtype, fill   meaning
                                                                 order of the start dims
 ``sample_destination``  attractor, sample         int32, -1     destination; -1 still on the set, -2 failed
 ``sample_periods``      attractor, sample         float64, NaN  time at risk [drive periods]
-``new_orbit_period``    new_orbit                 int32, 0      drive periods
+``new_orbit_period``    new_orbit                 int32, 0      drive periods; 0 for no orbit
 ``new_orbit_points``    new_orbit, state          float64, NaN  first section point
 ``new_orbit_multiplier``  new_orbit               float64, NaN  largest modulus
 ======================= ========================= ============= ===========================================
@@ -264,7 +264,7 @@ def _dataset(
     options: dict[str, Any],
 ) -> xr.Dataset:  # fmt: skip
     shape, n = tuple(attractors.sizes[d] for d in dims), attractors.sizes["attractor"]
-    n_new = max((len(c.new) for c in courses.values()), default=0)
+    n_new = max((len(c.new) for c in courses.values()), default=0) or 1
     sizes = {"destination": n + n_new, "sample": options["n_sample"], "new_orbit": n_new,
              "state": attractors.sizes["state"], "attractor": n}  # fmt: skip
     arrays = {

@@ -65,6 +65,12 @@ class Orbit:
         return float(10.0 * self.residual / max(np.abs(1.0 - self.multipliers).min(), 1e-6))
 
 
+def scaled_derivative(orbit: Orbit, geometry: Geometry) -> np.ndarray:
+    """Monodromy matrix for states in units of their scales."""
+    scales = np.asarray(geometry.scales)
+    return np.asarray(orbit.derivative * scales[None, :] / scales[:, None])
+
+
 def raw_orbit(points: np.ndarray, geometry: Geometry) -> Orbit:
     """Return the orbit of given section points as it is."""
     n = points.shape[1]

@@ -19,9 +19,10 @@ from pipeline.analysis.attractors.deciding import LOOSE_SHARE, STRICT, decide
 from pipeline.analysis.attractors.following import Engine, follow
 from pipeline.analysis.attractors.orbits import RUN_ON_RTOL, Orbit, distinct, number_of, polish, run_on
 from pipeline.analysis.attractors.points import Dynamics, Point
-from pipeline.analysis.attractors.spirals import MAX_GUESSES, RUN_ON_LEGS, near_closed, spirals_of
+from pipeline.analysis.attractors.spirals import MAX_GUESSES, RUN_ON_LEGS, beside, near_closed, spirals_of
 from pipeline.analysis.sets import Geometry, hashes
 from pipeline.products.attractors import IdentifyOptions
+from pipeline.products.reporting import report
 
 ROUNDS, ROUNDS_LOOSE = 3, 6
 """Most rounds of guessing and polishing, with a strict and a loose tolerance."""
@@ -103,6 +104,7 @@ def search_all(points: Mapping[tuple[int, ...], Point], search: Search) -> dict[
     answers: dict[tuple[int, ...], Any] = dict.fromkeys(searches)
     states: dict[tuple[int, ...], State] = {}
     while answers:
+        report("searching orbits", len(states), len(searches))
         asked: dict[tuple[int, ...], Guesses] = {}
         for index, answer in answers.items():
             try:
@@ -110,6 +112,7 @@ def search_all(points: Mapping[tuple[int, ...], Point], search: Search) -> dict[
             except StopIteration as stop:
                 states[index] = stop.value
         answers = _polish_together(asked, points, search)
+    report("searching orbits", len(states), len(searches))
     if search.options.polish:
         _run_spirals(states, points, search)
     return states
@@ -271,4 +274,6 @@ def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses
         # the period seen may be half the true one, and the orbit an unstable one: the future tells
         own = closed.guesses.least(MAX_GUESSES)
         own = own.followed_by(own.without_period())
+    if len(near.key):
+        own = own.followed_by(beside(orbits, search.longest, search.geometry))
     return own.followed_by(near.least(MAX_GUESSES))

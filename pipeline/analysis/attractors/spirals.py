@@ -9,11 +9,13 @@ it. Both make guesses for Newton's method; and what no orbit accounts for then i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.analysis.attractors.cells import Guesses, marks_of
+from pipeline.analysis.attractors.orbits import Orbit, scaled_derivative
 from pipeline.analysis.sets import Geometry, hashes
 
 NEAR = 0.05
@@ -33,6 +35,9 @@ SAME_LAG = 1.5
 
 MAX_GUESSES = 64
 """Most guesses per parameter point from cells that are not closed."""
+
+SLOWLY, BESIDE = 1.2, (0.005, 0.01, 0.02, 0.04, 0.08)
+"""Largest multiplier of an unstable orbit beside which others are looked for, and scaled distances there."""
 
 RUN_ON_LEGS = 32
 """How long spirals are run on, in legs of `following.LEG` drive periods."""
@@ -130,6 +135,32 @@ def _guesses(
     decade = np.floor(np.log10(np.maximum(score, 1e-12))).astype(np.int64)
     rows = np.concatenate([period[:, None], decade[:, None], geometry.boxes(point, NEAR)], axis=1)
     return Guesses(hashes(rows), score, mark, point, period).best()
+
+
+def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Guesses:
+    """Guesses of the orbits that sprang from unstable ones, along their unstable directions.
+
+    A cell that left an orbit which lost its stability a little way back goes on to the one that took its
+    place: of twice the period where the multiplier is below -1, of the same where it is above 1.
+    """
+    points, periods = [], []
+    for orbit in orbits:
+        values, vectors = np.linalg.eig(scaled_derivative(orbit, geometry))
+        k = int(np.abs(values).argmax())
+        period = orbit.period * (1 if values[k].real > 0.0 else 2)
+        if not 1.0 < np.abs(values[k]) < SLOWLY or values[k].imag != 0.0 or period > max_period:
+            continue
+        direction = vectors[:, k].real / np.abs(vectors[:, k].real).max()
+        for size in BESIDE:
+            points += [
+                orbit.points[0] + sign * size * direction * np.asarray(geometry.scales) for sign in (1, -1)
+            ]
+            periods += [period, period]
+    if not points:
+        return Guesses.none(len(geometry.scales))
+    point, period_of = np.array(points), np.array(periods, np.int64)
+    mark = hashes(np.concatenate([period_of[:, None], geometry.boxes(point, 1e-6)], axis=1))
+    return Guesses(mark, np.zeros(len(mark)), mark, point, period_of).best()
 
 
 def spirals_of(section: np.ndarray, max_period: int, side: float, geometry: Geometry) -> Guesses:

@@ -140,7 +140,8 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dic
         words["side"] = distinct(r["side"] for r in rows)
     words |= {**ranges(ds, rows, dims), "cells": str(sum(r["n_cells"] for r in rows))}
     words["letter"] = letter(rows[0]["attractor_id"])
-    words["id rests on"] = _evidence([r["match_basis"] for r in rows if "match_basis" in r])
+    if "match_basis" in rows[0]:
+        words["id rests on"] = _evidence([r["match_basis"] for r in rows])
     if "fraction" in rows[0]:
         words["max share"] = largest_share(ds, rows, dims)
     if "mirror_partner" in rows[0]:

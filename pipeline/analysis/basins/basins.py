@@ -6,35 +6,24 @@ Reads the cube and the ids of its attractors, integrates nothing.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.boundaries import Scaling, basin_entropy, uncertainty_exponent
-from pipeline.analysis.basins.labels import check_confidence, check_resamples
-from pipeline.analysis.basins.numbers import Interval, basin_fractions
-from pipeline.analysis.basins.wada import Metric, wada_merge_test
+from pipeline.analysis.basins.boundaries import basin_entropy, uncertainty_exponent
+from pipeline.analysis.basins.numbers import basin_fractions
+from pipeline.analysis.basins.wada import wada_merge_test
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import split_dims
+from pipeline.products.basins import BasinOptions
 
 DIVERGED = -2
 """Label of the cells that diverged: an outcome like an attractor. -1 is no outcome."""
 
 
 def basins(
-    ds: xr.Dataset,
-    ids: xr.Dataset,
-    *,
-    interval: Interval = "wilson",
-    confidence: float = 0.95,
-    box: int = 5,
-    block: int = 1,
-    scaling: Scaling = "perturbation",
-    radius: int = 1,
-    metric: Metric = "taxicab",
-    resamples: int = 200,
-    seed: int = 0,
+    ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = None, **changes: Any
 ) -> xr.Dataset:
     """Basins of attraction at each parameter point of a sweep, and their numbers.
 
@@ -44,18 +33,12 @@ def basins(
         Cube of a sweep.
     ids
         Result of `match` for it, or of `identify`.
-    interval, confidence
-        Method and level of the intervals of the fractions, see `basin_numbers.binomial_interval`; the
-        level also of the bootstrap intervals.
-    box, block
-        Side of the boxes of the basin entropy [cells], side of the squares of boxes that its bootstrap
-        draws; see `basin_boundaries.basin_entropy`.
-    scaling
-        Method of `basin_boundaries.uncertainty_exponent`.
-    radius, metric
-        Of the Wada test [cells], see `basin_wada.wada_merge_test`.
-    resamples, seed
-        Of the bootstraps.
+    options
+        By default those of `BasinOptions`. For the intervals see `numbers.binomial_interval`, for the boxes
+        `boundaries.basin_entropy`, for the scaling `boundaries.uncertainty_exponent`, for the radius and the
+        metric `wada.wada_merge_test`.
+    changes
+        Fields of the options, instead of `options`.
 
     Returns
     -------
@@ -78,10 +61,7 @@ def basins(
     ValueError
         If the cube is a continuation, or an option is out of bounds.
     """
-    check_basin_options(
-        interval=interval, confidence=confidence, box=box, block=block, scaling=scaling, radius=radius,
-        metric=metric, resamples=resamples,
-    )  # fmt: skip
+    options = options or BasinOptions(**changes)
     check_starts(ds)
     dims, start_dims = split_dims(ids["attractor_id"])
     cells = ids[["attractor_id", "decision", "status"]].drop_dims("attractor", errors="ignore")
@@ -89,38 +69,27 @@ def basins(
     labels = outcomes(ids)
     fractions = basin_fractions(
         labels, dims=start_dims, ids=ids["attractor"].values.tolist(),
-        inferred=ids["status"] == vocabulary.INFERRED, confidence=confidence, method=interval,
+        inferred=ids["status"] == vocabulary.INFERRED, confidence=options.confidence, method=options.interval,
     )  # fmt: skip
     result = result.assign(fractions.data_vars).assign(_unfinished(ids, start_dims))
     result = result.assign_coords(label=fractions["label"])
     reason = _no_grid(ds, start_dims)
     points = _Points(dims, tuple(ids.sizes[d] for d in dims))
     if not reason:
-        common: dict[str, Any] = {"resamples": resamples, "confidence": confidence, "seed": seed}
         for index in np.ndindex(*points.shape):
             grid = labels.isel(dict(zip(dims, index, strict=True))).values
-            for number in _boundary(grid, box, block, scaling, radius, metric, common, points.missing):
+            for number in _boundary(grid, options, points.missing):
                 points.add(index, *number)
         result = result.assign(points.variables())
     reasons = "\n".join([reason] if reason else sorted(points.missing))
-    about = {"basin_interval": interval, "basin_confidence": confidence, "basin_box": box,
-             "basin_block": block, "basin_scaling": scaling, "basin_radius": radius,
-             "basin_metric": metric, "basin_resamples": resamples, "basin_seed": seed}  # fmt: skip
+    about = {f"basin_{name}": getattr(options, name) for name in _OWN}
     return result.assign_attrs({**ids.attrs, **about, "not_computed": reasons})
 
 
-def check_basin_options(**options: Any) -> None:
-    """Refuse options that no cube allows."""
-    check_confidence(options["confidence"])
-    check_resamples(options["resamples"])
-    for name, least in (("box", 2), ("block", 1), ("radius", 1)):
-        if options[name] < least:
-            raise ValueError(f"{name} = {options[name]} is out of bounds: it must be {least} or more.")
-    for name, words in (("interval", Interval), ("scaling", Scaling), ("metric", Metric)):
-        if options[name] not in get_args(words):
-            raise ValueError(
-                f"{name} = {options[name]!r}: must be {' or '.join(map(repr, get_args(words)))}."
-            )
+_OWN = (
+    "interval", "confidence", "box", "block", "scaling", "radius", "metric", "resamples", "seed",
+)  # fmt: skip
+"""Options that are not those of the attractors."""
 
 
 def check_starts(ds: xr.Dataset) -> None:
@@ -230,15 +199,13 @@ class _Points:
         return found
 
 
-def _boundary(
-    grid: np.ndarray, box: int, block: int, scaling: Scaling, radius: int, metric: Metric,
-    common: dict[str, Any], missing: set[str],
-) -> Iterator[tuple[str, Any]]:  # fmt: skip
+def _boundary(grid: np.ndarray, options: BasinOptions, missing: set[str]) -> Iterator[tuple[str, Any]]:
     """Numbers on the boundaries of one grid of labels, by name."""
     if not (grid != -1).any():
         return
+    common: dict[str, Any] = {name: getattr(options, name) for name in ("resamples", "confidence", "seed")}
     try:
-        entropy = basin_entropy(grid, box, block=block, **common)
+        entropy = basin_entropy(grid, options.box, block=options.block, **common)
     except ValueError as error:
         missing.add(f"basin entropy: {error}")
     else:
@@ -247,7 +214,7 @@ def _boundary(
         if np.isfinite(entropy["boundary_entropy_low"]):
             yield "above_ln2_surely", int(entropy["above_ln2_surely"])
     try:
-        exponent = uncertainty_exponent(grid, method=scaling, **common)
+        exponent = uncertainty_exponent(grid, method=options.scaling, **common)
     except ValueError as error:
         missing.add(f"uncertainty exponent: {error}")
     else:
@@ -256,7 +223,7 @@ def _boundary(
         yield "exponent_r_squared", float(exponent["r_squared"])
         yield "uncertain", exponent["uncertain"]
     if np.unique(grid[grid != -1]).size >= 3:
-        wada = wada_merge_test(grid, radius, metric=metric, **common).isel(radius=0)
+        wada = wada_merge_test(grid, options.radius, metric=options.metric, **common).isel(radius=0)
         yield from _with_errors(wada, "wada_beyond", "beyond")
         yield "wada_distance", float(wada["hausdorff_distance"])
         yield "wada", int(wada["wada"])

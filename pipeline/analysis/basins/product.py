@@ -24,6 +24,5 @@ def basins(run: Any, options: BasinOptions) -> xr.Dataset:
     """Basins of a sweep: cells, fractions, boundaries."""
     from pipeline.analysis.basins.basins import basins as compute
 
-    shared = options.part(AttractorOptions)
-    own = {name: value for name, value in options.plain().items() if name not in shared}
-    return compute(run.cube(), run.derive("attractors", **shared), **own)
+    found = run.derive("attractors", **options.part(AttractorOptions))
+    return compute(run.cube(), found, options)

@@ -17,6 +17,7 @@ import xarray as xr
 from pipeline.analysis.chaos.sections import FLOOR, Floats, at_least, computed, geometry_of, with_coords
 from pipeline.analysis.sets import Geometry
 from pipeline.products.lyapunov import LyapunovFlag
+from pipeline.products.reporting import track
 
 
 def kaplan_yorke_dimension(
@@ -188,7 +189,7 @@ def correlation_dimension(
     ordered = section.transpose(*kept, *pool, "period_index", "state")
     shape = tuple(section.sizes[d] for d in kept)
     found = {}
-    for index in np.ndindex(*shape):
+    for index in track(list(np.ndindex(*shape)), "correlation sums"):
         values = ordered[index].values
         values = values.reshape(-1, *values.shape[-2:])
         known = values[np.isfinite(values).all(axis=(1, 2))]

@@ -156,14 +156,13 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
         exponents).
     """
     known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != FAILED)
-    first = ds["lyapunov_blocks"].isel(exponent=0, drop=True)
     attrs = {
         "units": "1", "long_name": "the chaos ended within the blocks",
         "flag_values": np.arange(-1, 2, dtype=np.int8), "flag_meanings": "unknown no yes",
     }  # fmt: skip
-    quarter = first.sizes["block"] // 4
-    if first.sizes["block"] < FEWEST_BLOCKS:
+    if ds.sizes.get("block", 0) < FEWEST_BLOCKS:
         return xr.full_like(known, -1, dtype=np.int8).assign_attrs(attrs)
+    first, quarter = ds["lyapunov_blocks"].isel(exponent=0, drop=True), ds.sizes["block"] // 4
     early, late = first.isel(block=slice(quarter)), first.isel(block=slice(-quarter, None))
     before, after = early.mean("block"), late.mean("block")
     error = np.sqrt((early.var("block", ddof=1) + late.var("block", ddof=1)) / quarter)

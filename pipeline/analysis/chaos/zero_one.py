@@ -9,6 +9,7 @@ from scipy import fft
 
 from pipeline.analysis.chaos.sections import FLOOR, Floats, at_least, computed, geometry_of, with_coords
 from pipeline.analysis.sets import Geometry
+from pipeline.products.reporting import report
 
 BUDGET = 64 * 2**20
 """Bytes that a step of the 0-1 test holds at once."""
@@ -97,6 +98,7 @@ def zero_one_test(
     measures = np.full((6, len(phi)), np.nan)
     step = max(1, BUDGET // (16 * n * n_frequencies))
     for begin in range(0, len(phi), step):
+        report("0-1 test", begin, len(phi))
         rows = slice(begin, begin + step)
         measures[:, rows] = _zero_one(phi[rows], c)
     table = {

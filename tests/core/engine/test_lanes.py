@@ -342,6 +342,25 @@ def test_engine__same_bits_on_other_cpus(straight, run_python, tmp_path, cpu):
     assert digest == expected
 
 
+CACHED = """
+import hashlib
+import numpy as np
+from magpend_core import run_branches
+packed, frequency, starts = (np.load("many.npz")[k] for k in ("packed", "frequency", "starts"))
+found = run_branches(packed, frequency, starts, n_transient=7, n_keep=3, rtol=1e-7, atol=1e-7)
+print(hashlib.sha256(found.section.tobytes() + found.n_steps.tobytes()).hexdigest())
+"""
+
+
+def test_engine__same_bits_when_read_from_the_compile_cache(straight, run_python, tmp_path):
+    # a process that compiles runs its callees as they were compiled alone, one that reads the cache
+    # those that were optimised once more as parts of the whole
+    packed, frequency, starts = many()
+    np.savez(tmp_path / "many.npz", packed=packed, frequency=frequency, starts=starts)
+    expected = hashlib.sha256(straight.section.tobytes() + straight.n_steps.tobytes()).hexdigest()
+    assert [run_python(CACHED).strip() for _ in range(2)] == [expected] * 2
+
+
 def test_run_branches__continues_bit_for_bit():
     # over many frequencies, because the rounding of the drive's phase differs among them
     packed, frequency, starts = many(200)

@@ -84,7 +84,7 @@ def test_extremes__of_the_pendulum_are_those_of_its_dense_output():
         mean = np.trapezoid(values, dx=1.0 / 40_000, axis=0)
         expected = np.stack([values.min(axis=0), values.max(axis=0), mean], axis=1)
         error = abs(found.extremes[0, k] - expected) / scale[:, None]
-        assert error[:-1].max() < 1e-5
+        assert error[:-1].max() < 1e-4
         assert error[-1].max() < 1e-3
         assert error[:, MEAN].max() < 1e-7
 
@@ -147,7 +147,7 @@ def test_extremes__of_failed_cells_are_nan():
     [
         (
             ("enrgy", "speed"),
-            r"duffing has no 'enrgy', 'speed'; did you mean energy\? It has x, v, energy_in",
+            r"duffing has no 'enrgy', 'speed'; did you mean energy\? It has x, v, energy, power_in",
         ),
         ("energy", r"one string; give a sequence of names: \['energy'\]"),
     ],

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.attractors.attractors import hysteresis, identify, match
+from pipeline.analysis.attractors.attractors import identify, match
+from pipeline.analysis.attractors.hysteresis import hysteresis
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 K = 16

@@ -11,9 +11,9 @@ import xarray as xr
 from scipy.stats import chi2
 
 from magpend_core import load_preset, sections
-from pipeline.analysis.attractors.attractors import identify, lifetimes, match
+from pipeline.analysis.attractors.attractors import identify, match
 from pipeline.analysis.attractors.following import LEG, ON_SET, follow
-from pipeline.analysis.attractors.lifetimes import lifetime_interval
+from pipeline.analysis.attractors.lifetimes import lifetime_interval, lifetimes
 from pipeline.analysis.attractors.orbits import Orbit
 from pipeline.analysis.sets import Geometry
 

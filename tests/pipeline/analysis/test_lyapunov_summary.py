@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.collections import PolyCollection
+from matplotlib.legend import Legend
 
 from magpend_core import Status, load_preset, lyapunov_exponents
 from magpend_core.orbits import stroboscopic_map
@@ -39,9 +40,11 @@ def make_cube(rates, *, stderr=0.02, n_exponents=4, blocks=8, **dims):
             "exponent": np.arange(1, n_exponents + 1),
             "frequency": dims["frequency"],
         },
+        attrs={"model": "pendulum", "parameters": PARAMETERS},
     )
 
 
+PARAMETERS = "\n".join(f"{k} = {v!r}" for k, v in load_preset().items())
 FREQUENCY = np.array([1.0, 2.0, 4.0])
 
 
@@ -67,12 +70,16 @@ def test_summarise__running_means_end_at_the_mean(cube):
 def test_summarise__motion(cube):
     cube["status"][2, 1] = Status.PERIODIC
     cube["lyapunov_flag"][0, 1] = 4
-    found = summarise(cube).motion.values
-    # 1.0 and 0.6 are both positive, 0.01 is within three errors, and a closed orbit is regular
+    cube["status"][1, 0] = Status.PERIODIC
+    summary = summarise(cube)
+    found = summary.motion.values
+    # 1.0 and 0.6 are both positive; 0.01 is within three errors, which is regular where the orbit closed; a
+    # cell that closed with a positive exponent is not
+    assert summary.contradicts.values.tolist() == [[0, 0], [0, 0], [0, 1]]
     assert found.tolist() == [
         [Motion.HYPERCHAOTIC, Motion.UNKNOWN],
-        [Motion.UNDECIDED, Motion.REGULAR],
-        [Motion.HYPERCHAOTIC, Motion.REGULAR],
+        [Motion.REGULAR, Motion.REGULAR],
+        [Motion.HYPERCHAOTIC, Motion.UNDECIDED],
     ]
     assert summarise(cube.isel(exponent=slice(1))).motion.values[0, 0] == Motion.CHAOTIC
     cube["lyapunov_flag"][0, 0] = 3  # only the first exponent is resolved
@@ -168,7 +175,7 @@ def artists(fig, gid):
 
 def test_plot_lyapunov__points_are_the_largest_exponents(cube):
     fig = plot_lyapunov(cube)
-    (line,) = artists(fig, "exponent:right")  # psi1 = psi2 = 0.3
+    (line,) = artists(fig, "exponent:2")  # right: psi1 = psi2 = 0.3
     drawn = sorted(zip(line.get_xdata(), line.get_ydata(), strict=True))
     expected = sorted(
         (f, v) for f, row in zip(FREQUENCY, cube.lyapunov.values[..., 0], strict=True) for v in row
@@ -182,9 +189,7 @@ def test_plot_lyapunov__points_are_the_largest_exponents(cube):
 
 def test_plot_lyapunov__bands_are_one_error_wide_and_joined(cube):
     cube["lyapunov"][0, 1, 0] = 0.97
-    (band,) = [
-        a for a in artists(plot_lyapunov(cube), "band:exponent:right") if isinstance(a, PolyCollection)
-    ]
+    (band,) = [a for a in artists(plot_lyapunov(cube), "band:exponent:2") if isinstance(a, PolyCollection)]
     spans = {(round(p.vertices[:, 1].min(), 9), round(p.vertices[:, 1].max(), 9)) for p in band.get_paths()}
     assert (0.95, 1.02) in spans  # 1.0 and 0.97 overlap
     assert (-0.32, -0.28) in spans
@@ -198,17 +203,17 @@ def test_plot_lyapunov__spectrum_per_period(cube):
         assert sorted(line.get_ydata()) == pytest.approx(
             sorted((cube.lyapunov.values[..., k] / FREQUENCY[:, None]).ravel())
         )
-    assert fig.axes[1].get_ylabel() == "exponents [1/drive period]"
+    assert fig.axes[1].get_ylabel() == "exponents [1/period]"
     assert fig.data["exponent_value"].attrs["per"] == "drive period"
 
 
 def test_plot_lyapunov__flagged_cells_are_open(cube):
     cube["lyapunov_flag"][1, 1] = 2
     fig = plot_lyapunov(cube)
-    (line,) = artists(fig, "flagged:exponent:right")
+    (line,) = artists(fig, "flagged:exponent:2")
     assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([2.0], pytest.approx([-0.3]))
     assert line.get_markerfacecolor() == "none"
-    assert "flagged" in [t.get_text() for t in fig.axes[1].get_legend().get_texts()]
+    assert "flagged" in [t.get_text() for legend in fig.findobj(Legend) for t in legend.get_texts()]
 
 
 def test_plot_lyapunov__mistakes(cube):
@@ -219,7 +224,7 @@ def test_plot_lyapunov__mistakes(cube):
     two = make_cube(np.zeros((2, 2)), frequency=[1.0, 2.0], q=[1.0, 1.5])
     with pytest.raises(ValueError, match="choose a value first"):
         plot_lyapunov(two)
-    assert plot_lyapunov(two, at={"q": 1.4}).data.sizes == {"frequency": 2, "exponent": 1}
+    assert plot_lyapunov(two, at={"q": 1.5}).data["exponent_value"].sizes == {"frequency": 2, "exponent": 1}
 
 
 def test_plot_lyapunov_map__the_largest_over_the_cells():

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 from magpend_core import load_preset
-from pipeline.analysis.attractors.portraits import magnet_path, portraits
+from pipeline.analysis.attractors.portraits import portraits
 
 ORBITS = json.loads((Path(__file__).parents[2] / "core" / "data" / "orbits.json").read_text("utf-8"))
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
@@ -35,7 +35,7 @@ def attractors():
             "attractor_points": ((*per, "point", "state"), points),
         },
         coords={"frequency": [2.0, 2.2], "state": STATES, "attractor": [0, 1, 2]},
-        attrs={"parameters": "q = 1.543"},
+        attrs={"parameters": "\n".join(f"{k} = {v!r}" for k, v in load_preset().items())},
     )
 
 
@@ -64,24 +64,15 @@ def test_portraits__velocities_are_those_of_the_angles(attractors):
     assert np.abs(rate - orbit[1:-1, 2:]).max() < 2e-2
 
 
-def test_magnet_path__geometry():
-    """Hanging straight down, link 1 or both horizontal, and folded upwards."""
-    p = load_preset()
-    l1, l2 = p.as_dict()["l1"], p.as_dict()["l2"]
-    quarter = np.pi / 2
-    states = np.array([[0, 0], [quarter, 0], [quarter, quarter], [0, np.pi], [-quarter, 0]], float)
-    expected = [[0, -l1 - l2], [l1, -l2], [l1 + l2, 0], [0, l2 - l1], [-l1, -l2]]
-    np.testing.assert_allclose(magnet_path(np.c_[states, 0 * states], p), expected, atol=1e-12)
-
-
 def test_portraits__magnet_and_fixed_magnet(attractors):
     p = load_preset()
     found = portraits(attractors, at={"frequency": 2.2}, parameters=p, n_periods=1)
-    assert found.attrs["fixed_magnet_y"] == -p.as_dict()["h"]
-    x = found["magnet"].sel(axis="x").values
+    assert found["fixed"].sel(fixed_place="fixed magnet", axis="y") == -p["h"]
+    x = found["points"].sel(place="magnet", axis="x").values
     # the reference orbits are one-sided: right, left
     assert (x[0] > 0).all()
     assert (x[1] < 0).all()
+    assert found["points"].attrs["units"] == "m"
 
 
 def test_portraits__bad_input(attractors):

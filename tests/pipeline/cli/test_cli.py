@@ -163,7 +163,10 @@ def test_run__status__verify__plot(main, write_spec, walk_text, tmp_path):
     code, out, _ = main("run", "spec.toml", "--smoke", "--workers", "0", "--plot")
     assert code == 0
     assert "cube: runs/spec-smoke/cube.zarr" in out
-    assert out.splitlines()[-1] == "figure: runs/spec-smoke/figures/bifurcation_psi1.png"
+    assert out.splitlines()[-2:] == [
+        "figure: runs/spec-smoke/figures/bifurcation_psi1.png",
+        "data: runs/spec-smoke/figures/bifurcation_psi1.nc",
+    ]
     directory = tmp_path / "runs" / "spec-smoke"
     assert (directory / "figures" / "bifurcation_psi1.png").stat().st_size > 0
 
@@ -176,7 +179,7 @@ def test_run__status__verify__plot(main, write_spec, walk_text, tmp_path):
     assert main("verify", directory)[0] == 0
     code, out, _ = main("plot", "bifurcation", directory, "--state", "psi2", "--degrees", "--format", "svg")
     assert code == 0
-    assert (directory / "figures" / "bifurcation_psi2.svg").read_text().startswith("<?xml")
+    assert (directory / "figures" / "bifurcation_psi2_degrees.svg").read_text().startswith("<?xml")
 
     code, _, err = main("plot", "bifurcation", directory, "--layout", "side", "--out", tmp_path / "a.pdf")
     assert code == 0

@@ -214,13 +214,13 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
     lines = attractors_table(ds).lines
     assert lines[0] == f"2 attractors at {n} parameter points"
     assert lines[1].split()[:3] == ["id", "kind", "periods"]
-    assert re.search(r"^  0 +closed orbit +1 +unknown +2 to 5 +7 +56 +1\.0000 at 2 Hz", lines[2])
-    assert re.search(r"^  1 +closed orbit +2 +unknown +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz", lines[3])
+    assert re.search(r"^  0 +closed orbit +1 +unknown +2 to 5 +7 +56 .*1\.0000 at 2 Hz", lines[2])
+    assert re.search(r"^  1 +closed orbit +2 +unknown +4 to 5 +3 +14 .*0\.8000 at 4\.5 Hz", lines[3])
     assert lines[4] == "all 70 cells belong to an attractor"
     cube = ds[["status"]].assign(n_periods=ds["status"])
     measured = basins_of(cube, ds)
     lines = basins_table(measured).lines
-    assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz", lines[3])
+    assert re.search(r"^  1 +4 to 5 +3 +14 .*0\.8000 at 4\.5 Hz", lines[3])
     assert lines[4] == "not computed: boundaries: the starts are no grid"
     assert not any("inferred" in line for line in lines)
     refined = ds["status"].where(cells == 0, 7).astype(np.int8).assign_attrs(flags)
@@ -229,7 +229,7 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
     assert [row["n_inferred"] for row in rows] == [row["n_cells"] * (row["label"] == 1) for row in rows]
     lines = basins_table(measured).lines
     assert lines[1].endswith("inferred cells")
-    assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz +14$", lines[3])
+    assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz.* 14$", lines[3])
 
 
 def test_analyse__run_without_attractors(main, write_spec, tmp_path):

@@ -208,6 +208,40 @@ def test_zoom__both_names_of_the_frequency(main, write_spec, sweep_text, tmp_pat
     assert "frequency_hz = 2.5" in (tmp_path / "b.toml").read_text()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--psi3", "0", "1"], "unknown axis 'psi3'; did you mean psi"),
+        (["--psi1-dg", "0", "1"], "unknown axis 'psi1_dg'; did you mean psi1_deg"),
+        (["--axis", "freqency=2:3"], "unknown axis 'freqency'; did you mean frequency_hz"),
+        (["--at", "qq=1"], "unknown axis 'qq'; did you mean q"),
+        (["--frequency", "2.1"], "no name with 2 numbers"),
+    ],
+    ids=" ".join,
+)
+def test_zoom__names_the_nearest(main, write_spec, sweep_text, tmp_path, arguments, sentence):
+    write_spec(sweep_text)
+    code, _, err = main("zoom", "spec.toml", *arguments, "--out", "a.toml")
+    assert code == Exit.REFUSED
+    assert sentence in err
+    assert not (tmp_path / "a.toml").exists()
+
+
+def test_run__names_the_nearest_workflow(main):
+    code, _, err = main("run", "quickstrt")
+    assert code == Exit.REFUSED
+    assert "did you mean quickstart?" in err
+
+
+def test_status__for_programs(main, made):
+    made.commit(0)
+    code, out, _ = main("status", made.info.directory, "--json")
+    assert code == 0
+    (found,) = json.loads(out)
+    assert found["complete"] is False
+    assert found["committed_cells"] == made.plan.cells_in(0)
+
+
 def test_simulate__states_by_their_own_names(main, tmp_path):
     code, _, err = main("simulate", "--model", "duffing", "--psi1", "1", "--no-figure")
     assert code == Exit.REFUSED

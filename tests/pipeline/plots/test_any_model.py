@@ -25,6 +25,7 @@ from pipeline.plots import (
     plot_regimes,
     plot_trajectory,
 )
+from pipeline.plots.labels import with_unit
 
 DUFFING = "\n".join(f"{k} = {v!r}" for k, v in load_model("duffing").load().as_dict().items())
 PENDULUM = "\n".join(f"{k} = {v!r}" for k, v in load_model("pendulum").load().as_dict().items())
@@ -207,11 +208,18 @@ def test_plot_branches__names_cover_no_line():
     names = [t for t in ax.texts if t.get_text() == "F1"]
     assert names
     for text in names:
-        # without the line that leads to it
+        text.get_window_extent()  # finds its place; what it returns also holds the line that leads to it
         box = Text.get_window_extent(text)
         for line in ax.get_lines():
             x, y = ax.transData.transform(np.asarray(line.get_xydata())).T
             assert not ((x > box.x0) & (x < box.x1) & (y > box.y0) & (y < box.y1)).any()
+
+
+@pytest.mark.parametrize(
+    ("unit", "label"), [("m/s2", "F [m/s²]"), ("1/(m2 s2)", "F [1/(m² s²)]"), ("1", "F"), ("N m", "F [N m]")]
+)
+def test_with_unit__powers_are_raised(unit, label):
+    assert with_unit("F", unit) == label
 
 
 def test_letter__same_as_in_tables():

@@ -201,10 +201,8 @@ def test_zoom__command(magpend, write_spec, sweep_text, tmp_path):
     ranges = ["--psi1-deg", -5, 35, "--num-psi1", 9, "--axis", "q=1.5:1.6:11", "--at", "frequency_hz=2.2"]
     found = magpend("zoom", path, *ranges, "--out", "zoom.toml")
     assert found.returncode == 0, found.stderr
-    assert found.stdout.splitlines() == [
-        "note: psi1_deg: -5 to 35 reaches beyond the old -30 to 30.",
-        "specification: zoom.toml",
-    ]
+    assert found.stdout == "specification: zoom.toml\n"
+    assert "note: psi1_deg: -5 to 35 reaches beyond the old -30 to 30." in found.stderr
     new = load_spec(tmp_path / "zoom.toml")
     assert (tmp_path / "zoom.toml").read_text().startswith("# Zoom. Derived from specification spec.toml.\n")
     assert len(new.initial_conditions.psi1_deg.array()) == 9

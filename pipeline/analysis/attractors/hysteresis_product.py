@@ -1,0 +1,26 @@
+"""Hysteresis as an analysis of a run (`pipeline.products.attractors`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import xarray as xr
+
+from pipeline.products.attractors import AttractorOptions
+
+if TYPE_CHECKING:
+    from pipeline.store.run import Run
+
+
+def needs_directions(run: Run, options: AttractorOptions) -> None:
+    """Refuse a run that is no continuation in both directions."""
+    from pipeline.analysis.attractors.hysteresis import check_directions
+
+    check_directions(run.cube())
+
+
+def hysteresis(run: Any, options: AttractorOptions) -> xr.Dataset:
+    """Loops, and jumps between attractors."""
+    from pipeline.analysis.attractors.hysteresis import hysteresis as compute
+
+    return compute(run.cube(), run.derive("attractors", **options.plain()))

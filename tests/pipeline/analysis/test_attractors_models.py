@@ -1,0 +1,123 @@
+"""Attractors of another model: two states, no angles, no words for its motions, other units."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magpend_core import load_model, sections
+from pipeline.analysis.attractors.attractors import identify, match
+from pipeline.analysis.attractors.lifetimes import lifetimes
+from pipeline.analysis.attractors.portraits import portraits
+from pipeline.analysis.attractors.settling_table import settling_table
+from pipeline.analysis.attractors.table import attractors_table
+from pipeline.analysis.basins.basins import basins
+from pipeline.analysis.chaos.chaos import chaos
+
+DUFFING = load_model("duffing")
+FREQUENCY = 1.0 / (2.0 * np.pi)
+
+
+def cube(preset, n, n_transient, n_keep, **overrides):
+    """Cells of a Duffing oscillator on a grid of starts, as a run stores them."""
+    parameters = DUFFING.load(preset, **overrides)
+    axis = np.linspace(-2.0, 2.0, n)
+    starts = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    found = sections(
+        parameters, FREQUENCY, starts, n_transient=n_transient, n_keep=n_keep, rtol=1e-9, atol=1e-9
+    )
+    dims = ("x_0", "v_0")
+    flags = {"flag_values": np.arange(3, dtype=np.int8), "flag_meanings": "pending periodic bounded"}
+    return xr.Dataset(
+        {
+            "section": ((*dims, "period_index", "state"), found.section.reshape(n, n, n_keep, 2)),
+            "status": (dims, found.status.reshape(n, n), flags),
+            "orbit_period": (dims, found.orbit_period.reshape(n, n)),
+            "n_periods": (dims, found.n_periods.reshape(n, n)),
+        },
+        coords={
+            "x_0": axis, "v_0": axis, "frequency": FREQUENCY, "state": ["x", "v"],
+            "state_units": ("state", ["m", "m/s"]),
+        },
+        attrs={
+            "model": "duffing", "rtol": 1e-9, "atol": 1e-9,
+            "parameters": "\n".join(f"{k} = {v!r}" for k, v in parameters.items()),
+        },
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def chaotic():
+    return cube("twin-well", 5, 200, 300)
+
+
+@pytest.fixture(scope="module")
+def strange(chaotic):
+    return identify(chaotic)
+
+
+@pytest.fixture(scope="module")
+def two():
+    return cube("twin-well-periodic", 6, 400, 16)
+
+
+def test_identify__chaos_without_angles(chaotic, strange):
+    """Grouping bounded sets took the largest difference of no rotations."""
+    assert strange["kind"].values.tolist() == [2]
+    assert strange["n_cells"].values.tolist() == [chaotic["status"].size]
+    # x(t) -> -x(t + T/2) maps the one attractor on itself
+    assert strange["mirror_partner"].values.tolist() == [0]
+    assert {"rotation", "side"}.isdisjoint(strange.data_vars)
+    assert strange["energy_min"].attrs["units"] == "J/kg"
+    text = "\n".join(attractors_table(match(strange)).lines)
+    assert "rotation" not in text
+    assert "side" not in text
+
+
+def test_identify__two_published_orbits(two):
+    """Section points and multipliers, DynamicalSystemsBase.jl, issue 139; recomputed independently."""
+    found = identify(two)
+    assert found["orbit_period"].values.tolist() == [1, 1]
+    points = found["attractor_points"].values[:, 0]
+    assert points == pytest.approx(
+        np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]]), abs=1e-9
+    )
+    multipliers = found["multiplier_real"].values + 1j * np.abs(found["multiplier_imag"].values)
+    assert multipliers == pytest.approx(np.full((2, 2), -0.226806 + 0.581567j), abs=1e-6)
+    assert found["mirror_partner"].values.tolist() == [1, 0]
+    assert found["mirror_distance"].values.max() < 1e-7
+    assert found["lyapunov_max"].values == pytest.approx(np.log(0.624230) * FREQUENCY, rel=1e-5)
+    fractions = basins(two, found)["fraction"].values
+    assert fractions.sum() == pytest.approx(1.0)
+
+
+def test_lifetimes__a_strange_attractor_stays(chaotic, strange):
+    stay = lifetimes(chaotic, strange, n_sample=8, n_periods=128)
+    assert stay["verdict"].values.tolist() == [1]
+    assert "attractor" in settling_table(stay.expand_dims("frequency")).lines[2]
+
+
+def test_chaos__by_the_zero_one_test(chaotic, strange):
+    found = chaos(chaotic, strange)
+    assert found["nature"].attrs["flag_meanings"].split()[found["nature"].item()] == "chaotic_by_test"
+    assert found["median_zero_one"].item() > 0.95
+    # 1.37 from 1e4 points
+    assert found["attractor_correlation"].item() == pytest.approx(1.35, abs=0.15)
+
+
+def test_portraits__of_a_model_without_a_drawing(strange):
+    found = portraits(strange, n_periods=2, n_samples=16)
+    assert found["orbit"].shape == (1, 33, 2)
+    assert "points" not in found
+
+
+def test_datasets__are_fit_for_netcdf(chaotic, strange, tmp_path):
+    stay = lifetimes(chaotic, strange, n_sample=2, n_periods=64)
+    for name, ds in (("found", strange), ("ids", match(strange)), ("stay", stay),
+                     ("chaos", chaos(chaotic, strange))):  # fmt: skip
+        ds.to_netcdf(tmp_path / f"{name}.nc", engine="scipy")
+        with xr.open_dataset(tmp_path / f"{name}.nc", engine="scipy") as stored:
+            assert set(stored.data_vars) == set(ds.data_vars)
+            if "state" in ds.coords:
+                assert stored["state"].values.tolist() == ["x", "v"]

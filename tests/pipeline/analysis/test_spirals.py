@@ -1,0 +1,99 @@
+"""Slow spirals: cells near a bifurcation that take thousands of periods to close are their orbit's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magpend_core import load_preset, sections
+from pipeline.analysis.attractors.attractors import identify
+from pipeline.analysis.attractors.following import LEG, leap
+from pipeline.analysis.attractors.lifetimes import lifetimes
+from pipeline.analysis.attractors.orbits import Orbit
+from pipeline.analysis.attractors.spirals import Recurrence, near_closed
+from pipeline.analysis.sets import Geometry
+
+LINE, PLANE = Geometry((False,), (1.0,)), Geometry((False, False), (1.0, 1.0))
+
+# first of 60 sections that the quickstart keeps: frequency [Hz], state, and the period of the orbit on which
+# the cell ends when 10 000 more periods are integrated at a tolerance of 1e-8
+SLOW = [
+    # towards an orbit of period 2 along its slow direction: multiplier 0.997
+    (2.505, [-0.0740135763700914, -0.13444506329073483, -2.2551534509947695, 3.0206773392734942], 2),
+    # away from the unstable orbit of period 1 that it doubled from: multiplier -1.0008
+    (2.505, [-0.05211619995973748, -0.1435603005423484, -2.199973439776495, 2.9784102827417676], 2),
+    # towards an orbit of period 1, alternating: multiplier -0.998
+    (2.5, [0.018175705957897026, 0.2091639911954814, -2.115042946702441, 2.879141966307841], 1),
+]
+
+
+def cell(frequency, state):
+    """One cell that did not close, as the quickstart keeps it."""
+    found = sections(
+        load_preset(), frequency, np.array([state]), n_transient=0, n_keep=60, rtol=1e-7, atol=1e-7
+    )
+    return xr.Dataset(
+        {
+            "section": (("initial_condition", "period_index", "state"), found.section),
+            "turns": (("initial_condition", "link"), found.turns),
+            "status": ("initial_condition", found.status),
+            "orbit_period": ("initial_condition", found.orbit_period),
+        },
+        coords={"frequency": frequency, "state": ["psi1", "psi2", "psi1_dot", "psi2_dot"]},
+        attrs={"rtol": 1e-7, "atol": 1e-7},
+    )
+
+
+@pytest.mark.parametrize(("frequency", "state", "period"), SLOW)
+def test_identify__a_slow_spiral_is_its_orbits(frequency, state, period):
+    ds = cell(frequency, state)
+    assert ds["status"].values.tolist() == [2]
+    found = identify(ds, parameters=load_preset())
+    assert found["kind"].values.tolist() == [1]
+    assert found["orbit_period"].values.tolist() == [period]
+    assert found["is_stable"].values.tolist() == [1]
+
+
+def test_lifetimes__a_slow_spiral_is_no_attractor():
+    """Named a bounded set, it is seen to be near its orbit from the start."""
+    ds = cell(*SLOW[0][:2])
+    named = identify(ds, parameters=load_preset(), polish=False)
+    assert named["kind"].values.tolist() == [2]
+    stay = lifetimes(ds, named, parameters=load_preset(), n_periods=128)
+    assert stay["verdict"].values.tolist() == [2]
+    assert stay["new_orbit_period"].values.tolist() == [2]
+
+
+def test_near_closed__the_period_at_which_sections_lie_nearest():
+    """Not the shortest at which they lie near: half the period leads to the orbit that doubled."""
+    n = np.arange(60)
+    section = np.stack([0.02 * (-1.0) ** n + 1e-4 * 0.999**n, np.zeros(60)], axis=-1)[None]
+    assert near_closed(section, 8, PLANE).period.tolist() == [2]
+
+
+def test_recurrence__a_rotating_spiral_contracts_to_its_centre():
+    """Sections turn by an angle that no short period divides; their mean shows the orbit."""
+    n = np.arange(64)
+    radius, angle = 0.3 * 0.99**n, 2.39996 * n
+    section = np.stack([1.0 + radius * np.cos(angle), 2.0 + radius * np.sin(angle)], axis=-1)[None]
+    found = Recurrence.of(section, 4, PLANE)
+    assert found.centred.tolist() == [1]
+    assert found.centre[0] == pytest.approx([1.0, 2.0], abs=0.05)
+    noise = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 64, 2))
+    assert Recurrence.of(noise, 4, PLANE).is_near.mean() < 0.05
+
+
+def test_leap__along_the_unstable_direction():
+    """x' = -1.0005 x doubles in 1386 steps; what does not follow the linear map stays."""
+    orbit = Orbit(np.zeros((1, 1)), np.array([-1.0005 + 0j]), 1e-12, np.array([[-1.0005]]))
+    n = np.arange(LEG)
+    follows = (1e-3 * (-1.0005) ** n)[:, None]
+    settles = (1e-3 * (-0.9995) ** n)[:, None]
+    states = leap(np.stack([follows, settles]), [orbit], LINE)
+    assert states[0, 0] == pytest.approx(2.0 * follows[-1, 0], rel=1e-3)
+    assert np.isnan(states[1, 0])
+    # a fast orbit is left alone, and so is a stable one
+    for multiplier in (-1.5, -0.9):
+        other = Orbit(np.zeros((1, 1)), np.array([multiplier + 0j]), 1e-12, np.array([[multiplier]]))
+        assert np.isnan(leap(follows[None], [other], LINE)).all()
