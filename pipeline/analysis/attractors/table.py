@@ -103,11 +103,11 @@ def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
             at = dict(zip(dims, index, strict=True))
             where = where_of(ds, at)
             here = [row for row in rows if all(row[k] == v for k, v in where.items())]
-            lines += heading(ds, where) + aligned([_attractor_words(row) for row in here])
+            lines += heading(ds, where) + aligned([_attractor_words(row, n_points) for row in here])
     return lines + cell_counts(ds, start_dims)
 
 
-def _attractor_words(row: Row) -> dict[str, str]:
+def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
     turns = [v for k, v in row.items() if k.startswith("rotation_")]
     decided = ", ".join(f"{n} {k[3:].replace('_', ' ')}" for k, n in row.items() if k.startswith("by_") and n)
     words = {
@@ -124,7 +124,10 @@ def _attractor_words(row: Row) -> dict[str, str]:
         words["share"] = with_interval(row)
     if "mirror_partner" in row:
         words["mirror"] = str(row["mirror_partner"]) if row["mirror_partner"] >= 0 else "-"
-    return words | {"letter": letter(row["attractor_id"]), "decided": decided}
+    words["letter"] = letter(row["attractor_id"])
+    if n_points > 1 and "match_basis" in row:
+        words["id by"] = row["match_basis"].replace("_", " ")
+    return words | {"decided": decided}
 
 
 def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:

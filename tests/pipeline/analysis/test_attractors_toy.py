@@ -273,6 +273,17 @@ def test_match__rotation_tells_apart():
     assert match(ds)["attractor_id"].values.tolist() == [[0], [1]]
 
 
+def test_match__side_tells_apart():
+    """Left never takes the id of right; what is not known of a motion says nothing."""
+    ds = rows([0.0], [0.0])
+    dims = ("frequency", "attractor")
+    assert match(ds.assign(side=(dims, [[1], [2]])))["attractor_id"].values.tolist() == [[0], [1]]
+    unknown = match(ds.assign(side=(dims, [[1], [0]])))
+    assert unknown["attractor_id"].values.tolist() == [[0], [0]]
+    words = unknown["match_basis"].attrs["flag_meanings"].split()
+    assert [words[b] for b in unknown["match_basis"].values[:, 0]] == ["first_appearance", "distance"]
+
+
 def test_match__two_axes():
     one = rows([0.0, 1.0], [0.05, 0.95])
     two = xr.concat([one, one.isel(attractor=slice(None, None, -1))], "q").assign_coords(q=[1.0, 2.0])

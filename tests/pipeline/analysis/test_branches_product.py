@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.table import branches_table, curves_table
 from pipeline.products.reporting import reporting
 from pipeline.runs.derive import derive
@@ -54,6 +55,9 @@ def test_attractors__ids_through_the_cascade(directory):
     words = ds["match_basis"].attrs["flag_meanings"].split()
     assert {words[b] for b in basis[1:3, :2].ravel()} == {"doubling", "absent"}
     assert ds["kind"].values[3].tolist() == [0, 0, 2]
+    text = "\n".join(attractors_table(ds).lines)
+    assert "id by" in text
+    assert "first appearance" in text
 
 
 def test_branches__all_periods_or_a_line(directory):
