@@ -12,8 +12,8 @@ class IdentifyOptions(Options):
 
     tolerance: float = option(
         0.0,
-        "Scaled distance (1 rad, 10 rad/s) within which a closed cell belongs to an orbit; 0 takes ten times "
-        "the run's closure tolerance, at least 1e-4.",
+        "Distance, in units of the states' scales, within which a closed cell belongs to an orbit; 0 takes "
+        "ten times the run's closure tolerance, at least 1e-4.",
         ge=0.0,
     )
     polish: bool = option(True, "Refine orbits by Newton's method, which integrates a point per orbit.")

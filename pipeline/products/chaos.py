@@ -29,7 +29,7 @@ class DimensionOptions(SettlingOptions):
     at: dict[str, float] = option({}, "Value of a swept parameter; by default all its values.")
     theiler: int = option(1, "Pairs of sections at most so far apart in time are left out.", ge=0)
     n_max: int = option(10_000, "Most section points used of an attractor.", ge=100)
-    floor: float = option(1e-6, "Scaled distance (1 rad, 10 rad/s) that is not resolved.", gt=0.0)
+    floor: float = option(1e-6, "Distance, in units of the states' scales, that is not resolved.", gt=0.0)
 
 
 CHAOS = Analysis(

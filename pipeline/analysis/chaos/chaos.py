@@ -47,8 +47,8 @@ def chaos(
     Raises
     ------
     ValueError
-        If an option is out of bounds, the cube has neither exponents nor sections enough, or `attractors`
-        are those of another cube.
+        If an option is out of bounds, the cube has neither exponents nor sections enough and orbits are not
+        polished, or `attractors` are those of another cube.
     """
     options = options or ChaosOptions(**changes)
     if attractors["attractor_id"].sizes != ds["status"].sizes:
@@ -88,7 +88,8 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
     Raises
     ------
     ValueError
-        If an option is out of bounds, or the cube has neither exponents nor sections enough.
+        If an option is out of bounds, or the cube has neither exponents nor sections enough, and orbits are
+        not polished.
     """
     options = options or ChaosOptions(**changes)
     check_chaos(ds, options)
@@ -107,14 +108,14 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
 
 
 def check_chaos(ds: xr.Dataset, options: ChaosOptions) -> None:
-    """Refuse a cube that has nothing to say.
+    """Refuse a cube that has nothing to say: polished orbits have multipliers without it.
 
     Raises
     ------
     ValueError
         With all reasons.
     """
-    if len(missing := reasons(ds, options.stride)) == 2:
+    if len(missing := reasons(ds, options.stride)) == 2 and not options.polish:
         raise ValueError("nothing to compute. " + ". ".join(missing))
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def needs_chaos(run: Run, options: ChaosOptions) -> None:
-    """Refuse a cube that has neither exponents nor sections enough."""
+    """Refuse a cube that has neither exponents nor sections enough, unless orbits are polished."""
     from pipeline.analysis.chaos.chaos import check_chaos
 
     check_chaos(run.cube(), options)

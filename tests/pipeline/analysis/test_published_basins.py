@@ -166,8 +166,8 @@ def rest_fraction(bench, torques, n):
     ds = cube_of(result, bench.PENDULUM, 0.1, torque=torques)
     # not polished: at rest, steps that the trajectory alone controls grow too long for its tangents
     found = identify(ds, system=bench.PENDULUM, parameters=np.array([0.1, 0.0]), polish=False, tolerance=1e-3)
-    turning = np.abs(found["rotation"].isel(link=0)) > 0.1
-    at_rest = (found["kind"] == 1) & (np.abs(found["rotation"].isel(link=0)) < 1e-3)
+    turning = np.abs(found["rotation"].isel(angle=0)) > 0.1
+    at_rest = (found["kind"] == 1) & (np.abs(found["rotation"].isel(angle=0)) < 1e-3)
     assert ((found["kind"] == 0) | turning | at_rest).all()
     ids = found["attractor_id"]
     assert (ids >= 0).all()
