@@ -19,7 +19,14 @@ from pipeline.analysis.attractors.deciding import LOOSE_SHARE, STRICT, decide
 from pipeline.analysis.attractors.following import Engine, follow
 from pipeline.analysis.attractors.orbits import RUN_ON_RTOL, Orbit, distinct, number_of, polish, run_on
 from pipeline.analysis.attractors.points import Dynamics, Point
-from pipeline.analysis.attractors.spirals import MAX_GUESSES, RUN_ON_LEGS, beside, near_closed, spirals_of
+from pipeline.analysis.attractors.spirals import (
+    MAX_GUESSES,
+    RUN_ON_LEGS,
+    SPIRALS_PER,
+    beside,
+    near_closed,
+    spirals_of,
+)
 from pipeline.analysis.sets import Geometry, hashes
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.reporting import report
@@ -151,7 +158,7 @@ def _spirals(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
         label, _ = decide(block, orbits, search.tolerance, search.geometry)
         rest = block.section[block.is_bounded & (label < 0)]
         found = found.joined(spirals_of(rest, search.longest, search.tolerance, search.geometry))
-    return found.least(MAX_GUESSES)
+    return found.least(max(MAX_GUESSES, point.n_cells // SPIRALS_PER))
 
 
 def _polish_together(

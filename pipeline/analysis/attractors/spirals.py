@@ -36,6 +36,9 @@ SAME_LAG = 1.5
 MAX_GUESSES = 64
 """Most guesses per parameter point from cells that are not closed."""
 
+SPIRALS_PER = 20
+"""One cell in so many is run on at most, where that is more than `MAX_GUESSES`."""
+
 SLOWLY, BESIDE = 1.2, (0.005, 0.01, 0.02, 0.04, 0.08)
 """Largest multiplier of an unstable orbit beside which others are looked for, and scaled distances there."""
 
