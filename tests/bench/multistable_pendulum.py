@@ -160,7 +160,8 @@ def integrate(
 
     with ThreadPoolExecutor(threads) as pool:
         parts = list(pool.map(run, range(0, n, CHUNK)))
-    return Sections(**{k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0])})
+    known = [k for k, value in vars(parts[0]).items() if value is not None]
+    return Sections(**{k: np.concatenate([getattr(p, k) for p in parts]) for k in known})
 
 
 def classify(sections: Sections) -> np.ndarray:

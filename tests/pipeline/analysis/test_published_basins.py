@@ -38,7 +38,7 @@ def cube_of(result, system, frequency, **axis):
             "section": variable("section", "period_index", "state"),
             "status": variable("status"),
             "orbit_period": variable("orbit_period"),
-            "turns": variable("turns", "link"),
+            "turns": variable("turns", "angle"),
         },
         coords={**axis, "state": list(system.state_names), "frequency": frequency},
     )

@@ -25,16 +25,16 @@ def test_simulate__is_the_cores_trajectory(series):
     assert (series.psi1.values == expected[:, 0]).all()
     assert (series.psi2_dot.values == expected[:, 3]).all()
     # the high state lasts for duty_cycle = 0.4927 of a period
-    assert (series.torque.values[1:9] > 0).all()
-    assert (series.torque.values[11:19] < 0).all()
+    assert (series.drive_torque.values[1:9] > 0).all()
+    assert (series.drive_torque.values[11:19] < 0).all()
     assert all(series[name].attrs["units"] for name in (*series.data_vars, "time"))
 
 
 def test_write_series__csv_and_netcdf_read_back(series, tmp_path):
     table = np.genfromtxt(write_series(series, tmp_path / "a.csv"), delimiter=",", names=True)
-    assert table.dtype.names == (
-        "time_s", "psi1_rad", "psi2_rad", "psi1_dot_rad_per_s", "psi2_dot_rad_per_s", "torque_N_m",
-    )  # fmt: skip
+    states = ("psi1_rad", "psi2_rad", "psi1_dot_rad_per_s", "psi2_dot_rad_per_s")
+    assert table.dtype.names[:7] == ("time_s", *states, "energy_J", "power_in_W")
+    assert len(table.dtype.names) == 1 + len(series.data_vars)
     assert (table["psi1_rad"] == series.psi1.values).all()
     with xr.open_dataset(write_series(series, tmp_path / "a.nc"), engine="scipy") as read:
         assert read.attrs["frequency_hz"] == 2.2
