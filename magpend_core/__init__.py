@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from magpend_core.engine.lyapunov import LyapunovExponents, lyapunov_exponents
+    from magpend_core.lyapunov import LyapunovExponents, lyapunov_exponents
     from magpend_core.meaning import kernel_version
     from magpend_core.models import (
         ModelError,
@@ -61,7 +61,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "engine.lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
+    "lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
     "meaning": ("kernel_version",),
     "models": (
         "ModelError", "load_model", "load_preset", "model_names", "preset_names", "preset_provenance",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from magpend_core import LyapunovExponents, Status, lyapunov_exponents
-from magpend_core.engine.lyapunov import MOST_LOSS
+from magpend_core.lyapunov import MOST_LOSS
 from pipeline.compute.task import Job
 from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag, LyapunovOptions
 

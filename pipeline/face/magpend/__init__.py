@@ -25,7 +25,7 @@ _HOMES = {
     "magpend_core.sections": ("Sections", "run_branches", "sections"),
     "magpend_core.trajectory": ("trajectory",),
     "magpend_core.orbits": ("PeriodicOrbits", "polish_orbits"),
-    "magpend_core.engine.lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
+    "magpend_core.lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
     "magpend_core.engine.system": ("System",),
     "magpend_core.pointwise": ("evaluate", "jacobian", "rates"),
     "magpend_core.status": ("Status",),

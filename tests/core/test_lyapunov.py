@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from magpend_core import Status, jacobian, lyapunov_exponents, polish_orbits, sections
-from magpend_core.engine.lyapunov import MOST_LOSS
+from magpend_core.lyapunov import MOST_LOSS
 from magpend_core.orbits import stroboscopic_map
 
 UNIT_FREQUENCY = 0.5 / np.pi  # forcing cos t
