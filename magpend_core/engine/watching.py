@@ -4,7 +4,7 @@ Templates for the engine, see `lanes`. After an accepted step each quantity is k
 middle (from the pair's continuous extension) and its end: the parabola through the three gives the
 extremes within the step, Simpson's rule the integral. With a step h the error of an extreme is of
 order h^3, of order h^4 where the quantity is even about it; that of the mean is of order h^4. On the
-pendulum at a tolerance of 1e-9, in units of a quantity's range: 4e-6 and 6e-8, but 2e-4 for the peaks of
+pendulum at a tolerance of 1e-9, in units of a quantity's range: 2e-5 and 1e-7, but 2e-4 for the peaks of
 friction torques, which are hardly wider than a step; at 1e-5 a hundred times as much.
 
 States, steps and sections are the same, to the last bit, whether something is watched or not. A
