@@ -84,10 +84,10 @@ def closed_at(preset, frequency, **options):
 
 
 def test_sections__period_2_at_2_48_hz(preset):
-    found = closed_at(preset, 2.48)
-    assert (found.orbit_period == 2).sum() >= 10
-    assert np.isin(found.orbit_period, [0, 2]).all()
-    two = found.section[found.orbit_period == 2]
+    # chaotic transients before some of them last hundreds of periods, and depend on the last bit
+    found = closed_at(preset, 2.48, n_transient=3000)
+    assert (found.orbit_period == 2).all()
+    two = found.section
     assert (distance(two[:, :2], two[:, 2:]) < 1e-5).all()
     assert (distance(two[:, 0], two[:, 1]) > 1e-2).all()
     # an orbit twice as long as looked for is not closed
