@@ -36,7 +36,7 @@ _DOUBLE_WELL = {"damping": 0.2, "linear": -1.0, "cubic": 1.0, "amplitude": 0.3}
 _SOURCES = {
     "twin-well": (
         _DOUBLE_WELL,
-        "chaotic at 1/(2 pi) Hz: Guckenheimer and Holmes, Nonlinear Oscillations (1983), section 2.2",
+        "chaotic at 1/(2 pi) Hz: ChaosTools.jl, issue 301",
     ),
     "twin-well-periodic": (
         {**_DOUBLE_WELL, "damping": 0.15, "amplitude": 0.2},
