@@ -1,0 +1,1 @@
+"""The bench: recordings, the magnet torque, identification, measured beside computed diagrams."""

@@ -1,0 +1,1 @@
+"""The magnet torque: measured curves, their fit, a preset of it."""

@@ -1,0 +1,1 @@
+"""Recordings of a rig: files, their mapping to states, what is wrong with them, their rates."""
