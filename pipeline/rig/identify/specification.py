@@ -236,8 +236,8 @@ def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> t
         ]
         if one.window_s is not None and not one.window_s[0] < one.window_s[1]:
             problems.append(
-                f"recordings[{i}].window_s = {list(one.window_s)}: is empty; give [start, end] with the start "
-                "below the end [s]."
+                f"recordings[{i}].window_s = {list(one.window_s)}: is empty; give [start, end] with the "
+                "start below the end [s]."
             )
         if len(set(one.hold_out)) < len(one.hold_out):
             problems.append(f"recordings[{i}].hold_out: names a piece twice; name each once.")
