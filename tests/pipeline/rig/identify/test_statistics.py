@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-import ringdown
-
 from pipeline.rig.identify import statistics as st
 
-SCALE = ringdown.TRUTH
+SCALE = np.array([0.4, 6.0])
 
 
 @pytest.fixture
@@ -37,7 +32,7 @@ def test_eliminate_starts__bears_a_start_that_nothing_determines(rng):
     np.testing.assert_allclose(np.linalg.inv(information), np.linalg.inv(kept.T @ kept)[:3, :3], rtol=1e-10)
 
 
-def test_covariance_of__white_is_the_textbook_formula(rng):
+def test_covariance_of__white_is_the_textbook_formula(ringdown, rng):
     found = ringdown.fit(*ringdown.record(rng), noise=0.02)
     covariance = st.covariance_of(found.linear, SCALE, "white")
     j, r = found.jacobian, np.concatenate(found.residuals)
@@ -48,7 +43,7 @@ def test_covariance_of__white_is_the_textbook_formula(rng):
     assert covariance.inflation == pytest.approx(np.sqrt(variance))
 
 
-def test_covariance_of__pieces_is_the_jackknife_by_refits(rng):
+def test_covariance_of__pieces_is_the_jackknife_by_refits(ringdown, rng):
     """One step from the optimum against whole refits without a piece; equal but for curvature."""
     times, measured = ringdown.record(rng, noise=1e-4)
     found = ringdown.fit(times, measured)
@@ -70,7 +65,7 @@ def test_covariance_of__newey_west_is_the_double_sum(rng):
 
 
 @pytest.mark.parametrize("estimator", ["white", "pieces"])
-def test_covariance_of__a_prior_counts_as_it_says(rng, estimator):
+def test_covariance_of__a_prior_counts_as_it_says(ringdown, rng, estimator):
     """A prior far better than the data is what is left; one far worse changes nothing."""
     times, measured = ringdown.record(rng)
     sure = ringdown.fit(times, measured, noise=0.01, prior=(ringdown.TRUTH, np.array([1e-6, np.inf])))
@@ -120,7 +115,7 @@ def test_robust_weights__are_derivatives_of_the_loss(loss):
 
 
 @pytest.mark.parametrize("memory", [0.5, 0.9])
-def test_n_effective__of_autoregressive_noise(memory, rng):
+def test_n_effective__of_autoregressive_noise(ringdown, memory, rng):
     """n (1 - a)/(1 + a) of noise with the lag-1 correlation a."""
     _, noise = ringdown.record(rng, n_pieces=20, n=4000, noise=1.0, memory=memory)
     residuals = [m[:, None] for m in noise]
@@ -147,7 +142,7 @@ def test_pooled_autocorrelation__leaves_out_what_was_not_measured(rng):
     )  # fmt: skip
 
 
-def coverage(seeds: int, estimator=None, **rig) -> tuple[np.ndarray, set[str]]:
+def coverage(ringdown, seeds: int, estimator=None, **rig) -> tuple[np.ndarray, set[str]]:
     """Share of seeds whose interval holds the truth, by parameter."""
     inside, chosen = np.zeros(2), set()
     for seed in range(seeds):
@@ -158,23 +153,23 @@ def coverage(seeds: int, estimator=None, **rig) -> tuple[np.ndarray, set[str]]:
     return inside / seeds, chosen
 
 
-def test_coverage__white_noise_quantised_with_a_dead_band():
-    share, _ = coverage(200, noise=0.002, bits=12, dead_band=True)
+def test_coverage__white_noise_quantised_with_a_dead_band(ringdown):
+    share, _ = coverage(ringdown, 200, noise=0.002, bits=12, dead_band=True)
     assert ((share >= 0.92) & (share <= 0.98)).all(), share
 
 
 @pytest.mark.parametrize(("n_pieces", "n"), [(16, 120), (2, 1500)])
-def test_coverage__autocorrelated_noise(n_pieces, n):
+def test_coverage__autocorrelated_noise(ringdown, n_pieces, n):
     """Where residuals remember, intervals of independent ones are far too narrow; ours are not."""
     rig = {"n_pieces": n_pieces, "n": n, "memory": 0.9}
-    plain, _ = coverage(100, "white", **rig)
-    share, chosen = coverage(100, **rig)
+    plain, _ = coverage(ringdown, 100, "white", **rig)
+    share, chosen = coverage(ringdown, 100, **rig)
     assert chosen == {"pieces" if n_pieces > 2 else "newey-west"}
     assert (share >= 0.9).all(), share
     assert (plain < 0.9).any(), plain
 
 
-def test_linearised__counts_what_is_fitted(rng):
+def test_linearised__counts_what_is_fitted(ringdown, rng):
     found = ringdown.fit(*ringdown.record(rng, dead_band=True))
     linear = replace(found.linear, prior=np.array([1.0, 0.0]))
     assert linear.n_fitted == 1 + 20

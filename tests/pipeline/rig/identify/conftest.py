@@ -8,8 +8,10 @@ Parameters d and w; slopes by complex steps, which are exact to rounding.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from scipy.signal import lfilter
 
 from pipeline.rig.identify.statistics import Linearised, eliminate_starts
@@ -100,3 +102,10 @@ def record(rng, *, n_pieces=10, n=120, noise=0.01, memory=0.0, bits=None, dead_b
         times.append(t)
         measured.append(x)
     return times, measured
+
+
+@pytest.fixture(scope="session")
+def ringdown():
+    return SimpleNamespace(
+        TRUTH=TRUTH, motion=motion, slopes=slopes, fit=fit, linearise=linearise, record=record
+    )
