@@ -118,8 +118,8 @@ def _cut_off(signal: Signal) -> list[Finding]:
             if slope * length / 2.0 > CLIPPED_RISE * grain:
                 findings.append(signal.found(
                     "saturated", i, k, "warning",
-                    f"{length} samples stay at {level:.6g}, the extreme: the top looks cut off. State the sensor's "
-                    "range in the mapping.",
+                    f"{length} samples stay at {level:.6g}, the extreme: the top looks cut off. State the "
+                    "sensor's range in the mapping.",
                 ))  # fmt: skip
     return findings
 

@@ -18,6 +18,9 @@ MIXED = 1e-3
 GAP_STEPS = 1.5
 """Distance of two time stamps from which on there is a gap [sampling intervals]."""
 
+REPEATING = 0.01
+"""Share of equal neighbouring time stamps from which on they are coarser than the sampling."""
+
 EVEN = 0.01
 """Deviation of a time stamp from even steps that is not worth a word [sampling intervals]."""
 
@@ -50,7 +53,12 @@ class Clock:
 
 
 def clock_of(
-    stretches: Sequence[Mapping[str, Channel]], sampling_rate_hz: float | None, source: str
+    stretches: Sequence[Mapping[str, Channel]],
+    sampling_rate_hz: float | None,
+    source: str,
+    *,
+    numbers: np.ndarray | None = None,
+    apart: bool = False,
 ) -> Clock:
     """Put the channels of all stretches on one clock.
 
@@ -62,6 +70,11 @@ def clock_of(
         Stated by the mapping; goes before what the file states.
     source
         Name of the file, for messages.
+    numbers
+        (n,) of the samples of the first channel, one stretch after the other: a new piece begins where it
+        changes.
+    apart
+        Whether each stretch is a piece, even one that follows on the one before.
 
     Returns
     -------
@@ -85,8 +98,30 @@ def clock_of(
         taken.append(where)
         stamps.append(_stamps(first, stated)[begin:end] if len(first) else np.empty(0))
         findings += found
-    time, piece, own_step, found = _joined(stamps, step, stated, source)
+    stamps, cut = _one_after_another(_checked_stamps(stamps, step, source), step, findings)
+    begins = np.cumsum([0, *(len(s) for s in stamps)])[:-1]
+    forced = np.zeros(sum(map(len, stamps)), dtype=bool)
+    forced[begins] = apart or cut
+    if numbers is not None:
+        forced |= _changes(numbers, stretches, taken)
+    time, piece, own_step, found = _cut(np.concatenate(stamps) - stamps[0][0], forced, step, stated)
     return Clock(time, piece, own_step, taken, findings + found)
+
+
+def _changes(
+    numbers: np.ndarray,
+    stretches: Sequence[Mapping[str, Channel]],
+    taken: Sequence[Mapping[str, tuple[int, int]]],
+) -> np.ndarray:
+    """Samples on the clock from which on a file numbers a new piece."""
+    parts, first = [], 0
+    for channels, where in zip(stretches, taken, strict=True):
+        name, channel = next(iter(channels.items()))
+        begin, end = where[name]
+        parts.append(numbers[first + begin : first + end])
+        first += len(channel)
+    own = np.concatenate(parts)
+    return np.concatenate([[False], own[1:] != own[:-1]])
 
 
 def _stamps(channel: Channel, stated: float | None) -> np.ndarray:
@@ -103,7 +138,7 @@ def _step_of(channel: Channel) -> float:
         return channel.step_s
     steps = np.diff(channel.time)
     usual = float(np.median(steps))
-    if usual > 0.0 and np.mean(steps == 0.0) < 0.01:
+    if usual > 0.0 and np.mean(steps == 0.0) < REPEATING:
         return usual
     # stamps coarser than the sampling repeat: their mean, without the gaps
     mean = (channel.time[-1] - channel.time[0]) / len(steps)
@@ -181,17 +216,19 @@ def _start_findings(late: Mapping[str, float], step: float, all_known: bool) -> 
         if whole:
             findings.append(Finding(
                 "start", name, 0.0, 0.0, "warning",
-                f"begins {whole * step:.6g} s before the last channel to begin; its first {whole} samples are left out.",
+                f"begins {whole * step:.6g} s before the last channel to begin; its first {whole} "
+                "samples are left out.",
             ))  # fmt: skip
         if abs(rest) > EVEN:
             findings.append(Finding(
                 "start", name, 0.0, 0.0, "warning",
-                f"is sampled {abs(rest) * step:.3g} s {'after' if rest < 0.0 else 'before'} the others; it is laid "
-                "on their instants as it is.",
+                f"is sampled {abs(rest) * step:.3g} s {'after' if rest < 0.0 else 'before'} the others; "
+                "it is laid on their instants as it is.",
             ))  # fmt: skip
     if not all_known and any(late.values()):
         findings.append(Finding(
-            "start", "", 0.0, 0.0, "warning", "some channels do not say when they begin; with the last is assumed."
+            "start", "", 0.0, 0.0, "warning",
+            "some channels do not say when they begin; with the last is assumed.",
         ))  # fmt: skip
     return findings
 
@@ -201,39 +238,46 @@ def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> 
     return [
         Finding(
             "length", name, n_common * step, length * step, "warning",
-            f"has {length} samples where {', '.join(short)} ha{'s' if len(short) == 1 else 've'} {n_common}; the last "
-            f"{length - n_common} are left out.",
+            f"has {length} samples, {', '.join(short)} only {n_common}; the last {length - n_common} are "
+            "left out.",
         )
         for name, length in lengths.items() if length > n_common
     ]  # fmt: skip
 
 
-def _joined(
-    stamps: list[np.ndarray], step: float, stated: float | None, source: str
-) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
-    """Lay the stretches on one axis, cut them at gaps, and make time even within each piece."""
-    findings: list[Finding] = []
-    if any(not np.isfinite(s).all() for s in stamps) and all(np.isnan(s).all() for s in stamps):
-        stamps = [step * np.arange(len(s)) for s in stamps]
-    bad = [int(np.flatnonzero(~np.isfinite(s))[0]) for s in stamps if not np.isfinite(s).all()]
-    if bad:
-        raise SpecError(
-            [f"{source}: time stamp {bad[0]} is no number; give sampling_rate_hz instead of time."]
-        )
+def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[np.ndarray]:
+    """Return stamps that are numbers and rise; count from 0 where the file does not say when it began."""
+    if all(np.isnan(s).all() for s in stamps):
+        return [step * np.arange(len(s)) for s in stamps]
+    for s in stamps:
+        bad = np.flatnonzero(~np.isfinite(s))
+        if bad.size:
+            raise SpecError(
+                [f"{source}: time stamp {bad[0]} is no number; give sampling_rate_hz instead of time."]
+            )
     _refuse_backwards(stamps, source)
-    stamps = _one_after_another(stamps, step, findings)
-    time = np.concatenate(stamps) - stamps[0][0]
-    begins = np.cumsum([0, *(len(s) for s in stamps)])[:-1]
-    coarse = np.diff(time)
-    grain = float(coarse[coarse > 0.0].min(initial=step))
-    repeats = bool(np.mean(coarse == 0.0) >= 0.01)
-    is_gap = coarse > GAP_STEPS * step + (grain if repeats else 0.0)
-    is_gap[begins[1:] - 1] |= True
-    piece = np.concatenate([[0], np.cumsum(is_gap)]).astype(np.int64)
+    return stamps
+
+
+def _cut(
+    time: np.ndarray, forced: np.ndarray, step: float, stated: float | None
+) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
+    """Cut the samples at gaps and where it is asked for, and make time even within each piece."""
+    distance = np.diff(time)
+    # stamps coarser than the sampling repeat, and then leap by a grain of theirs
+    repeats = bool(np.mean(distance == 0.0) >= REPEATING) if distance.size else False
+    grain = float(distance[distance > 0.0].min(initial=np.inf)) if repeats else 0.0
+    is_gap = np.concatenate([[False], distance > GAP_STEPS * step + grain])
+    piece = np.cumsum(is_gap | np.concatenate([[False], forced[1:]])).astype(np.int64)
     even, own_step, residual = _even(time, piece, step, stated)
-    findings += _gap_findings(time, is_gap, begins, own_step)
-    findings += _jitter_findings(even, residual, own_step)
-    return even, piece, own_step, findings
+    findings = [
+        Finding(
+            "gap", "", float(time[i - 1]), float(time[i]), "warning",
+            f"{round((time[i] - time[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
+        )
+        for i in np.flatnonzero(is_gap)
+    ]  # fmt: skip
+    return even, piece, own_step, findings + _jitter_findings(even, residual, own_step)
 
 
 def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
@@ -244,30 +288,30 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
             raise SpecError(
                 [
                     f"{source}: time goes backwards after sample {i} ({s[i]:.9g} s, then {s[i + 1]:.9g} s; "
-                    f"{falling.size} times in all); give sampling_rate_hz instead of time if the samples are even, "
-                    "or cut the file there."
+                    f"{falling.size} times in all); give sampling_rate_hz instead of time if the "
+                    "samples are even, or cut the file there."
                 ]
             )
 
 
-def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Finding]) -> list[np.ndarray]:
-    """Shift stretches whose clock begins anew behind the one before, a step apart."""
+def _one_after_another(
+    stamps: list[np.ndarray], step: float, findings: list[Finding]
+) -> tuple[list[np.ndarray], bool]:
+    """Shift stretches whose clock begins anew behind the one before, a step apart; say whether any was."""
     placed = [stamps[0]]
     moved = 0
     for s in stamps[1:]:
         last = placed[-1][-1]
-        if s[0] > last:
-            placed.append(s)
-        else:
-            placed.append(s - s[0] + last + step)
-            moved += 1
+        anew = s[0] <= last
+        placed.append(s - s[0] + last + step if anew else s)
+        moved += anew
     if moved:
         findings.append(Finding(
             "pieces", "", math.nan, math.nan, "note",
-            f"the clock begins anew in {moved} of {len(stamps)} stretches; they are laid one after another, a "
-            "sampling interval apart. How far apart they were is not known.",
+            f"the clock begins anew in {moved} of {len(stamps)} stretches; they are laid one after another, "
+            "a sampling interval apart. How far apart they were is not known.",
         ))  # fmt: skip
-    return placed
+    return placed, moved > 0
 
 
 def _even(
@@ -292,23 +336,15 @@ def _even(
     return even - even[0], slope, time - even
 
 
-def _gap_findings(time: np.ndarray, is_gap: np.ndarray, begins: np.ndarray, step: float) -> list[Finding]:
-    own = set((begins[1:] - 1).tolist())
-    return [
-        Finding(
-            "gap", "", float(time[i]), float(time[i + 1]), "warning",
-            f"{round((time[i + 1] - time[i]) / step) - 1} samples are missing; a new piece begins.",
-        )
-        for i in np.flatnonzero(is_gap) if time[i + 1] - time[i] > GAP_STEPS * step or int(i) not in own
-    ]  # fmt: skip
-
-
 def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> list[Finding]:
     """Say how far stamps are from even steps, and where it is so far that samples change places."""
     worst, spread = float(np.abs(residual).max()), float(residual.std())
     if worst <= EVEN * step:
         return []
-    text = f"time stamps deviate from even steps of {step:.6g} s by {spread:.3g} s (standard deviation), {worst:.3g} s at most"
+    text = (
+        f"time stamps deviate from even steps of {step:.6g} s by {spread:.3g} s (standard deviation), "
+        f"{worst:.3g} s at most"
+    )
     if worst < UNEVEN * step:
         return [
             Finding("jitter", "", float(time[0]), float(time[-1]), "note", f"{text}; even steps are used.")
@@ -317,6 +353,7 @@ def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> lis
     return [
         Finding(
             "jitter", "", float(time[far[0, 0]]), float(time[far[-1, 1] - 1]), "warning",
-            f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it is read.",
+            f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it "
+            "is read.",
         )
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The mapping of a recording: which channel of the file is which quantity of the model, and how it is scaled."""
+"""The mapping of a recording: which channel of the file is which quantity, and how it is scaled."""
 
 from __future__ import annotations
 
@@ -67,6 +67,12 @@ class TimeMap(Table):
     unit: str = Field("s", description="Unit in the file.")
 
 
+class PieceMap(Table):
+    """``piece``: a channel that changes where a new piece begins."""
+
+    channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
+
+
 class CsvMap(Table):
     """``[csv]``: how the text is to be read where it is not to be found out."""
 
@@ -89,6 +95,7 @@ class Mapping(Table):
         None, description="By default by the suffix."
     )
     time: TimeMap | None = Field(None, description="Channel of time stamps.")
+    piece: PieceMap | None = Field(None, description="Channel with a number for each piece.")
     sampling_rate_hz: Positive | None = Field(None, description="Where the file does not state it [Hz].")
     window_s: Pair | None = Field(None, description="Part to be read [s since the first sample].")
     csv: CsvMap = Field(CsvMap(), description="How a text is read.")
@@ -179,7 +186,7 @@ def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
         if key not in Mapping.model_fields:
             problems.append(unknown_key(key, key, Mapping.model_fields))
             continue
-        kind = {"time": TimeMap, "csv": CsvMap}.get(key)
+        kind = {"time": TimeMap, "piece": PieceMap, "csv": CsvMap}.get(key)
         if kind is not None:
             found[key] = _checked(kind, value, key, problems)
             continue
@@ -259,13 +266,15 @@ def _unit_problems(path: str, entry: Scaled, wanted: str) -> list[str]:
     if known is None and kind is not None and kind != "s":
         choices = ", ".join(units.UNITS.get(wanted, {wanted: 1.0}))
         return [
-            f"{path}.unit = {entry.unit!r}: is not one of {wanted}; give one of {choices}, or another channel."
+            f"{path}.unit = {entry.unit!r}: is not one of {wanted}; give one of {choices}, or another "
+            "channel."
         ]
     if known is None and entry.scale is None:
         return [f"{path}.scale: missing; the unit {entry.unit!r} needs one, in {wanted} per {entry.unit}."]
     if known not in (None, 1.0) and entry.scale is not None and abs(entry.scale / known - 1.0) < 0.02:
         return [
-            f"{path}.scale = {entry.scale!r}: the unit {entry.unit!r} is converted already; drop scale, or unit."
+            f"{path}.scale = {entry.scale!r}: the unit {entry.unit!r} is converted already; drop "
+            "scale, or unit."
         ]
     return []
 

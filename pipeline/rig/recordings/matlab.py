@@ -47,7 +47,7 @@ def read_matlab(path: Path) -> Raw:
             _gather(name, value, leaves)
     step = _step(leaves)
     stretches = _stretches(path, leaves, step)
-    return Raw(path, "matlab", digest(path), stretches)
+    return Raw(path, "matlab", digest(path), stretches, apart=True)
 
 
 def _refuse_hdf5(path: Path) -> None:

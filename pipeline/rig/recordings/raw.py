@@ -59,6 +59,10 @@ class Raw:
         Channels by name; more than one where the file keeps recordings apart, such as the cells of MATLAB.
     findings : tuple of Finding
         What was wrong with the file itself.
+    simulated : bool
+        Whether the file says that nobody measured it.
+    apart : bool
+        Whether the stretches are pieces even if one follows on another.
     """
 
     path: Path
@@ -66,6 +70,8 @@ class Raw:
     sha256: str
     stretches: tuple[Mapping[str, Channel], ...]
     findings: tuple[Finding, ...] = ()
+    simulated: bool = False
+    apart: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:

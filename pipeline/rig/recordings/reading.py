@@ -52,20 +52,42 @@ def read_recording(
         sampling rates, or nothing is in the window.
     """
     chosen = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
-    file = Path(path)
-    raw = formats.read_raw(file, chosen.format, chosen.csv)
-    columns = _resolved(raw, chosen)
-    stretches = [_timed(raw, s, chosen, columns) for s in raw.stretches]
-    clock = clock_of(stretches, chosen.sampling_rate_hz, str(file))
-    findings = [*raw.findings, *clock.findings, *_unit_findings(raw, chosen, columns)]
+    raw = formats.read_raw(Path(path), chosen.format, chosen.csv)
+    return recording_of(raw, chosen, window_s=window_s)
+
+
+def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | None = None) -> xr.Dataset:
+    """Return what `read_recording` makes of a file that is read already.
+
+    Parameters
+    ----------
+    raw
+        All channels of a file.
+    mapping
+        What they are.
+    window_s
+        Part to be kept [s since the first sample]; goes before the mapping's.
+
+    Raises
+    ------
+    SpecError
+        As `read_recording` does.
+    """
+    columns = _resolved(raw, mapping)
+    stretches = [_timed(raw, s, mapping, columns) for s in raw.stretches]
+    numbers = None
+    if mapping.piece is not None:
+        numbers = np.concatenate([s[columns["piece"]].values for s in raw.stretches])
+    clock = clock_of(stretches, mapping.sampling_rate_hz, str(raw.path), numbers=numbers, apart=raw.apart)
+    findings = [*raw.findings, *clock.findings, *_unit_findings(raw, mapping, columns)]
     variables: dict[str, np.ndarray] = {}
-    for name in _entries(chosen):
+    for name in _entries(mapping):
         signal = checks.Signal(name, _joined(stretches, name, clock), clock.time, clock.piece)
-        variables[name], found = _converted(signal, chosen)
+        variables[name], found = _converted(signal, mapping)
         findings += found
-    _make_absolute(variables, chosen)
-    ds = _labelled(variables, clock, raw, chosen, findings)
-    part = window_s or chosen.window_s
+    _make_absolute(variables, mapping)
+    ds = _labelled(variables, clock, raw, mapping, findings)
+    part = window_s or mapping.window_s
     return ds if part is None else window(ds, part)
 
 
@@ -104,13 +126,14 @@ def _entries(mapping: Mapping) -> dict[str, Scaled]:
 
 
 def _resolved(raw: Raw, mapping: Mapping) -> dict[str, str]:
-    """Name in the file of each mapped channel, and of the time stamps under ``time``."""
+    """Name in the file of each mapped channel, and of ``time`` and ``piece`` if there are any."""
     wanted: dict[str, tuple[str, str | int]] = {
         name: (f"channels.{name}" if name != DRIVE else DRIVE, entry.channel)
         for name, entry in _entries(mapping).items()
     }
-    if mapping.time is not None:
-        wanted["time"] = ("time", mapping.time.channel)
+    for name, axis in (("time", mapping.time), ("piece", mapping.piece)):
+        if axis is not None:
+            wanted[name] = (name, axis.channel)
     found, problems = {}, []
     for name, (key, channel) in wanted.items():
         own = _name_of(channel, raw.names)
@@ -138,8 +161,8 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 def _timed(
     raw: Raw, stretch: AnyMapping[str, Channel], mapping: Mapping, columns: dict[str, str]
 ) -> dict[str, Channel]:
-    """Channels of a stretch by their names in the dataset, with the mapping's time stamps if it names some."""
-    chosen = {name: replace(stretch[own], name=name) for name, own in columns.items() if name != "time"}
+    """Channels of a stretch by their names in the dataset, with the time stamps that the mapping names."""
+    chosen = {name: replace(stretch[columns[name]], name=name) for name in _entries(mapping)}
     if mapping.time is None:
         return chosen
     scale = units.factor(mapping.time.unit, "s") or 1.0
@@ -224,4 +247,6 @@ def _labelled(
         "format": raw.format, "mapping": mapping.toml(), "model": mapping.model,
         "findings": to_json(findings), "magpend_version": metadata.version("magpend"),
     }  # fmt: skip
+    if raw.simulated:
+        attrs["simulated"] = 1
     return xr.Dataset(data, coords=coords, attrs=attrs)
