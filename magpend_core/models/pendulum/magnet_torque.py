@@ -28,7 +28,7 @@ FITTED = (
     "alpha1", "alpha2", "beta1", "beta2", "gamma1", "gamma2", "p1", "p2", "r1", "r2", "c1", "c2",
     "eps_mag",
 )  # fmt: skip
-"""Parameters of the fitted torque (Eq. 18-19) that torque curves determine, in the order of `moment_slopes`."""
+"""Parameters of the fitted torque (Eq. 18-19) that curves determine, in the order of `moment_slopes`."""
 
 MODEL, DIPOLES = "pendulum", "pendulum-dipole"
 """Models with the fitted torque, and with point dipoles."""
@@ -98,7 +98,7 @@ def magnet_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
         Values of `FITTED` by name.
     """
     parts = _parts(psi1, psi_rel, p)
-    return parts.f[0] * parts.share[0] + parts.f[1] * parts.share[1]
+    return np.asarray(parts.f[0] * parts.share[0] + parts.f[1] * parts.share[1])
 
 
 def moment_slopes(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> np.ndarray:
@@ -131,7 +131,7 @@ def weight_torque(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
     """
     upper = p["g"] * (p["m1"] * p["e1"] + p["m2"] * p["l1"])
     lower = p["g"] * p["m2"] * p["e2"]
-    return -upper * np.sin(psi1) - lower * np.sin(np.asarray(psi1) + psi_rel)
+    return np.asarray(-upper * np.sin(psi1) - lower * np.sin(np.asarray(psi1) + psi_rel))
 
 
 def dipole_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> np.ndarray:
