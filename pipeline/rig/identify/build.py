@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -16,9 +16,7 @@ from magpend_core.sampling import Drive
 from pipeline.rig.edges import find_edges
 from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
-from pipeline.rig.recordings.mapping import load_mapping
-from pipeline.rig.recordings.reading import read_recording
-from pipeline.rig.recordings.smoothing import smooth
+from pipeline.rig.recordings import load_mapping, read_recording, smooth
 from pipeline.spec.problems import SpecError
 
 FEWEST_SAMPLES = 12
@@ -90,10 +88,11 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
     if problems:
         raise SpecError(problems)
     smoothed = [smooth(ds) for ds in recordings]
-    kept, held = [], []
-    for i, (table, ds) in enumerate(zip(spec.recordings, smoothed, strict=True)):
+    kept: list[Piece] = []
+    held: list[Piece] = []
+    for i, table in enumerate(spec.recordings):
         try:
-            own = pieces_of(spec.model, channels, ds, table, i, spec.fit.decimate)
+            own = pieces_of(spec.model, channels, (recordings[i], smoothed[i]), table, i, spec.fit.decimate)
         except SpecError as error:
             problems += [f"recordings[{i}]: {p}" for p in error.problems]
             continue
@@ -158,21 +157,22 @@ def channels_of(
     chosen = tuple(n for n in common if n not in rates) or tuple(common)
     if not chosen:
         problems.append(
-            f"recordings: no state of {model.name} ({', '.join(model.state_names)}) is measured in all of them."
+            f"recordings: none measures a state of {model.name} ({', '.join(model.state_names)}) that all "
+            "others do; map one."
         )
     return chosen
 
 
 def _drive_problems(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> list[str]:
     problems = [
-        f"recordings[{i}].drive = {table.drive!r}: its mapping names no drive channel; add [drive] there, or "
-        'set drive = "none".'
+        f"recordings[{i}].drive = {table.drive!r}: its mapping names no drive channel; add [drive] there, "
+        'or set drive = "none".'
         for i, (table, ds) in enumerate(zip(spec.recordings, recordings, strict=True))
         if table.drive != "none" and DRIVE not in ds
     ]
     problems += [
-        f'recordings[{i}].drive = "recorded": its mapping calls the drive a signal, not a torque; use "edges", '
-        'or map a torque (kind = "torque").'
+        f'recordings[{i}].drive = "recorded": its mapping calls the drive a signal, not a torque; use '
+        '"edges", or map a torque (kind = "torque").'
         for i, (table, ds) in enumerate(zip(spec.recordings, recordings, strict=True))
         if table.drive == "recorded" and DRIVE in ds and ds[DRIVE].attrs.get("kind") == "signal"
     ]
@@ -184,7 +184,8 @@ def _drive_problems(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) 
         )
     if "edges" in kinds and DUTY not in spec.model.parameter_names:
         problems.append(
-            f'recordings: drive = "edges" asks for a model with a parameter {DUTY}; {spec.model.name} has none.'
+            f'recordings: drive = "edges" asks for a model with a parameter {DUTY}; {spec.model.name} has '
+            "none."
         )
     return problems
 
@@ -193,9 +194,7 @@ def _hold_out_problems(i: int, table: RecordingTable, n: int) -> list[str]:
     wrong = [k for k in table.hold_out if k >= n]
     if not wrong:
         return []
-    return [
-        f"recordings[{i}].hold_out: there are pieces 0 to {n - 1}, and no {', '.join(map(str, wrong))}."
-    ]
+    return [f"recordings[{i}].hold_out: there are pieces 0 to {n - 1}, and no {', '.join(map(str, wrong))}."]
 
 
 def free_of(spec: IdentificationSpec, channels: Sequence[str], n_recordings: int) -> tuple[Free, ...]:
@@ -227,8 +226,8 @@ def noise_of(channels: Sequence[str], smoothed: Sequence[xr.Dataset]) -> np.ndar
 
 
 def pieces_of(
-    model: Model, channels: Sequence[str], smoothed: xr.Dataset, table: RecordingTable, recording: int,
-    decimate: int = 1,
+    model: Model, channels: Sequence[str], both: tuple[xr.Dataset, xr.Dataset], table: RecordingTable,
+    recording: int, decimate: int = 1,
 ) -> list[Piece]:  # fmt: skip
     """Cut a recording into pieces.
 
@@ -238,8 +237,8 @@ def pieces_of(
         Whose states they have.
     channels
         That are compared.
-    smoothed
-        The recording with rates, see `pipeline.rig.recordings`.
+    both
+        The recording as measured, and smoothed: the first guess of a start is read off the latter.
     table
         How it is cut, and what its drive is.
     recording
@@ -252,25 +251,27 @@ def pieces_of(
     SpecError
         Naming the pieces that are too short, or that the drive does not cover.
     """
-    drive = _drive_of(table, smoothed)
+    ds, smoothed = both
+    drive = _drive_of(table, ds)
     found: list[Piece] = []
     problems: list[str] = []
-    for stretch in stretches(smoothed, table.piece_s, recording):
-        samples = _usable(smoothed, stretch, channels, drive)
-        own = smoothed.isel(sample=samples)
+    for stretch in stretches(ds, table.piece_s, recording):
+        samples = _usable(ds, stretch, channels, drive)
+        own = ds.isel(sample=samples)
         time = own["time"].values[::decimate]
         if len(time) < FEWEST_SAMPLES:
             problems.append(
-                f"piece {stretch.number} has {len(time)} usable samples; a piece needs {FEWEST_SAMPLES} or more: "
-                "choose a longer piece_s or window_s, or a smaller fit.decimate."
+                f"piece {stretch.number} has {len(time)} usable samples; a piece needs {FEWEST_SAMPLES} or "
+                "more: choose a longer piece_s or window_s, or a smaller fit.decimate."
             )
             continue
         measured = np.stack([own[name].values[::decimate] for name in channels], axis=1)
         pieces_drive = None if drive is None else drive.window(float(time[0]), float(time[-1]))
+        start = _start(model, smoothed.isel(sample=samples))
         whole = samples.start == stretch.samples.start
         found.append(
             Piece(
-                recording, stretch.number, time - time[0], measured, _start(model, own), pieces_drive,
+                recording, stretch.number, time - time[0], measured, start, pieces_drive,
                 len(found) - 1 if stretch.continues and found and whole else -1,
             )
         )  # fmt: skip
@@ -297,7 +298,7 @@ def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Str
         length = float(time[end - 1] - time[begin])
         n = 1 if piece_s is None else max(1, round(length / piece_s))
         bounds = np.linspace(begin, end, n + 1).round().astype(int)
-        for k, (a, b) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+        for k, (a, b) in enumerate(itertools.pairwise(bounds)):
             found.append(Stretch(recording, len(found), slice(int(a), int(b)), k > 0))
     return found
 
@@ -305,12 +306,10 @@ def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Str
 def _runs(piece: np.ndarray) -> list[tuple[int, int]]:
     cuts = np.flatnonzero(np.diff(piece)) + 1
     bounds = [0, *cuts.tolist(), len(piece)]
-    return list(zip(bounds[:-1], bounds[1:], strict=True))
+    return list(itertools.pairwise(bounds))
 
 
-def _usable(
-    ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _Driven | None
-) -> slice:
+def _usable(ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _Driven | None) -> slice:
     """Samples of a stretch from where everything is measured, and as far as the drive is known."""
     begin, end = stretch.samples.start, stretch.samples.stop
     time = ds["time"].values[begin:end]
@@ -374,11 +373,4 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
 def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:
     """Number the predecessors anew after some were taken out; who lost one follows none."""
     numbers = {p.number: offset + k for k, p in enumerate(pieces)}
-    return [
-        replace(p, follows=numbers.get(p.number - 1, -1) if p.follows >= 0 else -1) for p in pieces
-    ]
-
-
-def source_paths(spec: IdentificationSpec) -> list[Path]:
-    """Paths of the recordings."""
-    return [spec.path(t.file) for t in spec.recordings]
+    return [replace(p, follows=numbers.get(p.number - 1, -1) if p.follows >= 0 else -1) for p in pieces]

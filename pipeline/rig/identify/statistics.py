@@ -60,6 +60,8 @@ class Linearised:
         Number of fitted components of starts.
     loss : str
         As `scipy.optimize.least_squares` names it.
+    loss_scale : float
+        Residual from which on a robust loss grows slower than the square.
     """
 
     information: np.ndarray
@@ -69,6 +71,7 @@ class Linearised:
     groups: tuple[int, ...]
     n_starts: int
     loss: str = "linear"
+    loss_scale: float = 1.0
 
     @property
     def n_samples(self) -> int:
@@ -272,7 +275,7 @@ def _scores(fit: Linearised) -> _Scores:
     for r, slopes in zip(fit.residuals, fit.slopes, strict=True):
         there = np.isfinite(r)
         known = np.where(there, r, 0.0)
-        weight, bend = robust_weights(known, fit.loss)
+        weight, bend = robust_weights(known / fit.loss_scale, fit.loss)
         own = np.where(there[..., None], slopes, 0.0)
         scores.append(np.einsum("tc,tcp->tp", weight * known, own))
         each = np.einsum("tcp,tc,tcq->cpq", own, bend, own)
@@ -355,7 +358,7 @@ def _white(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.ndarr
     degrees = max(fit.n_samples - fit.n_fitted, 1)
     share = degrees / fit.n_samples
     stacked = np.concatenate(fit.residuals)
-    weight, _ = robust_weights(np.nan_to_num(stacked), fit.loss)
+    weight, _ = robust_weights(np.nan_to_num(stacked) / fit.loss_scale, fit.loss)
     counts = np.isfinite(stacked).sum(0)
     variance = np.nansum((weight * stacked) ** 2, axis=0) / np.maximum(counts, 1) / share
     data = np.sum(parts.by_channel, axis=0)
