@@ -17,6 +17,7 @@ from magpend_core.models.parameters import (
     Parameters,
     near_names,
 )
+from magpend_core.models.presets import is_file
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
 from pipeline.spec.files import read_toml
 from pipeline.spec.problems import SpecError, unknown_choice, unknown_key
@@ -48,6 +49,7 @@ class FitTable(Table):
     channels: Annotated[tuple[str, ...], Field(strict=False)] = ()
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
     continuity: Literal["free"] | Annotated[float, Field(gt=0, strict=False)] = "free"
+    noise: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
     decimate: Annotated[int, Field(ge=1)] = 1
     rtol: Annotated[float, Field(gt=0, le=1e-3)] = 1e-8
 
@@ -98,6 +100,11 @@ class IdentificationSpec:
     fit: FitTable
     search: SearchTable
     folder: Path
+
+    @property
+    def preset_found(self) -> str | Path | None:
+        """The preset as `Model.preset` takes it."""
+        return _found(self.preset, self.folder)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -177,7 +184,7 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     if model is None:
         raise SpecError(problems)
     problems += _channel_problems(model, sensors, fit)
-    own = ParameterTables(data, model, preset, problems)
+    own = ParameterTables(data, model, _found(preset, folder), problems)
     if problems:
         raise SpecError(problems)
     assert own.values is not None
@@ -193,6 +200,11 @@ def _text(data: Mapping[str, Any], key: str, problems: list[str]) -> str | None:
         problems.append(f"{key} = {value!r}: must be a text in quotes.")
         return None
     return value
+
+
+def _found(preset: str | None, folder: Path) -> str | Path | None:
+    """A preset's name, or the path of its file."""
+    return folder / preset if preset is not None and is_file(preset) else preset
 
 
 def _model(data: Mapping[str, Any], problems: list[str]) -> Model | None:
@@ -249,6 +261,7 @@ def _channel_problems(model: Model, sensors: SensorsTable | None, fit: FitTable 
     named = {
         "sensors.zero": sensors.zero if sensors is not None else (),
         "fit.channels": fit.channels if fit is not None else (),
+        "fit.noise": tuple(fit.noise) if fit is not None else (),
     }
     known = model.state_names
     problems = [
