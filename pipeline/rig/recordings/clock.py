@@ -132,7 +132,7 @@ def _stamps(channel: Channel, stated: float | None) -> np.ndarray:
     return np.asarray(channel.start_s + step * np.arange(len(channel)))
 
 
-def _step_of(channel: Channel) -> float:
+def step_of(channel: Channel) -> float:
     """Sampling interval of one channel [s]: the usual distance of its stamps, or what is stated."""
     if channel.time is None or len(channel.time) < 2:
         return channel.step_s
@@ -147,7 +147,7 @@ def _step_of(channel: Channel) -> float:
 
 
 def _common_step(stretches: Sequence[Mapping[str, Channel]], stated: float | None, source: str) -> float:
-    steps = {name: _step_of(c) for channels in stretches for name, c in channels.items()}
+    steps = {name: step_of(c) for channels in stretches for name, c in channels.items()}
     if stated is not None and not any(c.time is not None for s in stretches for c in s.values()):
         rates = {n: s for n, s in steps.items() if math.isfinite(s)}
         _refuse_mixed(rates, source)
@@ -179,7 +179,7 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
     """Say where the file states another rate than the mapping."""
     if stated is None:
         return []
-    own = {c.name: _step_of(c) for c in stretches[0].values()}
+    own = {c.name: step_of(c) for c in stretches[0].values()}
     return [
         Finding(
             "rate", name, math.nan, math.nan, "warning",

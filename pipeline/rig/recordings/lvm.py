@@ -195,7 +195,7 @@ def _truncations(segment: _Segment, channels: dict[str, Channel], style: _Style)
         if math.isfinite(stated) and len(channel) < stated:
             findings.append(Finding(
                 "truncated", channel.name, math.nan, math.nan, "warning",
-                f"the segment from line {segment.first_line} on has {len(channel)} of the {stated:.0f} samples "
+                f"the segment from line {segment.first_line} has {len(channel)} of the {stated:.0f} samples "
                 "that its header states.",
             ))  # fmt: skip
     if "_cut" in segment.keys:

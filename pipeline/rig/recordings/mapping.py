@@ -30,20 +30,26 @@ class Scaled(Table):
     """A channel and how its numbers become SI units: ``sign*scale*unit*(raw - zero) + offset``."""
 
     channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
-    unit: str = Field("", description="Unit in the file; by default that of the quantity.")
-    scale: float | None = Field(None, description="Of a unit that is not the quantity's: SI units per unit.")
-    zero: float = Field(0.0, description="Reading that is 0 [the file's unit].")
-    offset: float = Field(0.0, description="Added after scaling [SI units].")
-    sign: Literal[-1, 1] = Field(1, description="-1 if it counts the other way round.")
+    unit: str = Field(default="", description="Unit in the file; by default that of the quantity.")
+    scale: float | None = Field(
+        default=None, description="Of a unit that is not the quantity's: SI units per unit."
+    )
+    zero: float = Field(default=0.0, description="Reading that is 0 [the file's unit].")
+    offset: float = Field(default=0.0, description="Added after scaling [SI units].")
+    sign: Literal[-1, 1] = Field(default=1, description="-1 if it counts the other way round.")
 
 
 class ChannelMap(Scaled):
     """``[channels.NAME]``: a measured quantity, under the name of the model's state."""
 
-    range: Pair | None = Field(None, description="Ends of the sensor's range [the file's unit].")
-    wraps: bool = Field(False, description="Whether the reading jumps back once a turn.")
-    dead_band: Pair | None = Field(None, description="Readings where it does not measure [the file's unit].")
-    relative_to: str | None = Field(None, description="Channel to which this angle is relative; it is added.")
+    range: Pair | None = Field(default=None, description="Ends of the sensor's range [the file's unit].")
+    wraps: bool = Field(default=False, description="Whether the reading jumps back once a turn.")
+    dead_band: Pair | None = Field(
+        default=None, description="Readings where it does not measure [the file's unit]."
+    )
+    relative_to: str | None = Field(
+        default=None, description="Channel to which this angle is relative; it is added."
+    )
 
     @model_validator(mode="after")
     def _rise(self) -> ChannelMap:
@@ -64,7 +70,7 @@ class TimeMap(Table):
     """``time``: the channel with a time stamp for each sample."""
 
     channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
-    unit: str = Field("s", description="Unit in the file.")
+    unit: str = Field(default="s", description="Unit in the file.")
 
 
 class PieceMap(Table):
@@ -77,11 +83,11 @@ class CsvMap(Table):
     """``[csv]``: how the text is to be read where it is not to be found out."""
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
-        None, description="Between fields."
+        default=None, description="Between fields."
     )
-    decimal: Literal[".", ","] | None = Field(None, description="Decimal point.")
-    header: bool | None = Field(None, description="Whether the first row has names.")
-    skip_rows: int = Field(0, ge=0, description="Rows before the names.")
+    decimal: Literal[".", ","] | None = Field(default=None, description="Decimal point.")
+    header: bool | None = Field(default=None, description="Whether the first row has names.")
+    skip_rows: int = Field(default=0, ge=0, description="Rows before the names.")
 
 
 class Mapping(Table):
@@ -92,15 +98,17 @@ class Mapping(Table):
 
     model: str = Field(description="Model whose states are measured.")
     format: Literal["tdms", "lvm", "csv", "matlab"] | None = Field(
-        None, description="By default by the suffix."
+        default=None, description="By default by the suffix."
     )
-    time: TimeMap | None = Field(None, description="Channel of time stamps.")
-    piece: PieceMap | None = Field(None, description="Channel with a number for each piece.")
-    sampling_rate_hz: Positive | None = Field(None, description="Where the file does not state it [Hz].")
-    window_s: Pair | None = Field(None, description="Part to be read [s since the first sample].")
-    csv: CsvMap = Field(CsvMap(), description="How a text is read.")
+    time: TimeMap | None = Field(default=None, description="Channel of time stamps.")
+    piece: PieceMap | None = Field(default=None, description="Channel with a number for each piece.")
+    sampling_rate_hz: Positive | None = Field(
+        default=None, description="Where the file does not state it [Hz]."
+    )
+    window_s: Pair | None = Field(default=None, description="Part to be read [s since the first sample].")
+    csv: CsvMap = Field(default=CsvMap(), description="How a text is read.")
     channels: dict[str, ChannelMap] = Field(min_length=1, description="By name of a state.")
-    drive: DriveMap | Literal["none"] = Field("none", description="Channel of the drive.")
+    drive: DriveMap | Literal["none"] = Field(default="none", description="Channel of the drive.")
 
     @property
     def system(self) -> Model:
@@ -186,7 +194,8 @@ def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
         if key not in Mapping.model_fields:
             problems.append(unknown_key(key, key, Mapping.model_fields))
             continue
-        kind = {"time": TimeMap, "piece": PieceMap, "csv": CsvMap}.get(key)
+        kinds: dict[str, type[BaseModel]] = {"time": TimeMap, "piece": PieceMap, "csv": CsvMap}
+        kind = kinds.get(key)
         if kind is not None:
             found[key] = _checked(kind, value, key, problems)
             continue
@@ -240,7 +249,7 @@ def _checked(model: type[BaseModel], value: Any, path: str, problems: list[str])
 
 
 def _units(model: Model) -> dict[str, str]:
-    return {entry.name: entry.unit for entry in (*model.states, *model.quantities)}
+    return {s.name: s.unit for s in model.states} | {q.name: q.unit for q in model.quantities}
 
 
 def _quantity_problems(model: Model, channels: dict[str, ChannelMap], drive: DriveMap | None) -> list[str]:

@@ -211,10 +211,13 @@ def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[
     """Say where the file states a unit that is not the mapping's."""
     findings = []
     for name, entry in _entries(mapping).items():
-        stated = raw.stretches[0][columns[name]].unit
-        own = entry.unit or mapping.unit_of(name)
-        known = [units.factor(u, units.kind_of(u) or u) for u in (stated, own)]
-        if stated and stated != own and (known[0] != known[1] or units.kind_of(stated) != units.kind_of(own)):
+        stated = units.spelled(raw.stretches[0][columns[name]].unit)
+        own = units.spelled(entry.unit or mapping.unit_of(name))
+        known = [units.factor(u, units.kind_of(u) or "") for u in (stated, own)]
+        same = stated == own or (
+            known[0] == known[1] is not None and units.kind_of(stated) == units.kind_of(own)
+        )
+        if stated and not same:
             findings.append(Finding(
                 "unit", name, math.nan, math.nan, "warning",
                 f"the file says {stated!r}, the mapping {own!r}; the mapping's is used.",
@@ -227,7 +230,7 @@ def _labelled(
 ) -> xr.Dataset:
     """Names, units and provenance."""
     model = mapping.system
-    meanings = {entry.name: entry.meaning for entry in (*model.states, *model.quantities)}
+    meanings = {s.name: s.meaning for s in model.states} | {q.name: q.meaning for q in model.quantities}
     data: dict[str, Any] = {}
     for name, values in variables.items():
         attrs = {"units": mapping.unit_of(name), "long_name": meanings.get(name, "drive")}
@@ -242,11 +245,11 @@ def _labelled(
         "time": (DIM, clock.time, {"units": "s", "long_name": "time since the recording's first sample"}),
         "piece": (DIM, clock.piece, {"units": "1", "long_name": "stretch without a gap"}),
     }
-    attrs = {
+    about: dict[str, Any] = {
         "sampling_rate_hz": 1.0 / clock.step_s, "file": str(raw.path), "sha256": raw.sha256,
         "format": raw.format, "mapping": mapping.toml(), "model": mapping.model,
         "findings": to_json(findings), "magpend_version": metadata.version("magpend"),
     }  # fmt: skip
     if raw.simulated:
-        attrs["simulated"] = 1
-    return xr.Dataset(data, coords=coords, attrs=attrs)
+        about["simulated"] = 1
+    return xr.Dataset(data, coords=coords, attrs=about)

@@ -17,8 +17,15 @@ import numpy as np
 import xarray as xr
 
 from pipeline.layout.vocabulary import model_of
+from pipeline.rig.recordings.findings import runs
 from pipeline.rig.recordings.mapping import DRIVE
 from pipeline.spec.problems import SpecError
+
+LEAP, LEAP_SAMPLES = 0.4, 5
+"""A drive leaps if it changes by this share of its range within so many samples."""
+
+QUIET = 10.0
+"""Least range of a drive whose leaps are looked for, in units of its change from sample to sample."""
 
 GROWTH = 1.25
 """Ratio of neighbouring windows that are tried."""
@@ -52,8 +59,8 @@ def smooth(
     order
         Of the polynomials, 1 or more.
     edges_s
-        Instants at which the drive switches [s]; by default those of ``drive``, if it is there and switches
-        between two levels.
+        Instants at which the drive switches [s]; by default those at which ``drive`` leaps from one level to
+        another, if it is there.
 
     Returns
     -------
@@ -71,7 +78,7 @@ def smooth(
     """
     step = 1.0 / float(ds.attrs["sampling_rate_hz"])
     width = _checked(window_s, order, step)
-    edges = _edges(ds) if edges_s is None else np.asarray(edges_s, dtype=np.float64)
+    edges = _switches(ds) if edges_s is None else np.asarray(edges_s, dtype=np.float64)
     rate_of = {s.name: s for s in model_of(ds).states if s.rate}
     result = ds.copy()
     for name in [str(n) for n in ds.data_vars if n != DRIVE]:
@@ -101,21 +108,26 @@ def _checked(window_s: float | None, order: int, step: float) -> int | None:
     return width
 
 
-def _edges(ds: xr.Dataset) -> np.ndarray:
-    """Instants at which a drive that has two levels passes from one to the other [s]."""
+def _switches(ds: xr.Dataset) -> np.ndarray:
+    """Instants at which the drive leaps between any of its levels [s].
+
+    A drive that is switched off has three levels, so that these are not the edges about one middle that
+    `pipeline.rig.edges` finds.
+    """
     if DRIVE not in ds:
         return np.empty(0)
-    time, drive = ds["time"].values, ds[DRIVE].values
+    time, drive, piece = ds["time"].values, ds[DRIVE].values, ds["piece"].values
     known = drive[np.isfinite(drive)]
-    if not known.size:
+    if len(known) <= LEAP_SAMPLES:
         return np.empty(0)
-    low, high = np.quantile(known, (0.05, 0.95))
-    if not high > low or np.mean(np.abs(known - 0.5 * (low + high)) < 0.3 * (high - low)) > 0.2:
-        return np.empty(0)  # no switching drive: it dwells between its levels
-    from pipeline.rig.edges import find_edges
-
-    found = find_edges(time, drive)
-    return np.sort(np.concatenate([found.rising, found.falling]))
+    low, high = np.quantile(known, (0.01, 0.99))
+    noise = float(np.median(np.abs(np.diff(known))))
+    if not high - low > QUIET * noise:
+        return np.empty(0)
+    leap = np.abs(drive[LEAP_SAMPLES:] - drive[:-LEAP_SAMPLES]) > LEAP * (high - low)
+    step = np.abs(np.diff(drive))
+    found = [i + int(np.argmax(step[i : k + LEAP_SAMPLES - 1])) for i, k in runs(leap, piece[LEAP_SAMPLES:])]
+    return np.array([0.5 * (time[i] + time[i + 1]) for i in found])
 
 
 def _parts(ds: xr.Dataset, name: str, edges: np.ndarray) -> np.ndarray:

@@ -41,7 +41,8 @@ def read_tdms(path: Path) -> Raw:
         except Exception as error:  # npTDMS raises what its parser meets: struct.error, KeyError, ...
             raise SpecError(
                 [
-                    f"{path}: is not a TDMS file that can be read ({error}); write it anew, or export it as CSV."
+                    f"{path}: is not a TDMS file that can be read ({error}); write it anew, or "
+                    "export it as CSV."
                 ]
             ) from None
     found = {}

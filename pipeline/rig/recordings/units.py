@@ -20,6 +20,16 @@ UNITS: dict[str, dict[str, float]] = {
 }  # fmt: skip
 """Factors to an SI unit, by that unit and by the unit in a file."""
 
+_SPELLINGS = {
+    "volt": "V", "volts": "V", "ampere": "A", "amperes": "A", "radian": "rad", "radians": "rad",
+    "second": "s", "seconds": "s", "newtons": "N", "newton": "N",
+}  # fmt: skip
+
+
+def spelled(unit: str) -> str:
+    """Return a unit as it is usually written; LabVIEW writes ``Volts``."""
+    return _SPELLINGS.get(unit.strip().lower(), unit.strip())
+
 
 def factor(unit: str, wanted: str) -> float | None:
     """Return what a unit is in another, or None if it is not one of that kind: a volt is no angle.
