@@ -24,7 +24,7 @@ from pipeline.rig.identify.profiles import Curvature, Profile, profile
 from pipeline.rig.identify.search import search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
 from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
-from pipeline.runs.workflows import find_spec
+from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.files import FIGURES, local_path, writer_lock
 
@@ -69,7 +69,7 @@ def identify(
     """
     path = find_spec(spec)
     parsed = load_identification(path)
-    folder = local_path(out) if out is not None else Path("runs") / path.stem
+    folder = directory_of(spec, out)
     sources = store.sources_of(parsed)
     store.check(folder, store.identity_of(parsed, sources))
     built = build(parsed, read_all(parsed))
@@ -84,6 +84,11 @@ def identify(
         if outcomes.recalled:
             echo(f"{outcomes.recalled} outcomes were there before")
         return _write(folder, parsed, found, sources, info.digest, figures)
+
+
+def directory_of(spec: str | Path, out: str | Path | None) -> Path:
+    """Where an identification goes: `out`, or ``runs/<name>``."""
+    return local_path(out) if out is not None else default_directory(find_spec(spec), False)
 
 
 def _write(
