@@ -295,8 +295,8 @@ def recorded_trajectory(
     own = driven_system(model.system, drive)
     state = check_states(initial_state, 1, own.n_states, "initial_state")
     found = sample(
-        own, _padded(parameters.pack(), own)[None], state[None], [times], drives=[drive], rtol=rtol, atol=atol,
-        max_steps_per_interval=max_steps_per_interval,
+        own, _padded(parameters.pack(), own)[None], state[None], [times], drives=[drive], rtol=rtol,
+        atol=atol, max_steps_per_interval=max_steps_per_interval,
     )  # fmt: skip
     if found.status[0] != Status.BOUNDED:
         raise ArithmeticError(f"The trajectory ended early: {Status(int(found.status[0])).sentence}.")

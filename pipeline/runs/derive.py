@@ -138,10 +138,10 @@ def _refuse_recorded(run: Run, name: str) -> None:
     """Refuse a run under a recorded drive: an analysis runs cells on, under a drive that goes on."""
     if run.spec.recorded is not None:
         raise SpecError([
-            f"{run.directory}: its drive is the recording {run.spec.recorded.file}, and {name} runs its cells on "
-            f"beyond it. Make a run at its mean frequency (frequency_hz = {run.spec.frequency_hz:.6g} instead of "
-            "[drive]) for attractors and what rests on them; the sections of this one can be drawn (magpend plot "
-            "bifurcation, section)."
+            f"{run.directory}: its drive is the recording {run.spec.recorded.file}, and {name} goes on where "
+            "it ends. For attractors and what rests on them make a run at its mean frequency (frequency_hz = "
+            f"{run.spec.frequency_hz:.6g} instead of [drive]); this one's sections can be drawn: magpend "
+            "plot bifurcation, or section."
         ])  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+
 from pipeline.spec.problems import SpecError
 
 if TYPE_CHECKING:
@@ -165,8 +166,8 @@ def parse_drive(text: str, file: str, sha256: str, section_hz: float | None = No
     Raises
     ------
     SpecError
-        With all problems: another header, fields that are no finite numbers, times that do not rise, edges out
-        of order, too few of them.
+        With all problems: another header, fields that are no finite numbers, times that do not rise, edges
+        out of order, too few of them.
     """
     kind, rows = _rows(text, file)
     first, second = _columns(kind, rows, file)
@@ -247,8 +248,8 @@ def _columns(kind: str, rows: list[tuple[int, list[str]]], file: str) -> tuple[n
             continue
         if not (math.isfinite(first[k]) and math.isfinite(second[k])):
             problems.append(
-                f"{file}, line {line}: {','.join(fields)[:60]!r} is not finite; leave the line out, or record "
-                "anew."
+                f"{file}, line {line}: {','.join(fields)[:60]!r} is not finite; leave the line out, or "
+                "record anew."
             )
     if problems:
         raise SpecError(_few(problems, file))

@@ -43,7 +43,7 @@ def with_drive(data: Mapping[str, Any], folder: str | Path, problems: list[str])
 
 
 def is_whole(table: Any) -> bool:
-    """Whether the text of a ``[drive]`` as plain data, if there is one, has the digest that stands beside it."""
+    """Whether the text of a ``[drive]`` as plain data, if there is one, has the digest beside it."""
     if not isinstance(table, Mapping):
         return True
     return hashlib.sha256(str(table.get("text", "")).encode()).hexdigest() == table.get("sha256")
@@ -55,8 +55,8 @@ def recorded(table: DriveTable | None, problems: list[str]) -> RecordedDrive | N
         return None
     if hashlib.sha256(table.text.encode()).hexdigest() != table.sha256:
         problems.append(
-            f"drive.sha256 = {table.sha256!r}: is not that of {table.file}; drop the key, or find the file that "
-            "it names."
+            f"drive.sha256 = {table.sha256!r}: is not that of {table.file}; drop the key, or find the "
+            "file that it names."
         )
         return None
     try:
@@ -123,8 +123,8 @@ def run_problems(
         )
     if getattr(starts, "refine", None) is not None:
         problems.append(
-            "initial_conditions.refine: cells are inferred from closed orbits, and a recording repeats itself "
-            "to its jitter alone; drop the key, or [drive]."
+            "initial_conditions.refine: cells are inferred from closed orbits, and a recording repeats "
+            "itself to its jitter alone; drop the key, or [drive]."
         )
     return problems + _product_problems(drive, data.get("products", {}))
 
@@ -153,12 +153,12 @@ def _product_problems(drive: RecordedDrive, products: Any) -> list[str]:
     problems = []
     if "lyapunov" in names:
         problems.append(
-            "products.lyapunov: exponents are means over ever more periods of one drive, and a recording ends; "
-            "drop the product, or [drive]."
+            "products.lyapunov: exponents are means over ever more periods of one drive, and a recording "
+            "ends; drop the product, or [drive]."
         )
     if "extremes" in names and drive.kind == TORQUE:
         problems.append(
-            "products.extremes: are taken over the intervals of a drive, and those of a torque are no periods; "
-            "drop the product, or give the drive as edges (columns rising_s,falling_s)."
+            "products.extremes: are taken over the intervals of a drive, and those of a torque are no "
+            "periods; drop the product, or give the drive as edges (columns rising_s,falling_s)."
         )
     return problems
