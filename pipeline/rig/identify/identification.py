@@ -83,7 +83,7 @@ def identify(
         found = find(parsed, built, outcomes, echo)
         if outcomes.recalled:
             echo(f"{outcomes.recalled} outcomes were there before")
-        return _write(folder, parsed, found, sources, info.digest, figures)
+        return _write(folder, parsed, found, sources, info.digest, figures, built.simulated)
 
 
 def directory_of(spec: str | Path, out: str | Path | None) -> Path:
@@ -93,10 +93,12 @@ def directory_of(spec: str | Path, out: str | Path | None) -> Path:
 
 def _write(
     folder: Path, spec: IdentificationSpec, found: reports.Finding, sources: list[Source], digest: str,
-    figures: bool,
+    figures: bool, simulated: bool,
 ) -> dict[str, Any]:  # fmt: skip
     reports.write_values(folder / store.PRESET, spec, found, sources)
     residuals = reports.residuals_of(spec, found)
+    if simulated:
+        residuals = residuals.assign_attrs(simulated=1)
     residuals.to_netcdf(folder / store.RESIDUALS, engine="scipy", format="NETCDF3_64BIT")
     result = reports.result_of(spec, found, sources, digest)
     files = [store.PRESET, store.RESIDUALS]
