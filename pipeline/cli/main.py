@@ -14,6 +14,7 @@ from pipeline.cli.common import EXIT_HELP, CommandError
 from pipeline.cli.console import EnoughError
 from pipeline.cli.exits import Exit
 from pipeline.cli.groups import SETTINGS, TopGroup
+from pipeline.cli.identify import identify_app
 from pipeline.cli.models import models, presets
 from pipeline.cli.options import speaking
 from pipeline.cli.plot import plot_app
@@ -58,6 +59,7 @@ for _command, _settings in (
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(plot_app, name="plot")
 app.add_typer(recordings_app, name="recordings")
+app.add_typer(identify_app, name="identify")
 
 
 def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
