@@ -18,6 +18,9 @@ ANGLE = "psi1"
 LOCKED = "psi_rel"
 """The angle that is locked."""
 
+SYMBOLS = {ANGLE: r"\psi_1", LOCKED: r"\psi_\mathrm{rel}", "torque": r"M_\mathrm{M}"}
+"""LaTeX without dollar signs."""
+
 SIDES = ("right", "left")
 """Where the pendulum is, seen from the fixed magnet: that of f_1 and that of f_2 (Eq. 18)."""
 

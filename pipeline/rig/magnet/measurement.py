@@ -140,7 +140,7 @@ class Header(Table):
     synthesis: dict[str, Any] = Field({}, description="How synthetic readings were made; for people.")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Curve:
     """The readings of one locked angle on one side.
 
@@ -213,7 +213,9 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
         rows = np.flatnonzero(side == code)
         rows = rows[np.argsort(locked[rows], kind="stable")]
         breaks = np.flatnonzero(np.diff(locked[rows]) > SAME_ANGLE) + 1
-        found += [Curve(code, float(locked[r].mean()), np.sort(r)) for r in np.split(rows, breaks) if len(r)]
+        found += [
+            Curve(code, float(np.median(locked[r])), np.sort(r)) for r in np.split(rows, breaks) if len(r)
+        ]
     return tuple(found)
 
 
