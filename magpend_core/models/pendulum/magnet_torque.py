@@ -155,3 +155,8 @@ def dipole_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
     dy = p["h"] - p["l1"] * np.cos(psi1) - p["l2"] * np.cos(psi2)
     strength = _VACUUM_PERMEABILITY * p["pole1"] * p["pole2"] / (4.0 * np.pi)
     return np.asarray(strength * p["h"] * dx / (dx * dx + dy * dy) ** 1.5)
+
+
+def reach(p: Mapping[str, float]) -> float:
+    """Distance of the moving magnet from joint 1, both links in line [m]."""
+    return float(p["l1"] + p["l2"])

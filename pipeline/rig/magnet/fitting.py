@@ -146,7 +146,7 @@ def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
         lambda x: torque - laws.bump(angle, *x), lambda x: -laws.bump_slopes(angle, *x), start, what
     )
     height, position, width = found.x[0], found.x[1], abs(found.x[2])
-    within = angle.min() - width <= -position <= angle.max() + width
+    within = angle.min() <= -position <= angle.max()
     if not within or (height > 0.0) != (curve.side == 0):
         raise ArithmeticError(
             f"{what}: the fit finds no peak of the expected sign among the readings; check side and sign, "
@@ -313,8 +313,7 @@ def _judged(
     measured: Measurement, found: Solution, free: tuple[str, ...], values: dict[str, float]
 ) -> JointFit:
     errors = dict(zip(free, map(float, found.errors), strict=True))
-    spread = found.errors[:, None] * found.errors
-    correlation = found.covariance / np.where(spread > 0.0, spread, 1.0)
+    correlation = found.correlation
     clusters = [curve.rows for curve in measured.curves]
     by_curve = dict(zip(free, map(float, errors_by_cluster(found, clusters)), strict=True))
     doubtful = [n for n in free if max(errors[n], by_curve[n]) > LARGE_ERROR * _scale(n, values)]
@@ -367,12 +366,16 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
 
     h = float(p["h"])
     if place:
-        reach = p["l1"] + p["l2"]
+        reach = laws.reach(p)
         # the sum of squares has several valleys over the place: survey, then descend
         grid = reach * np.geomspace(1.001, FARTHEST_DIPOLES, 400)
         best = int(np.argmin([(r := at(float(g))[1]) @ r for g in grid]))
         low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-        h = float(minimize_scalar(lambda g: (r := at(g)[1]) @ r, bounds=(low, high), method="bounded").x)
+        found = minimize_scalar(
+            lambda g: (r := at(g)[1]) @ r, bounds=(low, high), method="bounded",
+            options={"xatol": 1e-9 * reach},
+        )  # fmt: skip
+        h = float(found.x)
     strength, residuals = at(h)
     if not (np.isfinite(residuals).all() and strength > 0.0):
         raise ArithmeticError("point dipoles: no strength of repelling dipoles fits the readings.")

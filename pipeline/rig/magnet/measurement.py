@@ -85,10 +85,10 @@ class SideColumn(Table):
 
 
 class Tie(Table):
-    """What hangs on link 1 of the tie that holds it."""
+    """What hangs on the upper link of the tie that holds it."""
 
     mass_kg: float = Field(ge=0, description="Mass that hangs on the link [kg].")
-    lever_m: float = Field(ge=0, description="From joint 1 along link 1 to where it hangs [m].")
+    lever_m: float = Field(ge=0, description="From the upper joint along the link to where it hangs [m].")
 
 
 class Correction(Table):
@@ -106,7 +106,7 @@ class Correction(Table):
     def _once(self) -> Correction:
         if self.without is not None and (self.weights or self.tie is not None):
             raise ValueError(
-                "readings without the magnets have the weights already; set weights = false, no tie."
+                "readings without the magnets have the weights already; set weights = false and drop tie."
             )
         return self
 

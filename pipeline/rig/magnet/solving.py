@@ -34,15 +34,11 @@ class Solution:
     residuals: np.ndarray
 
     @property
-    def covariance(self) -> np.ndarray:
-        """Covariance from the residuals' variance."""
-        variance = float(self.residuals @ self.residuals) / max(self.freedom, 1)
-        return _inverse(self.jacobian) * variance
-
-    @property
-    def freedom(self) -> int:
-        """Readings less free numbers."""
-        return len(self.residuals) - len(self.x)
+    def correlation(self) -> np.ndarray:
+        """Correlation of the numbers, as far as the readings' noise is even."""
+        normal = _inverse(self.jacobian)
+        size = np.sqrt(np.diag(normal))
+        return np.asarray(normal / size[:, None] / size)
 
 
 @dataclass(frozen=True)
