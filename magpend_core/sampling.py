@@ -66,8 +66,8 @@ class Drive:
         rising, falling = check_array("rising_s", rising_s, 1), check_array("falling_s", falling_s, 1)
         if len(rising) < 2 or len(falling) != len(rising) - 1:
             raise ValueError(
-                f"{len(rising)} rising and {len(falling)} falling edges: give two rising edges at least, and one "
-                "falling edge between each two."
+                f"{len(rising)} rising and {len(falling)} falling edges: give two rising edges at least, and "
+                "one falling edge between each two."
             )
         if not ((rising[:-1] < falling) & (falling < rising[1:])).all():
             raise ValueError("falling_s must lie between the rising edges, one in each period.")
@@ -168,8 +168,8 @@ def sample(
     piece
         Which piece's times and drive each trajectory has, shape (trajectory,); by default one each, in order.
     drives
-        The drive of each piece; None for a system whose forcing is off or absent: then the piece counts as one
-        interval.
+        The drive of each piece; None for a system whose forcing is off or absent: then the piece counts as
+        one interval.
     columns
         Numbers of the states that are wanted; by default all.
     rtol, atol
@@ -205,7 +205,8 @@ def sample(
     table = _drive_table(system, grids, drives)
     samples = engine.Samples(
         packed, initial, which, np.concatenate([*grids, np.zeros(0)]), _offsets(grids), *table,
-        np.array(list(columns), np.int64), slack_of(rtol, atol), np.full((len(which), longest, len(columns)), np.nan),
+        np.array(list(columns), np.int64), slack_of(rtol, atol),
+        np.full((len(which), longest, len(columns)), np.nan),
         np.zeros(len(which), np.int64), np.zeros(len(which), np.int64),
     )  # fmt: skip
     if len(which):
@@ -261,8 +262,8 @@ def _check_drive(number: int, drive: Drive, names: tuple[str, ...], end_s: float
     durations = check_array(f"drives[{number}].durations_s", drive.durations_s, 1)
     if drive.names != names or (names and np.shape(drive.values) != (len(durations), len(names))):
         raise ValueError(
-            f"drives[{number}] has values of shape {np.shape(drive.values)} for {drive.names}; all drives need "
-            f"one row per interval and the same names {names}."
+            f"drives[{number}] has values of shape {np.shape(drive.values)} for {drive.names}; all drives "
+            f"need one row per interval and the same names {names}."
         )
     if not len(durations) or (durations <= 0.0).any() or not 0.0 <= drive.start_s < durations[0]:
         raise ValueError(
@@ -271,6 +272,7 @@ def _check_drive(number: int, drive: Drive, names: tuple[str, ...], end_s: float
     covered = durations.sum() - drive.start_s
     if covered < end_s - engine.COINCIDENT_S:
         raise ValueError(
-            f"drives[{number}] covers {covered:g} s of a piece of {end_s:g} s; give a longer drive or fewer times."
+            f"drives[{number}] covers {covered:g} s of a piece of {end_s:g} s; give a longer drive or fewer "
+            "times."
         )
     return durations

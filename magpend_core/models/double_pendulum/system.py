@@ -15,7 +15,8 @@ AT = positions(tuple(p.name for p in PARAMETERS))
 C = positions(
     (
         "B1", "B2", "N12", "M1", "M2", "c1", "c2", "T1", "T2", "drop", "floor", "c0", "eps", "per_eps",
-        "per_reversal1", "per_reversal2", "l1", "drag1", "near", "middle", "far", "outer", "inner", "q", "omega",
+        "per_reversal1", "per_reversal2", "l1", "drag1", "near", "middle", "far", "outer", "inner", "q",
+        "omega",
     )
 )  # fmt: skip
 

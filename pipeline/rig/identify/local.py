@@ -91,7 +91,7 @@ class _Unknowns:
 
     def jacobian(self, x: Array) -> Array:
         jacobian = self.at(x).jacobian
-        return jacobian[:, : len(self.sizes)] * self.sizes
+        return np.asarray(jacobian[:, : len(self.sizes)] * self.sizes)
 
 
 Echo = Callable[[Array, float], None]

@@ -117,10 +117,10 @@ def _lanes(problem: Problem, thetas: Array, starts: Array, slopes: bool) -> _Lan
 
 
 def _integrate(problem: Problem, lanes: _Lanes) -> tuple[Array, NDArray[np.bool_]]:
-    """States (member, change, piece, time, n_states) and whether a trajectory failed (member, change, piece)."""
+    """States (member, change, piece, time, n_states), and which trajectories failed."""
     shape = lanes.start.shape[:3]
     n_pieces = shape[2]
-    packed = problem.pack(lanes.theta.reshape(-1, len(problem.free)))
+    packed = problem.pack(lanes.theta.reshape(shape[0] * shape[1], len(problem.free)))
     piece = np.tile(np.arange(n_pieces), shape[0] * shape[1])
     grids = [_grid(problem, k) for k in range(n_pieces)]
     drives = [p.drive for p in problem.pieces]
@@ -145,9 +145,9 @@ def _grid(problem: Problem, k: int) -> Array:
 def _read(problem: Problem, k: int, states: Array, theta: Array) -> Array:
     """What the sensors read of computed states, (..., n, n_channels)."""
     n = len(problem.pieces[k].time)
-    columns = list(problem.columns) if problem.continuity is not None else slice(None)
     offset = problem.zeros[problem.pieces[k].recording] @ theta
-    return np.asarray(states[..., :n, columns] + offset)
+    read = states if problem.continuity is None else states[..., list(problem.columns)]
+    return np.asarray(read[..., :n, :] + offset)
 
 
 def _block(
@@ -173,7 +173,7 @@ def _block(
     zero = -problem.zeros[piece.recording] / problem.noise[:, None]
     jacobian[:, :n_free] += np.broadcast_to(zero, (*given.shape, n_free))[given] * factor[:, None]
     # an orthogonal transformation changes neither the cost nor the normal equations
-    triangle = np.linalg.qr(np.column_stack([jacobian, rows]), mode="r")
+    triangle: Array = np.linalg.qr(np.column_stack([jacobian, rows]), mode="r")  # type: ignore[assignment]
     return k, triangle[:, -1], triangle[:, :-1]
 
 

@@ -1,14 +1,16 @@
 """The global stage: many first guesses, each followed to an optimum over stretches that grow.
 
-Far from the truth a long piece is out of step with its recording and the cost is rugged. Short stretches from
-smoothed states are not, so a guess is first fitted to those, then to longer ones, and to the whole pieces with
-free starts at last (multiple shooting: Bezruchko et al., Chaos Solitons Fractals 29, 2006, 82).
+Far from the truth a long piece is out of step with its recording and the cost is rugged. Short stretches
+from smoothed states are not, so a guess is first fitted to those, then to longer ones, and to the whole
+pieces
+with free starts at last (multiple shooting: Bezruchko et al., Chaos Solitons Fractals 29, 2006, 82).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -30,9 +32,6 @@ STAGE_SAMPLES = 40
 
 POPULATION = 32
 """Members that are integrated at once."""
-
-LIKELY = 4.0
-"""A start whose cost over the shortest stretches is so many times the least is not worth following further."""
 
 
 class Keep(Protocol):
@@ -68,8 +67,8 @@ def search(
     spread
         They lie within this fraction of the problem's own guess around it, and within the bounds.
     method
-        ``sobol``: the best of `n_samples` points of a Sobol sequence are followed, and CMA-ES is tried if none
-        of them converges; ``cma``: CMA-ES over the shortest stretches finds the guesses.
+        ``sobol``: the best of `n_samples` points of a Sobol sequence are followed, and CMA-ES is tried if
+        none of them converges; ``cma``: CMA-ES over the shortest stretches finds the guesses.
     n_samples
         Points that are looked at; at least `n_starts`.
     keep
@@ -189,7 +188,10 @@ def _stages(problem: Problem) -> list[Problem]:
 
 
 def slowest_period(problem: Problem) -> float:
-    """Longest period [s] of the oscillations of a channel, by its mean crossings; the longest piece if there are none."""
+    """Longest period [s] of a channel's oscillations, by its crossings of its mean.
+
+    The length of the longest piece if there are none.
+    """
     found = []
     for k in range(len(problem.channels)):
         times, crossings = 0.0, 0
@@ -218,7 +220,7 @@ def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
     count = max(int(piece.time[-1] / length_s), 1)
     bounds = np.linspace(0, n, count + 1).astype(int)
     found = []
-    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+    for a, b in pairwise(bounds):
         if b - a < 4 or not np.isfinite(piece.measured[a]).all():
             continue
         start = piece.start if a == 0 else _read_off(problem, piece, int(a), (b - a) // 6 + 2)

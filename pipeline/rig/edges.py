@@ -1,0 +1,291 @@
+"""Edges of a measured drive signal, and what they say of its frequency, jitter and duty cycle.
+
+The motor of a rig is told to switch; when it did is measured. The instants at which the signal rises through
+its middle are the sections' instants, and a line through them against their number is the drive's period:
+with n edges its error falls as n^-3/2; counting periods reaches one sample over n.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from pipeline.spec.problems import SpecError
+
+Floats = npt.NDArray[np.float64]
+
+DRIVE = "drive"
+_LEAST_CONTRAST = 6.0
+"""Least distance of the two levels in units of the noise: white noise alone splits into halves 1.35 apart."""
+_MOST_JITTER = 0.2
+"""Edges that scatter by more than this share of a period about a line are no periodic drive."""
+_HARMONICS = 40
+"""Of the sawtooth by which instants are rounded to samples."""
+_DRIFTS = 9
+_GAP = 1.5
+"""A step in time of so many sampling intervals is a gap: an edge inside it has no instant."""
+
+
+class Timing(NamedTuple):
+    """What a line through the rising edges says; errors are standard errors.
+
+    Attributes
+    ----------
+    frequency_hz, frequency_error_hz : float
+    jitter_s : float
+        Root mean square of the edges about the line [s].
+    duty_cycle, duty_cycle_error : float
+        Share of the period in the high state; NaN if no falling edge lies between rising ones.
+    n_periods : int
+        From the first edge to the last.
+    """
+
+    frequency_hz: float
+    frequency_error_hz: float
+    jitter_s: float
+    duty_cycle: float
+    duty_cycle_error: float
+    n_periods: int
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Instants at which a drive signal passes the middle between its two levels.
+
+    Attributes
+    ----------
+    rising, falling : ndarray
+        Instants [s], rising in time.
+    resolution_s : float
+        Sampling interval if the signal switches from one sample to the next, so that an instant is only known
+        to lie between two samples; 0 if samples lie on the flanks.
+    """
+
+    rising: Floats
+    falling: Floats
+    resolution_s: float = 0.0
+
+    def between(self, start_s: float, end_s: float) -> Edges:
+        """Edges in ``start_s <= t < end_s``."""
+        rising, falling = ((t[(t >= start_s) & (t < end_s)]) for t in (self.rising, self.falling))
+        return Edges(rising, falling, self.resolution_s)
+
+    def frequency(self) -> Timing:
+        """Fit a line through the rising edges against their number: frequency, jitter and duty cycle.
+
+        Edges that are missing in between are counted by the median distance of neighbours. The standard
+        errors take the edges' jitter as independent, and count what sampling hides: where edges fall on the
+        same few places between two samples, their scatter says little of an offset of up to half of one.
+
+        Raises
+        ------
+        SpecError
+            If there are fewer than three rising edges, or they scatter by more than a fifth of a period.
+        """
+        rising = self.rising
+        if rising.size < 3:
+            raise SpecError(
+                [f"drive: {rising.size} rising edges; a frequency needs 3: choose a longer window."]
+            )
+        number = _numbers(rising)
+        start, period = _line(number, rising)
+        fitted = start + period * number
+        residual = rising - fitted
+        jitter = math.sqrt(float(residual @ residual) / (rising.size - 2))
+        if jitter > _MOST_JITTER * period:
+            raise SpecError([
+                f"drive: its rising edges scatter by {jitter:.3g} s about a period of {period:.3g} s, so it "
+                "is not periodic here: choose a window of one frequency, or a larger hysteresis."
+            ])  # fmt: skip
+        spread = number - number.mean()
+        error = self._error(fitted, spread / (spread @ spread), jitter)
+        duty, duty_error = self._duty_cycle(fitted, period, jitter)
+        return Timing(1 / period, error / period**2, jitter, duty, duty_error, int(number[-1]))
+
+    def _duty_cycle(self, fitted: Floats, period: float, jitter: float) -> tuple[float, float]:
+        """Mean share of the high state, and its standard error; each falling edge follows its rising one."""
+        before = np.searchsorted(self.rising, self.falling, side="right") - 1
+        high = np.where(before >= 0, self.falling - self.rising[before], np.inf)
+        before, high = before[high < period], high[high < period]
+        if high.size < 2:
+            return math.nan, math.nan
+        mean, even = float(high.mean()), np.full(high.size, 1 / high.size)
+        # both kinds of edges scatter alike, or the high states' own scatter is larger
+        each = max(jitter, float(high.std(ddof=1)) / math.sqrt(2))
+        errors = [self._error(t, even, each) for t in (fitted[before], fitted[before] + mean)]
+        return mean / period, math.hypot(*errors) / period
+
+    def _error(self, fitted: Floats, weights: Floats, scatter: float) -> float:
+        """Standard error [s] of a weighted sum of instants.
+
+        An instant known to a sample is rounded to its middle: a sawtooth of the instant, which is not
+        independent from edge to edge. Its harmonics, of unknown phase, are added up as they are, damped by
+        the jitter that blurs them; the rest of the scatter is independent. Since the line itself is known to
+        about a sample only, drifts of up to one over the whole are averaged.
+        """
+        step = self.resolution_s
+        if not step:
+            return scatter * math.sqrt(float(weights @ weights))
+        blur = math.sqrt(max(scatter**2 - step**2 / 12, 0.0)) / step
+        k = np.arange(1, _HARMONICS + 1)
+        power = 0.5 * (step / (math.pi * k)) ** 2 * np.exp(-4 * (math.pi * k * blur) ** 2)
+        place = (fitted - fitted[0]) / step
+        share = np.linspace(-0.5, 0.5, fitted.size)
+        turns = place + share * np.linspace(-1, 1, _DRIFTS)[:, None]
+        sums = np.array([abs(np.exp(2j * np.pi * i * turns) @ weights) ** 2 for i in k]).mean(axis=1)
+        rest = max(scatter**2 - float(power.sum()), 0.0)
+        return math.sqrt(rest * float(weights @ weights) + float(power @ sums))
+
+
+def find_edges(time: npt.ArrayLike, drive: npt.ArrayLike, *, hysteresis: float | None = None) -> Edges:
+    """Find the instants at which a drive signal passes the middle between its two levels.
+
+    Parameters
+    ----------
+    time
+        Instants of the samples [s], rising, shape (n,).
+    drive
+        Signal or torque in any unit, shape (n,); finite.
+    hysteresis
+        Width of the band about the middle, in the signal's unit, that it must cross as a whole to count;
+        by default half of the distance of the levels.
+
+    Returns
+    -------
+    Edges
+        Instants by linear interpolation at the middle; where noise crosses it several times on one flank,
+        the mean of the first and the last. A crossing inside a gap of the sampling is left out.
+
+    Raises
+    ------
+    SpecError
+        If lengths differ, a value is not finite, time does not rise, the band is not inside the levels, or
+        the signal has no two levels that stand out of its noise: a constant drive.
+    """
+    t, x = _checked(time, drive)
+    return _found([(t, x)], _switch(x, hysteresis))
+
+
+def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges:
+    """Edges of all pieces of a recording; none lies in a gap between two.
+
+    Parameters
+    ----------
+    recording
+        As `pipeline.rig.recordings.read_recording` gives it, with a drive.
+    hysteresis
+        As for `find_edges`.
+
+    Raises
+    ------
+    SpecError
+        If the recording has no drive, or no piece of it has an edge.
+    """
+    if DRIVE not in recording:
+        name = recording.attrs.get("file", "the recording")
+        raise SpecError([
+            f"{name}: no drive channel, so neither its frequency nor its sections are known: add [drive] to "
+            'the mapping, as in drive = { channel = "rig/motor", kind = "signal" }.'
+        ])  # fmt: skip
+    time, drive = recording["time"].values, recording[DRIVE].values
+    piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
+    parts = [_checked(time[piece == k], drive[piece == k]) for k in np.unique(piece)]
+    # the levels are those of all pieces: a short one may lie within one of them
+    return _found(parts, _switch(np.concatenate([x for _, x in parts]), hysteresis))
+
+
+@dataclass(frozen=True)
+class _Switch:
+    """Middle and distance of the levels, and the width of the band about the middle."""
+
+    middle: float
+    span: float
+    band: float
+
+
+def _switch(x: Floats, hysteresis: float | None) -> _Switch:
+    """Levels of a signal; refuses one that has not two."""
+    low, high, noise = _levels(x)
+    span = high - low
+    if span <= _LEAST_CONTRAST * noise or span <= 0:
+        raise SpecError([
+            f"drive: no edges; its levels {low:.4g} and {high:.4g} do not stand out of noise, {noise:.2g}: "
+            'map the channel that switches, choose a window in which it runs, or say drive = "none".'
+        ])  # fmt: skip
+    band = 0.5 * span if hysteresis is None else hysteresis
+    if not 0 < band < span:
+        raise SpecError([
+            f"hysteresis = {band:g}: must be greater than 0 and less than the levels' distance, {span:g}."
+        ])  # fmt: skip
+    return _Switch(0.5 * (low + high), span, band)
+
+
+def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
+    """Edges of stretches of samples, in their order."""
+    instants, rises, sharp, steps = [], [], [], [0.0]
+    for t, x in parts:
+        above = x - switch.middle
+        state = np.where(above > switch.band / 2, 1, np.where(above < -switch.band / 2, -1, 0))
+        decided = np.flatnonzero(state)
+        turn = np.flatnonzero(np.diff(state[decided]))
+        step = float(np.median(np.diff(t)))
+        steps.append(step)
+        for a, b in zip(decided[turn], decided[turn + 1], strict=True):
+            if np.diff(t[a : b + 1]).max() < _GAP * step:
+                instants.append(_crossing(t[a : b + 1], above[a : b + 1]))
+                rises.append(above[b] > 0)
+                sharp.append(b == a + 1 and min(abs(above[a]), abs(above[b])) > 0.4 * switch.span)
+    at, up = np.array(instants, np.float64), np.array(rises, bool)
+    return Edges(at[up], at[~up], max(steps) if sharp and np.mean(sharp) > 0.5 else 0.0)
+
+
+def _checked(time: npt.ArrayLike, drive: npt.ArrayLike) -> tuple[Floats, Floats]:
+    t, x = np.asarray(time, np.float64), np.asarray(drive, np.float64)
+    if t.ndim != 1 or t.shape != x.shape:
+        raise SpecError([f"drive: shape {x.shape}, time {t.shape}; both must be (samples,), equally many."])
+    if t.size < 2:
+        raise SpecError([f"drive: {t.size} samples hold no edge; choose a longer window."])
+    bad = int((~np.isfinite(x)).sum() + (~np.isfinite(t)).sum())
+    if bad:
+        raise SpecError([f"drive: {bad} values are not finite; choose a window without them."])
+    if not (np.diff(t) > 0).all():
+        raise SpecError(["drive: time does not rise from sample to sample; sort or repair the recording."])
+    return t, x
+
+
+def _levels(x: Floats) -> tuple[float, float, float]:
+    """Lower and upper level, and the noise from sample to sample, which slow flanks do not touch."""
+    ends = np.percentile(x, [2, 98])
+    middle = ends.mean()
+    if ends[0] == ends[1]:
+        return float(ends[0]), float(ends[0]), 0.0
+    low, high = np.median(x[x <= middle]), np.median(x[x > middle])
+    noise = 1.4826 * np.median(np.abs(np.diff(x))) / math.sqrt(2)
+    return float(low), float(high), float(noise)
+
+
+def _crossing(t: Floats, above: Floats) -> float:
+    """Instant of the sign change; mean of the first and the last if there are several."""
+    at = np.flatnonzero((above[:-1] > 0) != (above[1:] > 0))[[0, -1]]
+    share = above[at] / (above[at] - above[at + 1])
+    return float((t[at] + share * (t[at + 1] - t[at])).mean())
+
+
+def _numbers(rising: Floats) -> Floats:
+    """Number of each edge, in periods from the first; one that is missing is counted."""
+    gaps = np.diff(rising)
+    steps = np.maximum(np.rint(gaps / np.median(gaps)), 1.0)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _line(number: Floats, rising: Floats) -> tuple[float, float]:
+    """Intercept and slope by least squares, about the means: no cancellation far from time 0."""
+    centred = number - number.mean()
+    slope = float(centred @ (rising - rising.mean()) / (centred @ centred))
+    return float(rising.mean() - slope * number.mean()), slope

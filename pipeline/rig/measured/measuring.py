@@ -1,0 +1,225 @@
+"""Measured diagrams: from recordings of a sweep to sections, period and kind of motion per step."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models import load_model
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import Parameters
+from pipeline.analysis.sides import UNKNOWN, flags_of
+from pipeline.rig.edges import Edges, edges_of
+from pipeline.rig.measured.regimes import LIMIT, MAX_PERIOD, Regime, find_period
+from pipeline.rig.measured.sections import ORDER, WINDOW_S, find_sections, name_of
+from pipeline.rig.measured.steps import LEAST, TRANSIENT, Stretch, cut
+from pipeline.spec.problems import SpecError
+
+DIRECTIONS = {1: "up", -1: "down", 0: "none"}
+
+
+@dataclass(frozen=True)
+class Way:
+    """How recordings are cut, sectioned and judged.
+
+    Attributes
+    ----------
+    transient : int
+        Drive periods dropped after each step.
+    window : int, optional
+        Drive periods of a window of a slow sweep; see `pipeline.rig.measured.steps.cut`.
+    window_s, order
+        Of the local polynomials; see `pipeline.rig.measured.sections.find_sections`.
+    hysteresis : float, optional
+        Of the drive's edges; see `pipeline.rig.edges.find_edges`.
+    limit, max_period
+        Of the period; see `pipeline.rig.measured.regimes.find_period`.
+    """
+
+    transient: int = TRANSIENT
+    window: int | None = None
+    window_s: float = WINDOW_S
+    order: int = ORDER
+    hysteresis: float | None = None
+    limit: float = LIMIT
+    max_period: int = MAX_PERIOD
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One row of a measured diagram."""
+
+    stretch: Stretch
+    recording: int
+    state: tuple[str, ...]
+    section: np.ndarray
+    noise: np.ndarray
+    regime: Regime
+
+
+def measure(
+    recordings: Sequence[xr.Dataset], way: Way | None = None, *, parameters: Parameters | None = None
+) -> xr.Dataset:
+    """Sections and regimes of each step of one sweep or more.
+
+    Parameters
+    ----------
+    recordings
+        As `pipeline.rig.recordings.read_recording` gives them, all of one model, each with a drive.
+    way
+        How they are cut and judged.
+    parameters
+        Of the model, which its classifier needs to tell motions apart; without them no words are given.
+
+    Returns
+    -------
+    Dataset
+        Dims ``step``, ``period_index`` (NaN beyond a step's own), ``state``. ``section`` and
+        ``section_noise`` (step, period_index, state), angles not wrapped; by step ``frequency_error_hz``,
+        ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``n_sections``, ``orbit_period`` (0: closes at no
+        period that was looked at), ``confidence``, ``closure``, ``margin`` (`regimes.Regime`), ``side``
+        (codes of the model's classifier; absent without one or without parameters). Coordinates of ``step``:
+        ``frequency`` [Hz], ``direction`` (up, down, none), ``recording``, ``start_s``, ``end_s``.
+
+    Raises
+    ------
+    SpecError
+        For recordings of different models or states, without a drive, without a stretch of one frequency or
+        without sections.
+    """
+    way = way or Way()
+    models = sorted({str(r.attrs.get("model", "")) for r in recordings})
+    if len(models) != 1:
+        raise SpecError([
+            f"recordings: of the models {', '.join(models) or 'none'}; a diagram is drawn of one: give "
+            "recordings whose mappings name the same model."
+        ])  # fmt: skip
+    model = load_model(models[0])
+    steps = [step for i, r in enumerate(recordings) for step in _steps(r, i, way, model)]
+    _check(steps, recordings)
+    found = _dataset(steps, model, recordings)
+    return found if parameters is None else with_sides(found, parameters)
+
+
+def _steps(recording: xr.Dataset, number: int, way: Way, model: Model) -> list[_Step]:
+    edges = edges_of(recording, hysteresis=way.hysteresis)
+    stretches = cut(edges, transient=way.transient, window=way.window)
+    instants = Edges(np.concatenate([s.edges.rising for s in stretches]), edges.falling, edges.resolution_s)
+    sections = find_sections(recording, instants, window_s=way.window_s, order=way.order)
+    names = tuple(str(n) for n in sections["state"].values)
+    scale = np.array([model.state(n).scale for n in names])
+    section, noise = (_in_place(sections, n, instants.rising.size) for n in ("section", "section_noise"))
+    found, first = [], 0
+    for stretch in stretches:
+        own = slice(first, first + stretch.edges.rising.size)
+        first = own.stop
+        kept = np.flatnonzero(np.isfinite(section[own]).all(axis=1))
+        if kept.size < LEAST:
+            continue
+        inner = slice(own.start + int(kept[0]), own.start + int(kept[-1]) + 1)
+        points = section[inner]
+        blur = _with_instants(points, noise[inner], names, model, stretch.instant_error_s)
+        regime = find_period(points / scale, blur / scale, limit=way.limit, max_period=way.max_period)
+        found.append(_Step(stretch, number, names, points, blur, regime))
+    return found
+
+
+def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
+    """Sections at the places of their edges, NaN where an edge has none: what follows counts periods."""
+    values = np.full((n, sections.sizes["state"]), np.nan)
+    values[sections["number"].values] = sections[name].values
+    return values
+
+
+def _with_instants(
+    points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, error_s: float
+) -> np.ndarray:
+    """Noise of sections, that of their instants included where the rate is known."""
+    both = noise.copy()
+    for i, name in enumerate(names):
+        rate = model.state(name).rate
+        if rate in names:
+            both[:, i] = np.hypot(noise[:, i], points[:, names.index(rate)] * error_s)
+    return both
+
+
+def _check(steps: Sequence[_Step], recordings: Sequence[xr.Dataset]) -> None:
+    """Refuse recordings without sections, or with different states."""
+    if not steps:
+        names = ", ".join(name_of(r) for r in recordings)
+        raise SpecError([
+            f"{names}: no stretch of one frequency holds {LEAST} sections; choose longer recordings, a smaller "
+            "transient, or a window of a slow sweep."
+        ])  # fmt: skip
+    states = sorted({", ".join(s.state) for s in steps})
+    if len(states) > 1:
+        raise SpecError([
+            f"recordings: they hold different states ({'; '.join(states)}); map the same channels of all."
+        ])  # fmt: skip
+
+
+def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Dataset]) -> xr.Dataset:
+    length = max(len(s.section) for s in steps)
+    section, noise = (np.full((len(steps), length, len(steps[0].state)), np.nan) for _ in range(2))
+    for i, step in enumerate(steps):
+        section[i, : len(step.section)] = step.section
+        noise[i, : len(step.section)] = step.noise
+    dims = ("step", "period_index", "state")
+    about = {"units": "see state_units", "long_name": "state at the rising edge"}
+    timing, regime = [s.stretch.timing for s in steps], [s.regime for s in steps]
+    rows = {
+        "frequency_error_hz": ([t.frequency_error_hz for t in timing], "Hz", "standard error of the frequency"),
+        "jitter_s": ([t.jitter_s for t in timing], "s", "scatter of the rising edges"),
+        "duty_cycle": ([t.duty_cycle for t in timing], "1", "share of the period in the high state"),
+        "duty_cycle_error": ([t.duty_cycle_error for t in timing], "1", "standard error of the duty cycle"),
+        "n_sections": ([len(s.section) for s in steps], "1", "sections"),
+        "orbit_period": ([r.orbit_period for r in regime], "1", "period in drive periods, 0: unclosed"),
+        "confidence": ([r.confidence for r in regime], "1", "share of resamples with this period"),
+        "closure": ([r.closure for r in regime], "1", "second differences in units of noise"),
+        "margin": ([r.margin for r in regime], "1", "ratio by which the nearest rival misses"),
+    }
+    found = xr.Dataset(
+        {
+            "section": (dims, section, about),
+            "section_noise": (dims, noise, {**about, "long_name": "noise of the state at the rising edge"}),
+            **{k: ("step", np.array(v), {"units": u, "long_name": n}) for k, (v, u, n) in rows.items()},
+        },
+        coords={
+            "frequency": ("step", [t.frequency_hz for t in timing], {"units": "Hz", "long_name": "drive frequency"}),
+            "direction": ("step", [DIRECTIONS[s.stretch.direction] for s in steps]),
+            "recording": ("step", [s.recording for s in steps]),
+            "start_s": ("step", [s.stretch.start_s for s in steps], {"units": "s", "long_name": "first edge"}),
+            "end_s": ("step", [s.stretch.end_s for s in steps], {"units": "s", "long_name": "last edge"}),
+            "state": list(steps[0].state),
+            "state_units": ("state", [model.state(n).unit for n in steps[0].state]),
+        },
+    )  # fmt: skip
+    simulated = any(int(r.attrs.get("simulated", 0)) for r in recordings)
+    return found.assign_attrs(
+        title="measured diagram", model=model.name, simulated=int(simulated),
+        recordings=json.dumps([{"file": name_of(r), "sha256": str(r.attrs.get("sha256", ""))} for r in recordings]),
+    )  # fmt: skip
+
+
+def with_sides(measured: xr.Dataset, parameters: Parameters) -> xr.Dataset:
+    """Add what the model's classifier says of each step, for the parameters that are taken to hold.
+
+    Without a classifier, or with a state unknown, nothing is added.
+    """
+    model = parameters.model
+    classifier = model.classifier
+    if classifier is None or tuple(measured["state"].values) != model.state_names:
+        return measured
+    codes = np.full(measured.sizes["step"], UNKNOWN, np.int8)
+    angles = np.array(model.is_angle)
+    for i in range(measured.sizes["step"]):
+        points = measured["section"].values[i]
+        points = points[np.isfinite(points).all(axis=1)]
+        turns = np.round((points[-1] - points[0])[angles] / (2 * np.pi)).astype(np.int64)
+        wrapped = np.where(angles, np.pi - np.mod(np.pi - points, 2 * np.pi), points)
+        codes[i] = classifier.classify(wrapped, turns, measured["frequency"].values[i], parameters)
+    return measured.assign(side=("step", codes, flags_of(classifier)))

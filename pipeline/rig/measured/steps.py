@@ -1,0 +1,233 @@
+"""Stretches of a sweep: where the drive kept one frequency, or windows of a drive that was swept slowly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.rig.edges import Edges, Timing
+from pipeline.spec.problems import SpecError
+
+Floats = npt.NDArray[np.float64]
+
+TRANSIENT, WINDOW, LEAST = 20, 40, 8
+"""Periods dropped after a step; periods of a window of a slow sweep; least periods of a stretch."""
+_OFF = 5.0
+"""An edge so many standard deviations off the line through those before it, and the next as well: a step."""
+_AROUND = 16
+"""Edges on either side of a step by which it is placed."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Consecutive periods of one frequency.
+
+    Attributes
+    ----------
+    edges : Edges
+        Those at which sections are taken, transient dropped. Where their scatter is that of sampling, rising
+        ones are those of the line through all edges of the stretch, which is nearer the drive's instants.
+    timing : Timing
+        Of all edges of the stretch.
+    start_s, end_s : float
+        Its first and last edge [s], the transient included.
+    instant_error_s : float
+        Standard error of a rising edge [s].
+    direction : int
+        1 if the frequency rose to this stretch, -1 if it fell, 0 if there is no other.
+    """
+
+    edges: Edges
+    timing: Timing
+    start_s: float
+    end_s: float
+    instant_error_s: float
+    direction: int
+
+
+def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) -> list[Stretch]:
+    """Cut a sweep into stretches of constant frequency, or a slow sweep into windows.
+
+    Parameters
+    ----------
+    edges
+        Of a recording.
+    transient
+        Periods that are dropped at the begin of each constant stretch.
+    window
+        Periods of a window of a slow sweep, of which none are dropped; 0 never cuts into windows. By default
+        windows of 40 are taken if most of the recording has no stretch that is long enough.
+
+    Returns
+    -------
+    list of Stretch
+        In the order of time, each with at least 8 periods left.
+
+    Raises
+    ------
+    SpecError
+        If a number is out of bounds, or nothing long enough is left.
+    """
+    problems = []
+    if transient < 0:
+        problems.append(f"transient = {transient}: must be at least 0.")
+    if window is not None and window != 0 and window < LEAST:
+        problems.append(f"window = {window}: must be 0 or at least {LEAST} periods.")
+    if problems:
+        raise SpecError(problems)
+    if edges.rising.size <= LEAST:
+        raise SpecError([
+            f"drive: {edges.rising.size} rising edges; a stretch needs more than {LEAST}: choose a longer "
+            "recording, or look at the drive's channel."
+        ])  # fmt: skip
+    if window:
+        return _directed(_windows(edges, window))
+    spans = constant_spans(edges)
+    kept = [(a, b) for a, b in spans if b - a >= transient + LEAST]
+    if window is None and sum(b - a for a, b in kept) < 0.5 * (edges.rising.size - 1):
+        swept = _windows(edges, WINDOW) if edges.rising.size > WINDOW else []
+        if swept and not kept:
+            return _directed(swept)
+        if swept and len(spans) > 2 * len(kept) + 2:
+            return _directed(swept)
+    if not kept:
+        longest = max(b - a for a, b in spans)
+        raise SpecError([
+            f"drive: the longest stretch of one frequency has {longest} periods, and {transient} of transient and "
+            f"{LEAST} of sections are wanted: lower transient, or give window for a drive that is swept slowly."
+        ])  # fmt: skip
+    return _directed([_constant(edges, a, b, transient) for a, b in kept])
+
+
+def constant_spans(edges: Edges) -> list[tuple[int, int]]:
+    """First and last rising edge of each stretch in which edges lie on a line; neighbours share an edge."""
+    t = edges.rising
+    noise = _noise(edges)
+    spans, first = [], 0
+    while first < t.size - 1:
+        last = _reach(t, first, noise)
+        if last < t.size - 1 and t[last + 1] - t[last] < 1.5 * (t[last] - t[first]) / (last - first):
+            last = _placed(t, first, last)
+        spans.append((first, last))
+        lost = last + 1 < t.size and t[last + 1] - t[last] > 1.5 * (t[last] - t[first]) / max(last - first, 1)
+        first = last + 1 if lost else last
+    return spans
+
+
+def _noise(edges: Edges) -> float:
+    """Standard deviation of an edge [s]: from second differences, which steps of the frequency rarely touch."""
+    second = np.diff(edges.rising, 2)
+    own = 1.4826 * float(np.median(np.abs(second))) / math.sqrt(6) if second.size else 0.0
+    period = float(np.median(np.diff(edges.rising)))
+    return max(own, edges.resolution_s / math.sqrt(12), 1e-7 * period)
+
+
+def _reach(t: Floats, first: int, noise: float) -> int:
+    """Last edge that lies on the line through those before it."""
+    if first + 2 >= t.size:
+        return int(t.size - 1)
+    period = t[first + 1] - t[first]
+    n = np.arange(t.size - first, dtype=np.float64)
+    x = t[first:] - t[first] - period * n  # small numbers: nothing cancels in the sums below
+    s0, s1, s2, sx, snx = 2.0, 1.0, 1.0, x[0] + x[1], x[1]
+    off = 0
+    for k in range(2, x.size):
+        spread = s2 - s1 * s1 / s0
+        slope = (snx - s1 * sx / s0) / spread
+        ahead = n[k] - s1 / s0
+        error = noise * math.sqrt(1 + 1 / s0 + ahead**2 / spread)
+        miss = abs(x[k] - sx / s0 - slope * ahead)
+        if t[first + k] - t[first + k - 1] > 1.5 * (period + slope):
+            return first + k - 1
+        off = off + 1 if miss > _OFF * error else 0
+        if off == 2:
+            return first + k - 2
+        if not off:
+            s0, s1, s2 = s0 + 1, s1 + n[k], s2 + n[k] ** 2
+            sx, snx = sx + x[k], snx + n[k] * x[k]
+    return int(t.size - 1)
+
+
+def _placed(t: Floats, first: int, last: int) -> int:
+    """Place a step at the edge where two lines, through those before and those after, fit best."""
+    low, high = max(first, last - _AROUND), min(t.size - 1, last + _AROUND)
+    choices = range(max(low + 2, first + 1), min(last + 2, high - 1))
+    costs = {k: _misfit(t[low : k + 1]) + _misfit(t[k : high + 1]) for k in choices}
+    return min(costs, key=costs.__getitem__) if costs else last
+
+
+def _misfit(t: Floats) -> float:
+    """Sum of squares about the line through instants."""
+    n = np.arange(t.size) - 0.5 * (t.size - 1)
+    x = t - t.mean()
+    return float(((x - n * (n @ x) / (n @ n)) ** 2).sum())
+
+
+def _constant(edges: Edges, first: int, last: int, transient: int) -> Stretch:
+    """Stretch between two edges; sections from `transient` periods on."""
+    rising = edges.rising[first : last + 1]
+    own = edges.between(rising[0], math.nextafter(rising[-1], math.inf))
+    return _stretch(own, np.zeros(rising.size), transient)
+
+
+def _windows(edges: Edges, window: int) -> list[Stretch]:
+    """Windows of a slow sweep: the frequency is that of their middle, once the edges' bend is taken out."""
+    found = []
+    for first in range(0, edges.rising.size - window, window):
+        rising = edges.rising[first : first + window + 1]
+        if np.diff(rising).max() > 1.5 * np.median(np.diff(rising)):
+            continue  # a gap
+        own = edges.between(rising[0], math.nextafter(rising[-1], math.inf))
+        n = np.arange(window + 1, dtype=np.float64) - 0.5 * window
+        bend = np.polynomial.Polynomial.fit(n, rising, 2).convert().coef
+        curve = np.asarray((float(bend[2]) if bend.size > 2 else 0.0) * n**2)
+        found.append(_stretch(own, curve, 0))
+    if not found:
+        raise SpecError([
+            f"window = {window}: the recording has {edges.rising.size - 1} periods without a gap at most; "
+            "choose a shorter window."
+        ])  # fmt: skip
+    return found
+
+
+def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
+    """Judge the edges of a stretch once `curve` [s] is taken out of them."""
+    rising = own.rising
+    # a falling edge is shifted as its place between rising ones says
+    falling = own.falling - np.interp(own.falling, rising, curve)
+    timing = Edges(rising - curve, falling, own.resolution_s).frequency()
+    line = _line(rising - curve) + curve
+    sampled = own.resolution_s / math.sqrt(12)
+    by_sampling = timing.jitter_s < 1.5 * sampled
+    instants = line if by_sampling else rising
+    error = timing.jitter_s * math.sqrt(2 / rising.size) if by_sampling else sampled
+    kept = Edges(instants[transient:], own.falling[own.falling > instants[transient]], own.resolution_s)
+    return Stretch(kept, timing, float(rising[0]), float(rising[-1]), error, 0)
+
+
+def _line(rising: Floats) -> Floats:
+    """Instants on the line through edges; one that is missing does not shift the others."""
+    gaps = np.diff(rising)
+    n = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(gaps / np.median(gaps)), 1.0))])
+    centred = n - n.mean()
+    slope = centred @ (rising - rising.mean()) / (centred @ centred)
+    return np.asarray(rising.mean() + slope * centred)
+
+
+def _directed(stretches: list[Stretch]) -> list[Stretch]:
+    """Tell each stretch whether the frequency rose or fell to it; the first is told by the second."""
+    f = np.array([s.timing.frequency_hz for s in stretches])
+    error = np.array([s.timing.frequency_error_hz for s in stretches])
+    signs = [0] * len(stretches)
+    for i in range(1, len(stretches)):
+        change, slack = f[i] - f[i - 1], 4 * math.hypot(error[i], error[i - 1])
+        signs[i] = int(np.sign(change)) if abs(change) > slack else signs[i - 1]
+    known = next((s for s in signs if s), 0)
+    signs = [s or known for s in signs]
+    return [
+        Stretch(s.edges, s.timing, s.start_s, s.end_s, s.instant_error_s, sign)
+        for s, sign in zip(stretches, signs, strict=True)
+    ]
