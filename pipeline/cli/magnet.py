@@ -12,7 +12,11 @@ from pipeline.cli.common import Json
 
 def fit_magnet(
     measurement: Annotated[
-        Path, typer.Argument(metavar="MEASUREMENT.toml", help="Header of a table of torque readings.")
+        str,
+        typer.Argument(
+            metavar="MEASUREMENT",
+            help="Header of a table of torque readings, a TOML file; or discs, which ships.",
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -30,11 +34,12 @@ def fit_magnet(
 
     from pipeline.cli import console
     from pipeline.rig.magnet.fitting import fit_measurement
-    from pipeline.rig.magnet.measurement import read_measurement
+    from pipeline.rig.magnet.measurement import find_measurement, read_measurement
     from pipeline.rig.magnet.results import report_of, summary_of, warnings_of, write_results
 
-    folder = _folder(out or Path(measurement.stem + "-fit"))
-    outcome = fit_measurement(read_measurement(measurement))
+    header = find_measurement(measurement)
+    folder = _folder(out or Path(header.stem + "-fit"))
+    outcome = fit_measurement(read_measurement(header))
     folder.mkdir(exist_ok=True)
     written = write_results(outcome, folder)
     if not no_figures:

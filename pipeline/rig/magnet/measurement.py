@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,7 +24,7 @@ from magpend_core.models.parameters import ParameterError, Parameters
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.presets import find_preset
 from pipeline.spec.files import read_toml
-from pipeline.spec.problems import SpecError, unknown_choice, validated
+from pipeline.spec.problems import SpecError, unknown_choice, unknown_name, validated
 from pipeline.spec.tables import Table
 
 MIN_READINGS = 5
@@ -219,8 +220,30 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
     return tuple(found)
 
 
+def find_measurement(name: str | Path) -> Path:
+    """Return the path of a header: a file, or the bare name of a measurement that ships.
+
+    Raises
+    ------
+    SpecError
+        If there is neither.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    shipped = {p.stem: p for p in sorted(Path(str(resources.files("workflows"))).glob("magnet/*.toml"))}
+    if str(name) in shipped:
+        return shipped[str(name)]
+    raise SpecError([f"{name}: no such file; {unknown_name('measurement', str(name), shipped)}"])
+
+
 def read_measurement(path: str | Path) -> Measurement:
     """Read a header and its table.
+
+    Parameters
+    ----------
+    path
+        Of the header; see `find_measurement`.
 
     Raises
     ------

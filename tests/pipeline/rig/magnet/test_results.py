@@ -118,6 +118,17 @@ def test_fit_magnet__the_preset_drives_a_simulation(main, rig, tmp_path):
     assert len(series.read_text().splitlines()) == 402
 
 
+def test_fit_magnet__takes_a_measurement_that_ships_by_name(main, tmp_path):
+    code, result, notes = main("fit-magnet", "discs", "--no-figures")
+    assert code == 0
+    assert result.startswith("SYNTHETIC: two 33 mm x 10 mm N38 discs")
+    assert "what is left over is the law's, not noise" in notes
+    assert (tmp_path / "discs-fit" / "preset.toml").is_file()
+    code, _, notes = main("fit-magnet", "disks")
+    assert code == 2
+    assert "did you mean discs" in notes
+
+
 def test_fit_magnet__refuses_a_bad_measurement_and_writes_nothing(main, rig, tmp_path):
     rig.path.write_text(rig.path.read_text().replace('"torque"', '"moment"'))
     code, _, notes = main("fit-magnet", str(rig.path), "--out", str(tmp_path / "fit"))
