@@ -172,7 +172,11 @@ def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Datas
     about = {"units": "see state_units", "long_name": "state at the rising edge"}
     timing, regime = [s.stretch.timing for s in steps], [s.regime for s in steps]
     rows = {
-        "frequency_error_hz": ([t.frequency_error_hz for t in timing], "Hz", "standard error of the frequency"),
+        "frequency_error_hz": (
+            [t.frequency_error_hz for t in timing],
+            "Hz",
+            "standard error of the frequency",
+        ),
         "jitter_s": ([t.jitter_s for t in timing], "s", "scatter of the rising edges"),
         "duty_cycle": ([t.duty_cycle for t in timing], "1", "share of the period in the high state"),
         "duty_cycle_error": ([t.duty_cycle_error for t in timing], "1", "standard error of the duty cycle"),

@@ -23,7 +23,7 @@ from pipeline.spec.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 
-WINDOW_S = 0.1
+WINDOW_S = 0.08
 """Width of the window about an edge [s]."""
 ORDER = 3
 _LEAST_SPARE = 3
