@@ -53,7 +53,11 @@ def _evaluate(t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
                 out[first + lane, i] = values[i * WIDTH + lane]
 
 
-_KINDS = {"rates": _rates, "jacobian": _slopes, "quantities": _named}
+def _forced(t: Any, y: Any, c: Any) -> Any:
+    return (0.0 * y[0] + forcing(t, c),)
+
+
+_KINDS = {"rates": _rates, "jacobian": _slopes, "quantities": _named, "forcing": _forced}
 
 
 @cache
@@ -114,6 +118,32 @@ def rates(t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np
         If a state is not finite or has the wrong shape, or the frequency is not positive.
     """
     return _at("rates", parameters.model.system.n_states, t, state, parameters, frequency_hz)
+
+
+def drive_level(t: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
+    """Forcing at given times, in the unit of the model's own.
+
+    Parameters
+    ----------
+    t
+        Times since a section [s], shape (n,).
+    parameters
+        See `Model.load`.
+    frequency_hz
+        Drive frequency [Hz].
+
+    Returns
+    -------
+    ndarray
+        Shape (n,).
+
+    Raises
+    ------
+    ValueError
+        If the frequency is not positive.
+    """
+    at_rest = np.zeros((*np.shape(t), parameters.model.system.n_states))
+    return _at("forcing", 1, t, at_rest, parameters, frequency_hz)[..., 0]
 
 
 def jacobian(t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:

@@ -102,6 +102,8 @@ class System:
         section, from the states, their rates, the forcing and the constants.
     tangents_of : System or None
         The system whose tangent vectors this one carries along (see `variational.with_tangents`).
+    recorded_for : System or None
+        The system of which this one follows a recorded drive (see `driven.with_recorded_drive`).
 
     Examples
     --------
@@ -147,6 +149,7 @@ class System:
     quantity_names: tuple[str, ...] = ()
     quantities: Callable[..., Any] | None = None
     tangents_of: System | None = field(default=None, compare=False, repr=False)
+    recorded_for: System | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         from magpend_core.engine.absent import no_edges, no_forcing, no_layers  # brings the compiler

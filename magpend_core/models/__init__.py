@@ -14,7 +14,7 @@ from magpend_core.models.parameters import ParameterError, Parameters, near_name
 DEFAULT = "pendulum"
 """The model of a specification that names none."""
 
-ROOMS = ("pendulum", "duffing")
+ROOMS = ("pendulum", "double_pendulum", "duffing")
 """Modules here that have a tuple ``MODELS``."""
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib
 import itertools
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magpend_core.models.parameters import Parameter, ParameterError, Parameters, near_names
+from magpend_core.models.presets import Preset as Preset
+from magpend_core.models.presets import completed, find_preset
 
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
@@ -137,32 +138,6 @@ class Drawing:
     lines: tuple[tuple[str, ...], ...]
     trace: str
     unit: str = "m"
-
-
-@dataclass(frozen=True)
-class Preset:
-    """Named values of parameters, and where each comes from.
-
-    Attributes
-    ----------
-    name : str
-    values : dict
-    provenance : dict
-        A phrase by parameter name.
-    """
-
-    name: str
-    values: Mapping[str, float]
-    provenance: Mapping[str, str]
-
-    @classmethod
-    def read(cls, path: Path) -> Preset:
-        """Read a TOML file: tables of values, and ``[provenance]`` by parameter or by table."""
-        tables = tomllib.loads(path.read_text("utf-8"))
-        origin = tables.pop("provenance", {})
-        values = {name: value for table in tables.values() for name, value in table.items()}
-        known = {n: origin.get(n, origin.get(t, "")) for t, table in tables.items() for n in table}
-        return cls(path.stem, values, known)
 
 
 def _no_relations(values: Mapping[str, float]) -> list[str]:
@@ -295,23 +270,38 @@ class Model:
         hint = near_names(name, self.parameter_names, "parameters")
         raise ParameterError([f"{name!r} is not a parameter of {self.name}; {hint}"])
 
-    def preset(self, name: str | None = None) -> Preset:
-        """Return a preset by name, by default the first; raises `ParameterError` if there is none."""
+    def preset(self, name: str | Path | Preset | None = None) -> Preset:
+        """Return a preset with all that it has values for.
+
+        Parameters
+        ----------
+        name
+            Of one that ships (by default the first); a file, by a path or a name that ends in ``.toml``; or
+            what was read of one.
+
+        Raises
+        ------
+        ParameterError
+            If there is none, or what the file holds is no preset of this model.
+        """
         if name is None:
             return self.presets[0]
+        found = name if isinstance(name, Preset) else find_preset(name)
+        if isinstance(found, Preset):
+            return found if found in self.presets else completed(found, self)
         for p in self.presets:
-            if p.name == name:
+            if p.name == found:
                 return p
-        hint = near_names(name, self.preset_names, "presets")
-        raise ParameterError([f"preset {name!r} does not exist for {self.name}; {hint}"])
+        hint = near_names(str(found), self.preset_names, "presets")
+        raise ParameterError([f"preset {found!r} does not exist for {self.name}; {hint}"])
 
-    def load(self, preset: str | None = None, **overrides: float) -> Parameters:
+    def load(self, preset: str | Path | Preset | None = None, **overrides: float) -> Parameters:
         """Return the parameters of a preset, some of them replaced.
 
         Parameters
         ----------
         preset
-            One of `preset_names`; by default the first.
+            One of `preset_names` (by default the first), or a file, see `preset`.
         overrides
             Values by parameter name.
 

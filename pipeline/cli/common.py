@@ -61,8 +61,7 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
     from pipeline.cli import console
 
     if as_json:
-        rows = [{name: _json(value) for name, value in row.items()} for row in table.rows]
-        console.result(json.dumps(rows, indent=1))
+        console.result(json.dumps(json_rows(table), indent=1))
     elif csv == "-":
         text = io.StringIO()
         write_csv(table.rows, text)
@@ -74,6 +73,11 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
         with Path(str(csv)).open("w", newline="", encoding="utf-8") as file:
             write_csv(table.rows, file)
         console.note(f"table: {csv}")
+
+
+def json_rows(table: Table) -> list[dict[str, Any]]:
+    """Rows of a table as JSON has them."""
+    return [{name: _json(value) for name, value in row.items()} for row in table.rows]
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], file: Any) -> None:

@@ -17,6 +17,7 @@ from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.models import models, presets
 from pipeline.cli.options import speaking
 from pipeline.cli.plot import plot_app
+from pipeline.cli.recordings import recordings_app
 from pipeline.cli.running import run, status, verify
 from pipeline.cli.simulate import EXTRA, simulate
 from pipeline.cli.zoom import zoom
@@ -56,6 +57,7 @@ for _command, _settings in (
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(plot_app, name="plot")
+app.add_typer(recordings_app, name="recordings")
 
 
 def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:

@@ -12,6 +12,7 @@ from pipeline.cli.options import completing
 
 if TYPE_CHECKING:
     from magpend_core.models.model import Model
+    from magpend_core.models.presets import Preset
 
 
 DEFAULT = "pendulum"
@@ -86,24 +87,32 @@ def _table(rows: Sequence[tuple[str, ...]]) -> list[str]:
     ]
 
 
-def _preset(model: Model, name: str) -> list[str]:
+def _preset(model: Model, name: str | Preset) -> list[str]:
     """Values of a preset, and where each comes from."""
-    known, origin = model.load(name), model.preset(name).provenance
+    found = model.preset(name)
+    known, origin = model.load(found), found.provenance
     rows = [
         (p.name, f"{known[p.name]:g}", p.unit, p.meaning, origin.get(p.name, "")) for p in model.parameters
     ]
-    return [f"preset {name}", *_table(rows)]
+    title = f": {found.title}" if found.title else ""
+    return [f"preset {found.name}{title}", *_table(rows)]
 
 
 def presets(
-    name: Annotated[str | None, typer.Argument(help="Show this preset alone.")] = None,
-    model: Annotated[str, typer.Option(help="Whose presets.", autocompletion=completing(names))] = DEFAULT,
+    name: Annotated[
+        str | None, typer.Argument(help="Show this preset alone; or a file of one, FILE.toml.")
+    ] = None,
+    model: Annotated[
+        str, typer.Option(help="Whose presets; a file names its own.", autocompletion=completing(names))
+    ] = DEFAULT,
 ) -> None:
     """List the presets of a model: values, units, and where each comes from."""
     from magpend_core.models import load_model
+    from magpend_core.models.presets import find_preset
     from pipeline.cli import console
 
-    chosen = load_model(model)
-    for preset in [chosen.preset(name).name] if name else chosen.preset_names:
+    found = find_preset(name) if name else None
+    chosen = load_model(getattr(found, "model", "") or model)
+    for preset in [found] if found else chosen.preset_names:
         for line in _preset(chosen, preset):
             console.result(line)

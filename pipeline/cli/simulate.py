@@ -29,7 +29,8 @@ def simulate(
         float, typer.Option("--frequency-hz", "--frequency", help="Drive frequency [Hz].")
     ] = 2.2,
     preset: Annotated[
-        str | None, typer.Option(help="Parameter preset; by default the model's first.")
+        str | None,
+        typer.Option(help="Parameter preset, or a file of one: FILE.toml; by default the model's first."),
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")

@@ -12,6 +12,7 @@ import numpy as np
 
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model
+from magpend_core.models.presets import Preset
 from pipeline.spec.problems import SpecError, unknown_name
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def simulate(
     initial_state: Sequence[float],
     *,
     model: str = DEFAULT,
-    preset: str | None = None,
+    preset: str | Path | Preset | None = None,
     overrides: Mapping[str, float] | None = None,
     n_transient: int = 0,
     n_periods: int = 10,
@@ -48,7 +49,7 @@ def simulate(
     model
         Name of a model, see `magpend_core.load_model`.
     preset, overrides
-        Parameters by name, see `magpend_core.models.model.Model.load`.
+        Name or file of a preset and parameters by name, see `magpend_core.models.model.Model.load`.
     n_transient
         Drive periods before the series begins.
     n_periods, samples_per_period
@@ -76,7 +77,8 @@ def simulate(
     problems = _problems(frequency_hz, n_transient, n_periods, samples_per_period, rtol, atol)
     problems += _state_problems(chosen, initial_state)
     try:
-        parameters = chosen.load(preset, **(overrides or {}))
+        found = chosen.preset(preset)
+        parameters = chosen.load(found, **(overrides or {}))
     except ParameterError as error:
         problems += error.problems
     if problems:
@@ -86,7 +88,11 @@ def simulate(
     state = np.array(initial_state, dtype=np.float64)
     series = trajectory(parameters, frequency_hz, state, time, rtol=rtol, atol=atol)
     ds = _labelled(parameters, frequency_hz, time, series)
-    return ds.assign_attrs(initial_state=state, n_transient=n_transient, rtol=rtol, atol=atol)
+    origin = {**found.provenance, **dict.fromkeys(overrides or {}, "given")}
+    sources = "\n".join(f"{name}: {origin.get(name, '')}" for name in parameters)
+    return ds.assign_attrs(
+        preset=found.name, sources=sources, initial_state=state, n_transient=n_transient, rtol=rtol, atol=atol
+    )
 
 
 def _labelled(

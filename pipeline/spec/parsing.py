@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from pydantic import BaseModel, ValidationError
 from magpend_core.models import DEFAULT, ModelError, load_model, model_names
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import ParameterError, Parameters, unknown_name_problem
+from magpend_core.models.presets import Preset, is_file
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.files import merged, nested, read_toml
@@ -69,7 +70,7 @@ class Spec:
     @cached_property
     def values(self) -> Parameters:
         """Values of the parameters off the axes."""
-        return self.model.load(self.parameters.preset, **self.parameters.overrides)
+        return self.model.load(self.parameters.chosen, **self.parameters.overrides)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data with all defaults filled in; `parse_spec` reads it back."""
@@ -114,10 +115,11 @@ def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
     SpecError
         With all problems at once; also if the file cannot be read or is not TOML.
     """
-    return parse_spec(_with_smoke(read_toml(path), smoke))
+    folder = Path(path).parent
+    return parse_spec(_with_smoke(read_toml(path), smoke, folder), folder)
 
 
-def _with_smoke(data: dict[str, Any], smoke: bool) -> dict[str, Any]:
+def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, Any]:
     """Split off ``[smoke]``, check it in either case, and merge it if asked."""
     plain = {key: value for key, value in data.items() if key != "smoke"}
     if "smoke" not in data:
@@ -129,27 +131,35 @@ def _with_smoke(data: dict[str, Any], smoke: bool) -> dict[str, Any]:
         raise SpecError([f"smoke = {table!r}: must be a table of keys to replace."])
     small = merged(plain, nested(table))
     try:
-        parse_spec(small)
+        parse_spec(small, folder)
     except SpecError as error:
-        _raise_new(plain, error)
+        _raise_new(plain, folder, error)
     return small if smoke else plain
 
 
-def _raise_new(plain: dict[str, Any], smoke_error: SpecError) -> None:
+def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> None:
     """Raise the plain problems together with those that the smoke table brings."""
     try:
-        parse_spec(plain)
+        parse_spec(plain, folder)
         own: list[str] = []
     except SpecError as error:
         own = error.problems
     raise SpecError(own + [f"with [smoke]: {p}" for p in smoke_error.problems if p not in own])
 
 
-def parse_spec(data: Mapping[str, Any]) -> Spec:
+def parse_spec(data: Mapping[str, Any], folder: str | Path = ".") -> Spec:
     """Validate plain data.
 
     Every table is validated by itself, so that one with errors does not hide those of the others;
-    then whatever can be checked between the valid ones is.
+    then whatever can be checked between the valid ones is. The file of a preset is read here, and its
+    content takes the place of its name: what a run keeps needs the file no more.
+
+    Parameters
+    ----------
+    data
+        Tables as TOML or `Spec.as_dict` has them.
+    folder
+        From where the path of a preset's file counts.
 
     Raises
     ------
@@ -157,6 +167,7 @@ def parse_spec(data: Mapping[str, Any]) -> Spec:
         With all problems at once.
     """
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
+    data = _with_preset(data, folder, problems)
     kind, title, model = _kind(data, problems), _title(data, problems), _model(data, problems)
     tables = {name: _table(data, name, table, problems) for name, table in _TABLES.items()}
     axes = _axes(data, problems)
@@ -176,6 +187,21 @@ def parse_spec(data: Mapping[str, Any]) -> Spec:
         kind, title, model.name, tables["parameters"], axes, starts, walk, tables["integration"], products,
         tables["execution"],
     )  # fmt: skip
+
+
+def _with_preset(data: Mapping[str, Any], folder: str | Path, problems: list[str]) -> Mapping[str, Any]:
+    """Put the content of a preset's file in the place of its name; without it, if it cannot be read."""
+    table = data.get("parameters")
+    name = table.get("preset") if isinstance(table, dict) else None
+    if table is None or not isinstance(name, str) or not is_file(name):
+        return data
+    rest = {key: value for key, value in table.items() if key != "preset"}
+    try:
+        content = asdict(Preset.read(Path(folder) / name))
+    except ParameterError as error:
+        problems += [f"parameters.preset: {p}" for p in error.problems]
+        return {**data, "parameters": rest}
+    return {**data, "parameters": {"preset": content, **rest}}
 
 
 def _model(data: Mapping[str, Any], problems: list[str]) -> Model | None:
@@ -351,11 +377,11 @@ def _parameter_problems(
     problems = _frequency_problems(table, declared, axes, complete)
     swept = {name: axis.array() for name, axis in axes.items() if name != FREQUENCY}
     try:
-        base = model.load(table.preset)
+        base = model.load(table.chosen)
     except ParameterError as error:
         return problems + [f"parameters.preset: {p}" for p in error.problems]
     try:
-        base = model.load(table.preset, **table.overrides)
+        base = model.load(table.chosen, **table.overrides)
     except ParameterError as error:
         problems += [f"parameters.overrides: {p}" for p in error.problems]
     known = (*base.names, FREQUENCY)

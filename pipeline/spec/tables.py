@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 from fractions import Fraction
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+
+from magpend_core.models.presets import Preset
 
 FREQUENCY = "frequency_hz"
 """The drive's frequency among the parameters."""
@@ -70,14 +72,49 @@ class Range(Table):
         return np.array([float(start + i * step) for i in range(num)], dtype=np.float64)
 
 
+class PresetTable(Table):
+    """What the file of a preset holds, so that a specification with it needs the file no more."""
+
+    name: str
+    model: str
+    base: str = ""
+    title: str = ""
+    values: dict[str, float]
+    provenance: dict[str, str]
+
+    def preset(self) -> Preset:
+        """Return the preset of the table."""
+        return Preset(**self.model_dump())
+
+
+def _name_or_table(value: Any) -> str:
+    return "(table)" if isinstance(value, dict | PresetTable) else "(name)"
+
+
 class ParametersTable(Table):
     """``[parameters]``: the preset, what differs from it, and the frequency unless it is an axis."""
 
-    preset: str | None = Field(None, description="Preset of the model; by default its first.")
+    nested_model: ClassVar[type[BaseModel] | None] = PresetTable
+    preset: (
+        Annotated[
+            Annotated[str, Tag("(name)")] | Annotated[PresetTable, Tag("(table)")],
+            Discriminator(_name_or_table),
+        ]
+        | None
+    ) = Field(
+        None,
+        description="Preset of the model, by default its first; or a file of one, FILE.toml, seen from the "
+        "specification.",
+    )
     overrides: dict[str, float] = Field({}, description="Values by parameter name, SI units.")
     frequency_hz: Annotated[float, Field(gt=0)] | None = Field(
         None, description="Drive frequency [Hz], unless it is an axis."
     )
+
+    @property
+    def chosen(self) -> str | Preset | None:
+        """The preset as `Model.load` takes it."""
+        return self.preset.preset() if isinstance(self.preset, PresetTable) else self.preset
 
 
 class Continuation(Table):

@@ -22,6 +22,7 @@ _HOMES = {
     "magpend_core.models": ("load_model", "load_preset", "model_names", "preset_names"),
     "magpend_core.models.model": ("Model",),
     "magpend_core.models.parameters": ("ParameterError", "Parameters"),
+    "magpend_core.models.presets": ("write_preset",),
     "magpend_core.sections": ("Sections", "run_branches", "sections"),
     "magpend_core.trajectory": ("trajectory",),
     "magpend_core.orbits": ("PeriodicOrbits", "polish_orbits"),

@@ -1,0 +1,278 @@
+"""Many trajectories in step, each seen at its own instants: the engine's dense output on all lanes.
+
+Where `lanes.advance` sees a trajectory once a period, this loop writes states at given times, by the
+continuous extension of the Dormand-Prince pair, and lets the drive change from interval to interval: each has
+its own length and its own values of some parameters. So a recording's instants and a recorded drive are
+followed as they are. A trajectory's numbers depend on its own inputs alone, as everywhere in the engine.
+
+The functions here are templates, bound to a system by `sampler_of` (see `lanes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from magpend_core.engine.jit import UNCOUNTED, inline, is_covered, kernel, specialise
+from magpend_core.engine.lanes import (
+    DIVERGED,
+    FIRST_STEP,
+    NOTHING,
+    PENDING,
+    REACHED,
+    STEP_LIMIT,
+    STEP_UNDERFLOW,
+    TOO_MANY_STEPS,
+    engine_bindings,
+)
+from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.simd import WIDTH, load, store
+from magpend_core.engine.system import System
+from magpend_core.engine.tableau import DENSE, N_STAGES
+from magpend_core.engine.vecmath import TWO_PI
+from magpend_core.status import Status
+
+BOUNDED = int(Status.BOUNDED)
+
+COINCIDENT_S = 1e-9
+"""Times that differ by less are one: sums of a drive's intervals round."""
+
+
+class Samples(NamedTuple):
+    """Input and output arrays of `follow_all`; pieces lie one after the other."""
+
+    parameters: Any  # (trajectory, n_parameters)
+    initial: Any  # (trajectory, n_states)
+    piece: Any  # int64 (trajectory,)
+    times: Any  # (time,) s since the piece's start, rising within a piece
+    first_time: Any  # int64 (piece + 1,)
+    durations: Any  # (interval,) s
+    values: Any  # (interval, n_changed)
+    first_interval: Any  # int64 (piece + 1,)
+    changed: Any  # int64 (n_changed,): the parameters that `values` are of
+    start: Any  # (piece,) s, of a piece within its first interval
+    columns: Any  # int64: the states that are written
+    slack: float
+    out: Any  # (trajectory, longest, n_columns)
+    status: Any  # int64 (trajectory,)
+    n_steps: Any  # int64 (trajectory,)
+
+
+class Seats(NamedTuple):
+    """What each lane is at."""
+
+    lanes: Any  # float64, the groups' rows
+    before: Any  # float64: rows of each group's written states, then their first slopes, before the attempt
+    clock: Any  # float64 (lanes, 2): time before the attempt [s], interval's begin since the piece's [s]
+    trajectory: Any  # int64
+    interval: Any  # int64
+    done: Any  # int64, times written
+    edge: Any  # int64
+    turns: Any  # int64 (lanes, n_states)
+    edge_table: Any  # float64 (lanes, 3, n_edges)
+    p: Any  # float64 (n_parameters,), scratch
+    weights: Any  # float64 (N_STAGES,), scratch
+
+
+def begin_interval(samples: Samples, seats: Seats, lane: int, scratch: Any) -> None:
+    """Give a lane the constants of its interval, at the interval's start."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    w, at, p = seats.lanes, seats.interval[lane], seats.p
+    steps, rejected = w[base + ROWS.steps + column], w[base + ROWS.rejected + column]
+    for i in range(len(p)):
+        p[i] = samples.parameters[seats.trajectory[lane], i]
+    for i in range(len(samples.changed)):
+        p[samples.changed[i]] = samples.values[at, i]
+    frequency = 1.0 / samples.durations[at]
+    load_cell(w, base, column, frequency, p, samples.slack, scratch, seats.edge_table[lane])
+    seats.edge[lane] = begin_period(w, base, column, seats.edge_table[lane])
+    w[base + ROWS.steps + column] = steps
+    w[base + ROWS.rejected + column] = rejected
+
+
+def begin_trajectory(samples: Samples, seats: Seats, lane: int, number: int, scratch: Any) -> None:
+    """Put a trajectory's initial state into a lane, at its place within the first interval."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    w, piece = seats.lanes, samples.piece[number]
+    for i in range(N):
+        w[base + ROWS.state + i * WIDTH + column] = samples.initial[number, i]
+        seats.turns[lane, i] = 0
+    w[base + ROWS.steps + column] = 0.0
+    w[base + ROWS.rejected + column] = 0.0
+    seats.trajectory[lane] = number
+    seats.interval[lane] = samples.first_interval[piece]
+    seats.done[lane] = 0
+    begin_interval(samples, seats, lane, scratch)
+    late = samples.start[piece]
+    w[base + ROWS.time + column] = late
+    while seats.edge[lane] < NE and w[base + ROWS.target + column] <= late:
+        table = seats.edge_table[lane]
+        seats.edge[lane] = begin_segment(w, base, column, table, seats.edge[lane] + 1)
+    seats.clock[lane, 1] = -late
+    take_section(w, base, column, scratch, seats.turns[lane])
+    w[base + ROWS.fresh + column] = 1.0
+    w[base + ROWS.after_rejection + column] = 0.0
+    w[base + ROWS.event + column] = NOTHING
+    w[base + ROWS.wish + column] = FIRST_STEP * w[base + ROWS.period + column]
+    # an interval can be as long as a piece: the first step must not depend on that
+    first, end = samples.first_time[piece], samples.first_time[piece + 1]
+    spacing = (samples.times[end - 1] - samples.times[first]) / max(end - first - 1, 1)
+    if spacing > 0.0:
+        w[base + ROWS.wish + column] = min(w[base + ROWS.wish + column], spacing)
+
+
+def remember(samples: Samples, w: Any, before: Any, clock: Any, group: int) -> None:
+    """Keep what the continuous extension needs and an accepted step overwrites."""
+    base = group * ROWS.size
+    n_columns = len(samples.columns)
+    kept = group * 2 * n_columns * WIDTH
+    for k in range(n_columns):
+        row = base + samples.columns[k] * WIDTH
+        store(before, kept + k * WIDTH, load(w, row + ROWS.state))
+        store(before, kept + (n_columns + k) * WIDTH, load(w, row + ROWS.slopes))
+    for column in range(WIDTH):
+        clock[group * WIDTH + column, 0] = w[base + ROWS.time + column]
+
+
+def write_due(samples: Samples, seats: Seats, lane: int, until: float) -> None:
+    """Write the samples that fall into a lane's last accepted step, up to `until` [s in the interval]."""
+    group, column = lane // WIDTH, lane % WIDTH
+    base, number = group * ROWS.size, seats.trajectory[lane]
+    w, piece, t0, begin = seats.lanes, samples.piece[number], seats.clock[lane, 0], seats.clock[lane, 1]
+    first, end = samples.first_time[piece], samples.first_time[piece + 1]
+    h, done = w[base + ROWS.step + column], seats.done[lane]
+    weights, n_columns = seats.weights, len(samples.columns)
+    kept = group * 2 * n_columns * WIDTH + column
+    while first + done < end and samples.times[first + done] - begin <= until:
+        x = min((samples.times[first + done] - begin - t0) / h, 1.0) if h > 0.0 else 0.0
+        for s in range(N_STAGES):
+            p = ((DENSE[s, 3] * x + DENSE[s, 2]) * x + DENSE[s, 1]) * x + DENSE[s, 0]
+            weights[s] = h * (p * x)
+        for k in range(n_columns):
+            i = samples.columns[k]
+            total = weights[0] * seats.before[kept + (n_columns + k) * WIDTH]
+            for s in range(1, N_STAGES):
+                total += weights[s] * w[base + ROWS.slopes + (s * N + i) * WIDTH + column]
+            total += seats.before[kept + k * WIDTH]
+            samples.out[number, done, k] = total + TWO_PI * seats.turns[lane, i]
+        done += 1
+    seats.done[lane] = done
+
+
+def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
+    """Act on a lane's attempt; return PENDING, or the status with which its trajectory ended."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    w = seats.lanes
+    event = w[base + ROWS.event + column]
+    w[base + ROWS.event + column] = NOTHING
+    piece = samples.piece[seats.trajectory[lane]]
+    wanted = samples.first_time[piece + 1] - samples.first_time[piece]
+    if w[base + ROWS.after_rejection + column] == 0.0:
+        last = seats.interval[lane] + 1 == samples.first_interval[piece + 1]
+        ends = event == REACHED and seats.edge[lane] == NE and last
+        until = w[base + ROWS.time + column] + (COINCIDENT_S if ends else 0.0)
+        write_due(samples, seats, lane, until)
+        if seats.done[lane] == wanted:
+            return BOUNDED if in_bounds(w, base, column) else DIVERGED
+    if event == NOTHING:
+        return PENDING
+    if event == REACHED and seats.edge[lane] < NE:
+        table = seats.edge_table[lane]
+        seats.edge[lane] = begin_segment(w, base, column, table, seats.edge[lane] + 1)
+        return PENDING
+    if not in_bounds(w, base, column):
+        return DIVERGED
+    if event == REACHED:
+        take_section(w, base, column, scratch, seats.turns[lane])
+        seats.clock[lane, 1] += samples.durations[seats.interval[lane]]
+        seats.interval[lane] += 1
+        begin_interval(samples, seats, lane, scratch)
+        return PENDING
+    return STEP_LIMIT if event == TOO_MANY_STEPS else STEP_UNDERFLOW
+
+
+def end_trajectory(samples: Samples, seats: Seats, lane: int, status: int) -> None:
+    """Write how a trajectory ended; what it did not reach stays NaN."""
+    base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
+    samples.status[seats.trajectory[lane]] = status
+    samples.n_steps[seats.trajectory[lane]] = int(seats.lanes[base + ROWS.steps + column])
+
+
+def copy_seat(seats: Seats, source: int, target: int) -> None:
+    """Copy everything that belongs to one lane to another."""
+    move_lane(seats.lanes, source, target)
+    seats.trajectory[target] = seats.trajectory[source]
+    seats.interval[target] = seats.interval[source]
+    seats.done[target] = seats.done[source]
+    seats.edge[target] = seats.edge[source]
+    for i in range(2):
+        seats.clock[target, i] = seats.clock[source, i]
+    for i in range(N):
+        seats.turns[target, i] = seats.turns[source, i]
+    for k in range(3):
+        for i in range(seats.edge_table.shape[2]):
+            seats.edge_table[target, k, i] = seats.edge_table[source, k, i]
+    rows = len(seats.before) * WIDTH // len(seats.trajectory)
+    a = (source // WIDTH) * rows + source % WIDTH
+    b = (target // WIDTH) * rows + target % WIDTH
+    for row in range(0, rows, WIDTH):
+        seats.before[b + row] = seats.before[a + row]
+
+
+def follow_all(samples: Samples, n_lanes: int, rtol: float, atol: float, max_attempts: float) -> None:
+    """Integrate all trajectories, `n_lanes` at a time, and fill the output arrays of `samples`."""
+    n = len(samples.piece)
+    active = min(n_lanes, n)
+    n_groups = (active + WIDTH - 1) // WIDTH
+    size, n_columns = n_groups * WIDTH, len(samples.columns)
+    seats = Seats(
+        np.zeros(n_groups * ROWS.size), np.zeros(size * 2 * n_columns), np.zeros((size, 2)),
+        np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size, np.int64),
+        np.zeros(size, np.int64), np.zeros((size, N), np.int64), np.zeros((size, 3, max(NE, 1))),
+        np.zeros(samples.parameters.shape[1]), np.zeros(N_STAGES),
+    )  # fmt: skip
+    scratch = np.zeros(max(NC, N))
+    for lane in range(size):
+        # lanes beyond the last trajectory repeat it, so that they hold ordinary numbers; no one looks
+        begin_trajectory(samples, seats, lane, min(lane, n - 1), scratch)
+    following = active
+    rows, before, clock = seats.lanes, seats.before, seats.clock
+    events, n_watching = np.zeros(n_groups, np.bool_), np.zeros(n_groups, np.int64)
+    while active > 0:
+        in_use = (active + WIDTH - 1) // WIDTH
+        for group in range(in_use):
+            remember(samples, rows, before, clock, group)
+        attempt(rows, events, n_watching, in_use, samples.slack, rtol, atol, max_attempts)
+        lane = 0
+        while lane < active:
+            status = go_on(samples, seats, lane, scratch)
+            if status == PENDING:
+                lane += 1
+                continue
+            end_trajectory(samples, seats, lane, status)
+            if following < n:
+                begin_trajectory(samples, seats, lane, following, scratch)
+                following += 1
+                lane += 1
+            else:
+                # the last lane moves here, with what its attempt left to do
+                active -= 1
+                copy_seat(seats, active, lane)
+
+
+_INLINE = ("remember",)
+_CALLED = ("begin_interval", "begin_trajectory", "write_due", "go_on", "end_trajectory", "copy_seat")
+
+
+@cache
+def sampler_of(system: System) -> Callable[..., None]:
+    """Compile `follow_all` for a system."""
+    bindings = engine_bindings(system, RECORD_LAST)
+    for key in (*_INLINE, *_CALLED):
+        function = specialise(globals()[key], system.label, **bindings)
+        bindings[key] = inline(function) if key in _INLINE else njit(**UNCOUNTED)(function)
+    return kernel(specialise(follow_all, system.label, **bindings), is_covered(*system.functions))

@@ -1,0 +1,258 @@
+"""Presets: named values of a model's parameters, each with a phrase that says where it comes from.
+
+A preset is a TOML file, whether it ships in a model's room or was written by a person or by a fit::
+
+    model = "pendulum"                  # whose parameters they are
+    base = "wojna2018"                  # optional: a preset that ships and has the rest
+    title = "magnets of the test rig"   # optional
+
+    [values]                            # in the model's units; the table's name does not matter
+    alpha1 = 1.1306
+
+    [provenance]                        # by parameter, or by table
+    alpha1 = "fit of six torque curves, +- 0.0003 N m"
+
+Those that ship name no model: several models of a room share them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magpend_core.models.parameters import ParameterError, near_names
+
+if TYPE_CHECKING:
+    from magpend_core.models.model import Model
+
+SUFFIX = ".toml"
+KEYS = ("model", "base", "title")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Named values of parameters, and where each comes from.
+
+    Attributes
+    ----------
+    name : str
+    values : dict
+    provenance : dict
+        A phrase by parameter name.
+    model : str
+        Whose parameters they are; empty if it ships.
+    base : str
+        A preset that ships and has the values that this one has not; empty if there is none.
+    title : str
+        What it is, in a line.
+    """
+
+    name: str
+    values: Mapping[str, float]
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    model: str = ""
+    base: str = ""
+    title: str = ""
+
+    @classmethod
+    def read(cls, path: Path) -> Preset:
+        """Read a file: tables of values, and ``[provenance]`` by parameter or by table.
+
+        Raises
+        ------
+        ParameterError
+            If it cannot be read or is no such file; all problems at once. Names and bounds are checked
+            against a model by `Model.preset`.
+        """
+        try:
+            tables = tomllib.loads(path.read_text("utf-8"))
+        except OSError as error:
+            raise ParameterError([f"{path}: cannot be read ({error.strerror or error})."]) from None
+        except UnicodeDecodeError:
+            raise ParameterError([f"{path}: is not text in UTF-8; a preset is a TOML file."]) from None
+        except tomllib.TOMLDecodeError as error:
+            raise ParameterError([f"{path}: is not valid TOML: {error}."]) from None
+        problems = _problems(tables)
+        if problems:
+            raise ParameterError([f"{path}: {p}" for p in problems])
+        head = {key: tables.pop(key, "") for key in KEYS}
+        origin = tables.pop("provenance", {})
+        values = {name: value for table in tables.values() for name, value in table.items()}
+        known = {n: origin.get(n, origin.get(t, "")) for t, table in tables.items() for n in table}
+        return cls(path.stem, values, known, **head)
+
+
+def _problems(tables: Mapping[str, Any]) -> list[str]:
+    """Sentences on what is no part of a preset's file."""
+    problems = [
+        f"{key} = {tables[key]!r}: must be a text in quotes."
+        for key in KEYS
+        if not isinstance(tables.get(key, ""), str)
+    ]
+    own = {key: table for key, table in tables.items() if key not in (*KEYS, "provenance")}
+    for key, table in own.items():
+        if not isinstance(table, dict):
+            hint = near_names(key, (*KEYS, "provenance"), "keys")
+            problems.append(f"{key}: is no table of values and no key of a preset; {hint}")
+    names = [name for table in own.values() if isinstance(table, dict) for name in table]
+    problems += [
+        f"{name}: has two values; keep one." for name in dict.fromkeys(names) if names.count(name) > 1
+    ]
+    origin = tables.get("provenance", {})
+    if not isinstance(origin, dict):
+        return [*problems, f"provenance = {origin!r}: must be a table; write [provenance]."]
+    for name, phrase in origin.items():
+        if not isinstance(phrase, str):
+            problems.append(f"provenance.{name} = {phrase!r}: must be a text in quotes.")
+        if name not in (*names, *own):
+            problems.append(f"provenance.{name}: nothing of this name has a value; drop it, or give one.")
+    return problems
+
+
+def is_file(name: str | Path) -> bool:
+    """Whether a preset is named by its file and not as one that ships: it is a path, or ends in ``.toml``."""
+    return isinstance(name, Path) or str(name).endswith(SUFFIX)
+
+
+def find_preset(name: str | Path, folder: str | Path = ".") -> str | Preset:
+    """Return what `Model.load` takes for a preset as a person names it: a file is read.
+
+    Parameters
+    ----------
+    name
+        Of one that ships, or of a file: a path, or a text that ends in ``.toml``.
+    folder
+        From where the path of a file counts.
+
+    Raises
+    ------
+    ParameterError
+        If it is a file that cannot be read or is no preset.
+    """
+    return Preset.read(Path(folder) / name) if is_file(name) else str(name)
+
+
+def completed(preset: Preset, model: Model) -> Preset:
+    """Return a preset with the values of its base, checked against the model that it is to serve.
+
+    Raises
+    ------
+    ParameterError
+        If it is of a model that shares no presets with this one, lacks a phrase of provenance, or has an
+        unknown name, a value out of bounds or an unknown base; all problems at once.
+    """
+    from magpend_core.models import load_model
+
+    where = f"{preset.name}{SUFFIX}"
+    if not preset.model:
+        raise ParameterError([f'{where}: model: missing; add model = "{model.name}".'])
+    try:
+        owner = load_model(preset.model)
+    except ParameterError as error:
+        raise ParameterError([f"{where}: {p}" for p in error.problems]) from None
+    if owner.presets != model.presets:
+        raise ParameterError(
+            [f"{where}: is of model {owner.name!r}, whose parameters are not those of {model.name!r}."]
+        )
+    base, problems = Preset("", {}), []
+    if preset.base:
+        try:
+            base = owner.preset(preset.base)
+        except ParameterError as error:
+            problems += [f"base: {p}" for p in error.problems]
+    problems += value_problems(owner, preset.values, preset.provenance)
+    values, origin = {**base.values, **preset.values}, {**base.provenance, **preset.provenance}
+    absent = [n for n in model.parameter_names if n not in values]
+    if absent and not problems:
+        known = " or ".join(repr(name) for name in owner.preset_names)
+        problems = [f"{', '.join(absent)}: no value; give them, or set base to a preset that has: {known}."]
+    if problems:
+        raise ParameterError([f"{where}: {p}" for p in problems])
+    return Preset(preset.name, values, origin, preset.model, preset.base, preset.title)
+
+
+def value_problems(model: Model, values: Mapping[str, Any], sources: Mapping[str, str]) -> list[str]:
+    """Sentences on names, values and provenance that are none of a model's."""
+    problems = []
+    for name, value in values.items():
+        try:
+            problem = model.parameter(name).problem(value)
+        except ParameterError as error:
+            problem = str(error)
+        problems += [problem] if problem else []
+        if not sources.get(name, "").strip():
+            problems.append(f"{name}: has no provenance; say in [provenance] where the value comes from.")
+    return problems
+
+
+def write_preset(
+    path: str | Path,
+    model: str,
+    values: Mapping[str, float],
+    sources: Mapping[str, str],
+    title: str = "",
+    *,
+    base: str | Preset | None = None,
+) -> Path:
+    """Write a preset that specifications can name: ``preset = "FILE.toml"``.
+
+    Parameters
+    ----------
+    path
+        Ends in ``.toml``; written whole or not at all, over what was there.
+    model
+        Name of the model.
+    values
+        By parameter name, in the model's units; numbers that read back the same.
+    sources
+        Where each of `values` comes from, by its name.
+    title
+        What it is, in a line.
+    base
+        Has the values that `values` does not have: one that ships, by name, or one from a file, whose
+        values and sources are written with these; None if there are no others.
+
+    Raises
+    ------
+    ParameterError
+        As `Model.load` of what is written; nothing is written then.
+    """
+    from magpend_core.models import load_model
+
+    path = Path(path)
+    if path.suffix != SUFFIX:
+        raise ParameterError([f"{path}: the suffix must be {SUFFIX}."])
+    values = {name: float(value) for name, value in values.items()}
+    sources = {name: phrase for name, phrase in sources.items() if name in values}
+    shipped = base.name if isinstance(base, Preset) else base or ""
+    if isinstance(base, Preset) and base.model:  # from a file, which may be gone when this one is read
+        values, sources = {**base.values, **values}, {**base.provenance, **sources}
+        shipped = base.base
+    preset = Preset(path.stem, values, sources, model, shipped, title)
+    chosen = load_model(model)
+    chosen.load(preset)
+    whole = path.with_name(f".{path.name}.{os.getpid()}")
+    whole.write_text(_text(preset, chosen), "utf-8")
+    whole.replace(path)
+    return path
+
+
+def _text(preset: Preset, model: Model) -> str:
+    lines = [f"{key} = {_quoted(getattr(preset, key))}" for key in KEYS if getattr(preset, key)]
+    ordered = [p for p in model.parameters if p.name in preset.values]
+    width = max((len(f"{p.name} = {preset.values[p.name]!r}") for p in ordered), default=0)
+    lines += ["", "[values]"]
+    lines += [f"{f'{p.name} = {preset.values[p.name]!r}':{width}}  # {p.unit}, {p.meaning}" for p in ordered]
+    lines += ["", "[provenance]"]
+    lines += [f"{p.name} = {_quoted(preset.provenance[p.name])}" for p in ordered]
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    # JSON escapes what TOML must have escaped, but for DEL
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

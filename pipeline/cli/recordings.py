@@ -1,0 +1,155 @@
+"""``magpend recordings``: show, convert and simulate recordings of a rig."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipeline.cli.common import EXIT_HELP, Json, tell
+from pipeline.cli.groups import SETTINGS
+from pipeline.cli.options import speaking
+from pipeline.cli.plot import check_figure_path
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+File = Annotated[Path, typer.Argument(metavar="FILE", help="Recording: .tdms, .lvm, .csv or .mat.")]
+Window = Annotated[
+    tuple[float, float] | None,
+    typer.Option(metavar="FROM TO", help="Part of the recording [s since its first sample]."),
+]
+
+recordings_app = typer.Typer(
+    help="Recordings of a rig: what a file holds, and what is wrong with it.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    context_settings=SETTINGS,
+)
+
+
+def show(
+    file: File,
+    mapping: Annotated[
+        Path | None, typer.Option(help="Mapping (TOML): which channel is which state.")
+    ] = None,
+    window: Window = None,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Draw smoothed states and the rates from them.")
+    ] = False,
+    smoothing_window: Annotated[
+        float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Say what a recording holds; with a mapping, what was found in it, and draw it.
+
+    Without --mapping the channels of the file are listed as they are: what a mapping can name. With it they
+    are read as states of the model, checked, and drawn with --out; the exit code is 0 whatever was found.
+    """
+    from pipeline.rig.recordings.formats import read_raw
+    from pipeline.rig.recordings.overview import describe_file
+    from pipeline.spec.problems import SpecError
+
+    if out is not None:
+        check_figure_path(out)
+    if mapping is None:
+        if out is not None or window is not None or smooth:
+            raise SpecError(
+                ["--mapping: missing; what is drawn are states, and a mapping says which they are."]
+            )
+        tell(describe_file(read_raw(file)), None, as_json)
+        return
+    ds = _read(file, mapping, window)
+    _tell(ds, as_json)
+    if out is not None:
+        _draw(_smoothed(ds, smooth, smoothing_window), out, as_json)
+
+
+def convert(
+    file: File,
+    out: Annotated[Path, typer.Option(help="File to write: .tdms, .csv or .nc.")],
+    mapping: Annotated[Path, typer.Option(help="Mapping (TOML): which channel is which state.")],
+    window: Window = None,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Write smoothed states, and the rates from them.")
+    ] = False,
+    smoothing_window: Annotated[
+        float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")
+    ] = None,
+) -> None:
+    """Write a recording in SI units, in another format; beside TDMS and CSV, the mapping that reads it."""
+    from pipeline.cli import console
+    from pipeline.rig.recordings import mapping_for, write_recording
+    from pipeline.rig.recordings.writing import check_target
+
+    check_target(out)
+    ds = _smoothed(_read(file, mapping, window), smooth, smoothing_window)
+    console.result(f"recording: {write_recording(ds, out)}")
+    if out.suffix.lower() != ".nc":
+        beside = out.with_suffix(".toml")
+        beside.write_text(mapping_for(ds, out).toml(), encoding="utf-8")
+        console.result(f"mapping: {beside}")
+
+
+def simulate(
+    spec: Annotated[Path, typer.Argument(metavar="SPEC", help="Virtual rig (TOML).")],
+    out: Annotated[Path, typer.Option(help="File to write: .tdms or .csv; the mapping goes beside it.")],
+) -> None:
+    """Write the recording of a virtual rig, labelled as simulated, and the mapping that reads it."""
+    from pipeline.cli import console
+    from pipeline.rig.recordings.writing import SUFFIXES, check_target, write_raw
+    from pipeline.rig.simulation import load_rig, simulated
+
+    check_target(out, SUFFIXES[:2])
+    raw, mapping = simulated(load_rig(spec), is_csv=out.suffix.lower() == ".csv")
+    console.result(f"recording: {write_raw(raw, out)}")
+    beside = out.with_suffix(".toml")
+    beside.write_text(mapping.toml(), encoding="utf-8")
+    console.result(f"mapping: {beside}")
+
+
+def _read(file: Path, mapping: Path, window: tuple[float, float] | None) -> xr.Dataset:
+    from pipeline.rig.recordings import read_recording
+
+    return read_recording(file, mapping, window_s=window)
+
+
+def _smoothed(ds: xr.Dataset, wanted: bool, window_s: float | None) -> xr.Dataset:
+    from pipeline.rig.recordings import smooth
+
+    return smooth(ds, window_s=window_s) if wanted or window_s is not None else ds
+
+
+def _tell(ds: xr.Dataset, as_json: bool) -> None:
+    """Print quantities and findings, as lines or as one JSON object."""
+    from pipeline.cli import console
+    from pipeline.cli.common import json_rows
+    from pipeline.rig.recordings.overview import describe_recording
+
+    quantities, findings = describe_recording(ds)
+    if not as_json:
+        for line in (*quantities.lines, *findings.lines):
+            console.result(line)
+        return
+    keys = ("file", "sha256", "format", "model", "sampling_rate_hz", "simulated")
+    about: dict[str, Any] = {key: ds.attrs[key] for key in keys if key in ds.attrs}
+    about |= {"samples": ds.sizes["sample"], "pieces": len(set(ds["piece"].values.tolist()))}
+    told = {**about, "quantities": json_rows(quantities), "findings": json_rows(findings)}
+    console.result(json.dumps(told, indent=1))
+
+
+def _draw(ds: xr.Dataset, out: Path, as_json: bool) -> None:
+    from pipeline.cli import console
+    from pipeline.plots import save_figure
+    from pipeline.rig.recordings.figure import plot_recording
+
+    say = console.note if as_json else console.result
+    say(f"figure: {save_figure(plot_recording(ds), out)}")
+
+
+for _command in (show, convert, simulate):
+    recordings_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(_command))

@@ -1,0 +1,376 @@
+"""From a specification and its recordings to the problem that is fitted."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import Parameters
+from magpend_core.sampling import Drive
+from pipeline.rig.edges import find_edges
+from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
+from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
+from pipeline.rig.recordings import load_mapping, read_recording, smooth
+from pipeline.spec.problems import SpecError
+
+FEWEST_SAMPLES = 12
+"""Of a piece: below it a free start takes most of what there is to know."""
+
+DRIVE = "drive"
+DUTY = "duty_cycle"
+LEAST_NOISE = 1e-6
+"""Noise is taken as at least this share of a channel's spread: simulated recordings may have none."""
+
+
+@dataclass(frozen=True)
+class Built:
+    """What is fitted, and what is held out.
+
+    Attributes
+    ----------
+    problem : Problem
+    held_out : tuple of Piece
+        Judged afterwards, their starts alone refitted.
+    """
+
+    problem: Problem
+    held_out: tuple[Piece, ...]
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Samples of a recording that make a piece."""
+
+    recording: int
+    number: int
+    samples: slice
+    continues: bool
+
+
+def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
+    """Read the recordings of a specification.
+
+    Raises
+    ------
+    SpecError
+        With the problems of all of them.
+    """
+    found, problems = [], []
+    for i, table in enumerate(spec.recordings):
+        try:
+            mapping = load_mapping(spec.path(table.mapping))
+            found.append(read_recording(spec.path(table.file), mapping, window_s=table.window_s))
+        except SpecError as error:
+            problems += [f"recordings[{i}]: {p}" for p in error.problems]
+    if problems:
+        raise SpecError(problems)
+    return found
+
+
+def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
+    """Return the problem that a specification and its recordings pose.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once, before anything is integrated: a channel or drive that is not there, pieces
+        that are too short, numbers of held-out pieces that do not exist, nothing left to fit.
+    """
+    problems: list[str] = []
+    channels = channels_of(spec.model, spec.fit.channels, recordings, problems)
+    problems += _drive_problems(spec, recordings)
+    if problems:
+        raise SpecError(problems)
+    smoothed = [smooth(ds) for ds in recordings]
+    kept: list[Piece] = []
+    held: list[Piece] = []
+    for i, table in enumerate(spec.recordings):
+        try:
+            own = pieces_of(spec.model, channels, (recordings[i], smoothed[i]), table, i, spec.fit.decimate)
+        except SpecError as error:
+            problems += [f"recordings[{i}]: {p}" for p in error.problems]
+            continue
+        problems += _hold_out_problems(i, table, len(own))
+        held += [p for p in own if p.number in table.hold_out]
+        kept += _rechained([p for p in own if p.number not in table.hold_out], len(kept))
+    if problems:
+        raise SpecError(problems)
+    if not kept:
+        raise SpecError(["recordings: all pieces are held out; leave some to be fitted."])
+    problem = Problem(
+        model=spec.model, fixed=spec.values, free=free_of(spec, channels, len(recordings)), channels=channels,
+        pieces=tuple(kept), noise=noise_of(channels, smoothed), tied=spec.tied, loss=spec.fit.loss,
+        continuity=None if spec.fit.continuity == "free" else float(spec.fit.continuity), rtol=spec.fit.rtol,
+        recorded=any(t.drive == "recorded" for t in spec.recordings),
+    )  # fmt: skip
+    return Built(problem, tuple(replace(p, follows=-1) for p in held))
+
+
+def judging_problem(
+    problem: Problem, values: Parameters, zeros: dict[str, float], pieces: Sequence[Piece]
+) -> Problem:
+    """Return the problem in which all but the starts of some pieces is known.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    values
+        All parameters.
+    zeros
+        Sensors' zeros by the names of their unknowns.
+    pieces
+        To be judged.
+    """
+    free = tuple(f for f in problem.free if f.name in zeros)
+    own = replace(
+        problem, fixed=values, free=free, tied={}, pieces=tuple(pieces), loss="linear", continuity=None
+    )
+    return own.without(zeros)
+
+
+def channels_of(
+    model: Model, wanted: Sequence[str], recordings: Sequence[xr.Dataset], problems: list[str]
+) -> tuple[str, ...]:
+    """Return the channels that are compared: those asked for, else what all recordings measure.
+
+    By default rates are left out where the states that they are of are measured: they hold nothing new.
+    """
+    rates = {s.rate for s in model.states if s.rate}
+    measured = [[n for n in model.state_names if n in ds.data_vars] for ds in recordings]
+    if wanted:
+        problems += [
+            f"fit.channels: recordings[{i}] has no channel {name!r} (it has {', '.join(there) or 'none'}); map "
+            "it, or leave it out."
+            for i, there in enumerate(measured)
+            for name in wanted
+            if name not in there
+        ]
+        return tuple(wanted)
+    common = [n for n in model.state_names if all(n in there for there in measured)]
+    chosen = tuple(n for n in common if n not in rates) or tuple(common)
+    if not chosen:
+        problems.append(
+            f"recordings: none measures a state of {model.name} ({', '.join(model.state_names)}) that all "
+            "others do; map one."
+        )
+    return chosen
+
+
+def _drive_problems(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> list[str]:
+    problems = [
+        f"recordings[{i}].drive = {table.drive!r}: its mapping names no drive channel; add [drive] there, "
+        'or set drive = "none".'
+        for i, (table, ds) in enumerate(zip(spec.recordings, recordings, strict=True))
+        if table.drive != "none" and DRIVE not in ds
+    ]
+    problems += [
+        f'recordings[{i}].drive = "recorded": its mapping calls the drive a signal, not a torque; use '
+        '"edges", or map a torque (kind = "torque").'
+        for i, (table, ds) in enumerate(zip(spec.recordings, recordings, strict=True))
+        if table.drive == "recorded" and DRIVE in ds and ds[DRIVE].attrs.get("kind") == "signal"
+    ]
+    kinds = {table.drive for table in spec.recordings}
+    if "edges" in kinds and len(kinds) > 1:
+        problems.append(
+            'recordings: drive = "edges" cannot stand beside others in one identification; give all '
+            'recordings "edges", or none.'
+        )
+    if "edges" in kinds and DUTY not in spec.model.parameter_names:
+        problems.append(
+            f'recordings: drive = "edges" asks for a model with a parameter {DUTY}; {spec.model.name} has '
+            "none."
+        )
+    return problems
+
+
+def _hold_out_problems(i: int, table: RecordingTable, n: int) -> list[str]:
+    wrong = [k for k in table.hold_out if k >= n]
+    if not wrong:
+        return []
+    return [f"recordings[{i}].hold_out: there are pieces 0 to {n - 1}, and no {', '.join(map(str, wrong))}."]
+
+
+def free_of(spec: IdentificationSpec, channels: Sequence[str], n_recordings: int) -> tuple[Free, ...]:
+    """Return the unknowns: parameters in the order of the specification, then zeros of the sensors."""
+    found = []
+    for u in spec.unknowns:
+        p = spec.model.parameter(u.name)
+        mean, sd = (u.prior.mean, u.prior.sd) if u.prior is not None else (math.nan, math.nan)
+        found.append(Free(u.name, u.start, u.lower, u.upper, p.unit, p.meaning, mean, sd))
+    for name in spec.sensors.zero:
+        state = spec.model.state(name)
+        bound = math.pi / 2 if state.on_circle else math.inf
+        for i in range(n_recordings):
+            suffix = f".{i}" if n_recordings > 1 else ""
+            meaning = f"zero offset of {name}" + (f" in recording {i}" if suffix else "")
+            found.append(Free(f"{ZERO}.{name}{suffix}", 0.0, -bound, bound, state.unit, meaning))
+    return tuple(found)
+
+
+def noise_of(channels: Sequence[str], smoothed: Sequence[xr.Dataset]) -> np.ndarray:
+    """Return the noise of each channel: the root mean square of that of the recordings [SI]."""
+    found = []
+    for name in channels:
+        noise = [float(ds[name].attrs.get("noise", math.nan)) for ds in smoothed]
+        spread = [float(np.nanstd(ds[name].values)) for ds in smoothed]
+        rms = math.sqrt(float(np.nanmean(np.square(noise)))) if np.isfinite(noise).any() else 0.0
+        found.append(max(rms, LEAST_NOISE * max(spread)) or LEAST_NOISE)
+    return np.array(found)
+
+
+def pieces_of(
+    model: Model, channels: Sequence[str], both: tuple[xr.Dataset, xr.Dataset], table: RecordingTable,
+    recording: int, decimate: int = 1,
+) -> list[Piece]:  # fmt: skip
+    """Cut a recording into pieces.
+
+    Parameters
+    ----------
+    model
+        Whose states they have.
+    channels
+        That are compared.
+    both
+        The recording as measured, and smoothed: the first guess of a start is read off the latter.
+    table
+        How it is cut, and what its drive is.
+    recording
+        Its number.
+    decimate
+        Take every so many samples.
+
+    Raises
+    ------
+    SpecError
+        Naming the pieces that are too short, or that the drive does not cover.
+    """
+    ds, smoothed = both
+    drive = _drive_of(table, ds)
+    found: list[Piece] = []
+    problems: list[str] = []
+    for stretch in stretches(ds, table.piece_s, recording):
+        samples = _usable(ds, stretch, channels, drive)
+        own = ds.isel(sample=samples)
+        time = own["time"].values[::decimate]
+        if len(time) < FEWEST_SAMPLES:
+            problems.append(
+                f"piece {stretch.number} has {len(time)} usable samples; a piece needs {FEWEST_SAMPLES} or "
+                "more: choose a longer piece_s or window_s, or a smaller fit.decimate."
+            )
+            continue
+        measured = np.stack([own[name].values[::decimate] for name in channels], axis=1)
+        pieces_drive = None if drive is None else drive.window(float(time[0]), float(time[-1]))
+        start = _start(model, smoothed.isel(sample=samples))
+        whole = samples.start == stretch.samples.start
+        found.append(
+            Piece(
+                recording, stretch.number, time - time[0], measured, start, pieces_drive,
+                len(found) - 1 if stretch.continues and found and whole else -1,
+            )
+        )  # fmt: skip
+    if problems:
+        raise SpecError(problems)
+    return found
+
+
+def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Stretch]:
+    """Return the stretches of a recording: its pieces, each cut into equal parts of about a length.
+
+    Parameters
+    ----------
+    ds
+        The recording.
+    piece_s
+        Length [s]; by default pieces stay whole.
+    recording
+        Its number.
+    """
+    found: list[Stretch] = []
+    piece, time = ds["piece"].values, ds["time"].values
+    for begin, end in _runs(piece):
+        length = float(time[end - 1] - time[begin])
+        n = 1 if piece_s is None else max(1, round(length / piece_s))
+        bounds = np.linspace(begin, end, n + 1).round().astype(int)
+        for k, (a, b) in enumerate(itertools.pairwise(bounds)):
+            found.append(Stretch(recording, len(found), slice(int(a), int(b)), k > 0))
+    return found
+
+
+def _runs(piece: np.ndarray) -> list[tuple[int, int]]:
+    cuts = np.flatnonzero(np.diff(piece)) + 1
+    bounds = [0, *cuts.tolist(), len(piece)]
+    return list(itertools.pairwise(bounds))
+
+
+def _usable(ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _Driven | None) -> slice:
+    """Samples of a stretch from where everything is measured, and as far as the drive is known."""
+    begin, end = stretch.samples.start, stretch.samples.stop
+    time = ds["time"].values[begin:end]
+    good = np.all([np.isfinite(ds[name].values[begin:end]) for name in channels], axis=0)
+    if drive is not None:
+        good &= (time >= drive.begin_s) & (time <= drive.end_s)
+        end = begin + int(np.searchsorted(time, drive.end_s, side="right"))
+    first = np.flatnonzero(good)
+    return slice(begin + int(first[0]), end) if first.size else slice(end, end)
+
+
+def _start(model: Model, own: xr.Dataset) -> np.ndarray:
+    """First guess of the state at the first sample: measured or smoothed, 0 for what is neither."""
+    found = []
+    for state in model.states:
+        value = float(own[state.name].values[0]) if state.name in own else 0.0
+        found.append(value if math.isfinite(value) else 0.0)
+    return np.array(found)
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """A recording's drive, and the times of the recording that it covers [s]."""
+
+    drive: Drive | None
+    begin_s: float
+    end_s: float
+
+    def window(self, begin: float, end: float) -> Drive:
+        """The part that a piece needs."""
+        if self.drive is None:
+            # no torque, beside recordings that have one
+            return Drive.from_torque(np.array([0.0, end - begin]), np.zeros(2))
+        return self.drive.window(begin - self.begin_s, end - self.begin_s)
+
+
+def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
+    """The drive of a recording; None for none."""
+    time = ds["time"].values
+    if table.drive == "none":
+        return None
+    level = ds[DRIVE].values
+    if table.drive == "recorded":
+        known = np.isfinite(level)
+        covered = time[known]
+        if len(covered) < 2:
+            raise SpecError(["its drive channel has no values; map another channel."])
+        return _Driven(Drive.from_torque(covered, level[known]), float(covered[0]), float(covered[-1]))
+    edges = find_edges(time, level)
+    rising = edges.rising
+    falling = np.array([edges.falling[edges.falling > r][:1] for r in rising[:-1]], dtype=object)
+    if len(rising) < 2 or any(len(f) != 1 or f[0] >= r for f, r in zip(falling, rising[1:], strict=True)):
+        raise SpecError([
+            "its drive has no two rising edges with a falling one between each two; look at it with "
+            "magpend recordings show, and choose a window in which it switches."
+        ])  # fmt: skip
+    flat = np.array([float(f[0]) for f in falling])
+    return _Driven(Drive.from_edges(rising, flat, name=DUTY), float(rising[0]), float(rising[-1]))
+
+
+def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:
+    """Number the predecessors anew after some were taken out; who lost one follows none."""
+    numbers = {p.number: offset + k for k, p in enumerate(pieces)}
+    return [replace(p, follows=numbers.get(p.number - 1, -1) if p.follows >= 0 else -1) for p in pieces]

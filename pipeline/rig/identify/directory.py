@@ -1,0 +1,334 @@
+"""The directory of an identification: what it is, its outcomes one by one, its results.
+
+    identification.json   specification, mappings, digest, versions, host, time: written once
+    outcomes/             a file for each local fit and each profile, written whole
+    result.json           estimates and all that is said of them; its presence says that all is there
+    residuals.nc  preset.toml  figures/  lock
+
+An identification that was stopped goes on with the outcomes that are there, and ends with the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+from zipfile import BadZipFile
+
+import numpy as np
+
+from magpend_core import kernel_version
+from magpend_core.meaning import meaning_digest
+from pipeline.layout.identity import canonical, differences, digest_of
+from pipeline.rig.identify.specification import IdentificationSpec
+from pipeline.store.errors import DamagedError, RefusedError
+from pipeline.store.files import (
+    FIGURES,
+    LOCK,
+    RUN_FILE,
+    is_temporary,
+    is_there,
+    local_path,
+    object_entry,
+    problems_of,
+    sync_folder,
+    unreadable,
+    write_atomically,
+)
+from pipeline.store.provenance import provenance, versions
+
+T = TypeVar("T")
+
+FORMAT = 1
+IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES = (
+    "identification.json", "result.json", "residuals.nc", "preset.toml", "outcomes",
+)  # fmt: skip
+_OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK})
+_ROOM = Path(__file__).parent
+_NOT_NUMBERS = ("figures.py", "directory.py", "reports.py")
+"""Modules that decide no number."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording as an identification knows it.
+
+    Attributes
+    ----------
+    file : str
+        Name of the file.
+    sha256 : str
+    mapping : str
+        Text of the mapping file.
+    """
+
+    file: str
+    sha256: str
+    mapping: str
+
+
+@dataclass(frozen=True)
+class Info:
+    """What ``identification.json`` holds.
+
+    Attributes
+    ----------
+    directory : Path
+    digest : str
+        Of `identity`.
+    identity : dict
+        What decides the numbers.
+    title, spec_text : str
+    files : list of str
+        Names of the recordings.
+    mappings : list of str
+        Texts of their mapping files.
+    versions, provenance : dict
+    """
+
+    directory: Path
+    digest: str
+    identity: dict[str, Any]
+    title: str
+    spec_text: str
+    files: list[str]
+    mappings: list[str]
+    versions: dict[str, str]
+    provenance: dict[str, str]
+
+
+def sources_of(spec: IdentificationSpec) -> list[Source]:
+    """Read what decides an identification besides its specification.
+
+    Raises
+    ------
+    SpecError
+        If a file cannot be read.
+    """
+    from pipeline.spec.problems import SpecError
+
+    found, problems = [], []
+    for i, table in enumerate(spec.recordings):
+        try:
+            data = spec.path(table.file).read_bytes()
+            text = spec.path(table.mapping).read_text("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            problems.append(f"recordings[{i}]: cannot be read ({error}).")
+            continue
+        found.append(Source(Path(table.file).name, hashlib.sha256(data).hexdigest(), text))
+    if problems:
+        raise SpecError(problems)
+    return found
+
+
+def identity_of(spec: IdentificationSpec, sources: Sequence[Source]) -> dict[str, Any]:
+    """Return all that decides the numbers: specification, recordings, kernel, model, code."""
+    tables = spec.as_dict()
+    for table, source in zip(tables["recordings"], sources, strict=True):
+        del table["file"], table["mapping"]
+        table["sha256"] = source.sha256
+        table["mapping_text"] = source.mapping
+    own = [p for p in _ROOM.glob("*.py") if p.name not in _NOT_NUMBERS]
+    return {
+        "format": FORMAT,
+        "spec": tables,
+        "kernel_version": kernel_version(),
+        "model_digest": spec.model.digest,
+        "code": {
+            "identify": meaning_digest(own),
+            "recordings": meaning_digest([_ROOM.parent / "recordings"]),
+        },
+    }
+
+
+def is_identification(directory: str | Path) -> bool:
+    """Whether an identification has been begun there."""
+    return is_there(local_path(directory) / IDENTIFICATION)
+
+
+def read_info(directory: str | Path) -> Info:
+    """Read ``identification.json``.
+
+    Raises
+    ------
+    RefusedError
+        If there is none, or one of another format.
+    DamagedError
+        If it is not what was written.
+    """
+    directory = local_path(directory)
+    path = directory / IDENTIFICATION
+    if not is_identification(directory):
+        run = " It is a run; see magpend status." if is_there(directory / RUN_FILE) else ""
+        raise RefusedError(f"{directory}: no identification (it has no {IDENTIFICATION}).{run}")
+    with unreadable(path):
+        content = path.read_bytes()
+    try:
+        data = json.loads(content)
+        found = data["identity"]["format"]
+        if found != FORMAT:
+            raise RefusedError(
+                f"{path}: format {found}, and this magpend reads {FORMAT}; identify again into another "
+                "directory."
+            )
+        info = Info(directory=directory, **data)
+        fits = digest_of(info.identity) == info.digest
+    except (ValueError, TypeError, KeyError) as error:
+        raise DamagedError(f"{path}: damaged ({error}); remove {directory} and identify again.") from None
+    if not fits:
+        raise DamagedError(
+            f"{path}: damaged (its digest does not fit); remove {directory} and identify again."
+        )
+    return info
+
+
+def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
+    """Say whether this identification can be done in this directory; changes nothing.
+
+    Returns
+    -------
+    Info or None
+        What is there already, if anything is.
+
+    Raises
+    ------
+    RefusedError
+        If another identification is there (with the difference), or something else.
+    """
+    if directory.exists() and not directory.is_dir():
+        raise RefusedError(f"{directory}: is a file; give another --out.")
+    if not directory.exists():
+        return None
+    if not is_identification(directory):
+        with unreadable(directory):
+            names = sorted(p.name for p in directory.iterdir() if p.name != LOCK and not is_temporary(p.name))
+        if names:
+            raise RefusedError(
+                f"{directory}: is not empty and holds no identification ({', '.join(names[:5])}); give "
+                "another --out."
+            )
+        return None
+    info = read_info(directory)
+    lines = differences(info.identity, identity)
+    if lines:
+        raise RefusedError(
+            f"{directory}: holds another identification. Give another --out, or remove it. What differs:\n  "
+            + "\n  ".join(_short(line) for line in lines)
+        )
+    return info
+
+
+def _short(line: str) -> str:
+    """A line without the whole text of a mapping."""
+    flat = " ".join(line.split())
+    return flat if len(flat) <= 400 else f"{flat[:197]} ... {flat[-197:]}"
+
+
+def establish(directory: Path, spec: IdentificationSpec, sources: Sequence[Source], spec_text: str) -> Info:
+    """Make the directory, or return what it holds; call `check` first."""
+    identity = identity_of(spec, sources)
+    if check(directory, identity) is None:
+        directory.mkdir(parents=True, exist_ok=True)
+        content = {
+            "digest": digest_of(identity), "identity": identity, "title": spec.title, "spec_text": spec_text,
+            "files": [s.file for s in sources], "mappings": [s.mapping for s in sources],
+            "versions": versions(), "provenance": provenance(),
+        }  # fmt: skip
+        write_atomically(directory / IDENTIFICATION, canonical(content))
+        sync_folder(directory.parent)
+    (directory / OUTCOMES).mkdir(exist_ok=True)
+    return read_info(directory)
+
+
+class Outcomes:
+    """Outcomes by name, each computed once and kept in a file of its own.
+
+    Parameters
+    ----------
+    folder
+        Where they are kept.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.recalled = 0
+
+    def keep(
+        self,
+        name: str,
+        compute: Callable[[], T],
+        pack: Callable[[T], Mapping[str, np.ndarray]],
+        unpack: Callable[[Mapping[str, np.ndarray]], T],
+    ) -> T:
+        """Return an outcome: the one that is there, else what `compute` gives, once it is on the disk.
+
+        Parameters
+        ----------
+        name
+            Of the outcome's file.
+        compute
+            Called if it is not there, or not whole.
+        pack, unpack
+            To arrays and back.
+        """
+        path = self._folder / f"{name}.npz"
+        if is_there(path):
+            try:
+                with unreadable(path), np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as data:
+                    found = unpack({key: data[key] for key in data.files})
+            except (ValueError, KeyError, EOFError, BadZipFile):
+                pass
+            else:
+                self.recalled += 1
+                return found
+        result = compute()
+        buffer = io.BytesIO()
+        np.savez(buffer, **pack(result))  # type: ignore[arg-type]
+        write_atomically(path, buffer.getvalue())
+        # from the file, so that an identification that was stopped goes on with the very same numbers
+        return unpack(pack(result))
+
+
+def write_result(directory: Path, result: Mapping[str, Any], files: Sequence[str]) -> None:
+    """Write ``result.json``, which says that everything is there, with the digests of the other files."""
+    entries = {name: object_entry(directory / name) for name in sorted(files)}
+    write_atomically(directory / RESULT, canonical({**result, "files": entries}))
+
+
+def read_result(directory: str | Path) -> dict[str, Any]:
+    """Read ``result.json`` of a finished identification.
+
+    Raises
+    ------
+    RefusedError
+        If it is not finished.
+    DamagedError
+        If it is no JSON.
+    """
+    path = local_path(directory) / RESULT
+    read_info(directory)
+    if not is_there(path):
+        raise RefusedError(
+            f"{directory}: the identification is not finished; give its command again: it goes on."
+        )
+    try:
+        with unreadable(path):
+            found: dict[str, Any] = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise DamagedError(f"{path}: damaged ({error}); remove it and identify again.") from None
+    return found
+
+
+def is_complete(directory: Path) -> bool:
+    """Whether all results are there and as they were written."""
+    if not is_there(directory / RESULT):
+        return False
+    try:
+        result = read_result(directory)
+    except DamagedError:
+        return False
+    return not problems_of(directory, result.get("files", {}))

@@ -1,0 +1,112 @@
+"""From a fit to what statistics need of it: residuals and slopes sample by sample, the starts eliminated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.rig.identify.local import Fit
+from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.problem import Problem
+from pipeline.rig.identify.statistics import Linearised, eliminate_starts, robust_weights
+
+STEP = 1e-4
+"""Of the central differences, in units of the sizes: their error is about its square."""
+
+RTOL = 1e-10
+"""Tolerance under the differences; its noise in a slope is this over `STEP`."""
+
+MAD = 1.4826
+"""Standard deviation of Gaussian noise over its median absolute value."""
+
+
+def linearise(problem: Problem, fit: Fit) -> Linearised:
+    """Return residuals and slopes at a fit's optimum, the starts eliminated.
+
+    The fit's own slopes are compressed piece by piece; what is autocorrelated needs them along time.
+    """
+    n_free = len(problem.free)
+    scale = loss_scale_of(problem, fit)
+    _, following = eliminate_starts(fit.jacobian, n_free)
+    full = sample_slopes(problem, fit)
+    n_states = len(problem.model.states)
+    slopes = []
+    for k, own in enumerate(full):
+        follow = following[k * n_states : (k + 1) * n_states]
+        slopes.append(own[..., :n_free] - own[..., n_free:] @ follow)
+    prior = np.array([f.prior_sd**-2 if f.has_prior else 0.0 for f in problem.free])
+    residuals = tuple(r / problem.noise for r in fit.residuals)
+    information = _information(problem, fit, slopes, residuals, prior, scale)
+    return Linearised(
+        information, prior, residuals, tuple(slopes), groups_of(problem), fit.starts.size, problem.loss, scale
+    )
+
+
+def _information(
+    problem: Problem, fit: Fit, slopes: list[np.ndarray], residuals: tuple[np.ndarray, ...],
+    prior: np.ndarray, scale: float,
+) -> np.ndarray:  # fmt: skip
+    """Information of everything: of a robust loss with the curvature that it has, else that of the fit."""
+    if problem.loss == "linear":
+        return eliminate_starts(fit.jacobian, len(problem.free))[0]
+    total = np.diag(prior)
+    for r, own in zip(residuals, slopes, strict=True):
+        there = np.isfinite(r)
+        bend = np.where(there, robust_weights(np.where(there, r, 0.0) / scale, problem.loss)[1], 0.0)
+        known = np.where(there[..., None], own, 0.0)
+        total = total + np.einsum("tcp,tc,tcq->pq", known, bend, known)
+    return total
+
+
+def loss_scale_of(problem: Problem, fit: Fit) -> float:
+    """Scale of the residuals from which on the loss of a fit grows slower than the square; see `fit_local`."""
+    if problem.loss == "linear":
+        return 1.0
+    z = np.concatenate(fit.residuals) / problem.noise
+    return max(MAD * float(np.nanmedian(np.abs(z))), 1.0)
+
+
+def groups_of(problem: Problem) -> tuple[int, ...]:
+    """Independent stretch of each piece: with continuity, pieces that continue others belong to them."""
+    found: list[int] = []
+    for k, piece in enumerate(problem.pieces):
+        joined = problem.continuity is not None and 0 <= piece.follows < k
+        found.append(found[piece.follows] if joined else k)
+    return tuple(found)
+
+
+def sample_slopes(problem: Problem, fit: Fit) -> list[np.ndarray]:
+    """Slopes of the residuals of each piece in units of the noise, (n, n_channels, n_free + n_states).
+
+    Central differences in one call of the engine: the starts of all pieces move at once, since none depends
+    on another's. At a bound they are one-sided.
+    """
+    n_free, scales = len(problem.free), problem.model.scales
+    thetas, starts, widths = [], [], []
+    for i, free in enumerate(problem.free):
+        h = STEP * max(abs(float(fit.theta[i])), free.size)
+        ends = np.clip(fit.theta[i] + h * np.array([1.0, -1.0]), free.lower, free.upper)
+        for end in ends:
+            theta = fit.theta.copy()
+            theta[i] = end
+            thetas.append(theta)
+            starts.append(fit.starts)
+        widths.append(float(ends[0] - ends[1]))
+    for s, scale in enumerate(scales):
+        for sign in (1.0, -1.0):
+            moved = fit.starts.copy()
+            moved[:, s] += sign * STEP * scale
+            thetas.append(fit.theta)
+            starts.append(moved)
+        widths.append(2 * STEP * scale)
+    exact = replace(problem, rtol=min(problem.rtol, RTOL), continuity=None)
+    found = evaluate(exact, np.array(thetas), np.array(starts), slopes=False)
+    slopes = []
+    for k in range(len(problem.pieces)):
+        own = [
+            (found[2 * j].residuals[k] - found[2 * j + 1].residuals[k]) / (widths[j] * problem.noise)
+            for j in range(n_free + len(scales))
+        ]
+        slopes.append(np.nan_to_num(np.stack(own, axis=-1)))
+    return slopes

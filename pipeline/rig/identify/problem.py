@@ -1,0 +1,225 @@
+"""What is identified from what: unknowns, pieces of recordings, and how parameters follow from unknowns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from magpend_core.engine.system import System
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import Parameters
+from magpend_core.sampling import Drive, with_recorded_drive
+
+ZERO = "zero"
+"""First word of the names of sensors' zeros: ``zero.CHANNEL`` or ``zero.CHANNEL.RECORDING``."""
+
+
+@dataclass(frozen=True)
+class Free:
+    """One unknown: a parameter of the model or a sensor's zero.
+
+    Attributes
+    ----------
+    name : str
+        The parameter's, or ``zero.CHANNEL`` for all recordings, ``zero.CHANNEL.RECORDING`` for one.
+    start, lower, upper : float
+        First guess and bounds [SI].
+    unit, meaning : str
+    prior_mean, prior_sd : float
+        An independent measurement; NaN for none.
+    """
+
+    name: str
+    start: float
+    lower: float = -math.inf
+    upper: float = math.inf
+    unit: str = ""
+    meaning: str = ""
+    prior_mean: float = math.nan
+    prior_sd: float = math.nan
+
+    @property
+    def size(self) -> float:
+        """What counts as 1 in this unknown: steps of differences and of the search are fractions of it."""
+        width = self.upper - self.lower
+        least = 1e-2 * width if math.isfinite(width) else 0.0
+        return max(abs(self.start), least) or 1.0
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether an independent measurement is given."""
+        return math.isfinite(self.prior_sd)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A stretch of a recording whose start is free.
+
+    Attributes
+    ----------
+    recording, number : int
+        Of the recording, and of the piece in it.
+    time : ndarray, (n,)
+        Since the stretch's start, rising from 0 [s].
+    measured : ndarray, (n, n_channels)
+        NaN where nothing was measured [SI].
+    start : ndarray, (n_states,)
+        First guess of the state at time 0 [SI].
+    drive : Drive, optional
+        None for none.
+    follows : int
+        Number, in the problem, of the stretch that this one continues; -1 for none.
+    """
+
+    recording: int
+    number: int
+    time: np.ndarray
+    measured: np.ndarray
+    start: np.ndarray
+    drive: Drive | None = None
+    follows: int = -1
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Least squares of measured states over parameters and the pieces' starts.
+
+    Attributes
+    ----------
+    model : Model
+    fixed : Parameters
+        Values of all that is not identified.
+    free : tuple of Free
+    tied : dict
+        Parameter to factor and name of the one that it follows.
+    channels : tuple of str
+        The states that are compared.
+    pieces : tuple of Piece
+    noise : ndarray, (n_channels,)
+        Standard deviation that counts as 1 [SI].
+    loss : str
+        ``linear``, ``soft_l1``, ``huber`` or ``cauchy``, as in `scipy.optimize.least_squares`.
+    loss_scale : float
+        Residual, in units of the noise, from which on a robust loss grows slower than the square.
+    continuity : float, optional
+        Weight of the gap between a stretch's end and the next one's start; None leaves the starts free.
+    rtol : float
+        Tolerance of the integration, relative and absolute.
+    recorded : bool
+        Whether the pieces' drives are measured torques instead of the model's own drive.
+    """
+
+    model: Model
+    fixed: Parameters
+    free: tuple[Free, ...]
+    channels: tuple[str, ...]
+    pieces: tuple[Piece, ...]
+    noise: np.ndarray
+    tied: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    loss: str = "linear"
+    loss_scale: float = 1.0
+    continuity: float | None = None
+    rtol: float = 1e-8
+    recorded: bool = False
+
+    @cached_property
+    def system(self) -> System:
+        """What is integrated."""
+        return with_recorded_drive(self.model.system) if self.recorded else self.model.system
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns."""
+        return tuple(f.name for f in self.free)
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """First guess of the unknowns."""
+        return np.array([f.start for f in self.free])
+
+    @cached_property
+    def lower(self) -> np.ndarray:
+        """Lower bounds."""
+        return np.array([f.lower for f in self.free])
+
+    @cached_property
+    def upper(self) -> np.ndarray:
+        """Upper bounds."""
+        return np.array([f.upper for f in self.free])
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """First guesses of the pieces' starts, (n_piece, n_states)."""
+        return np.array([p.start for p in self.pieces])
+
+    @cached_property
+    def columns(self) -> tuple[int, ...]:
+        """Number of each channel's state."""
+        return tuple(self.model.state_names.index(name) for name in self.channels)
+
+    @cached_property
+    def moving(self) -> tuple[int, ...]:
+        """Numbers of the unknowns on which the trajectories depend."""
+        return tuple(i for i, f in enumerate(self.free) if not f.name.startswith(f"{ZERO}."))
+
+    @cached_property
+    def zeros(self) -> np.ndarray:
+        """Derivative of what a sensor reads by the unknowns: (recording, n_channels, n_free) of 0 and 1."""
+        n = 1 + max((p.recording for p in self.pieces), default=0)
+        found = np.zeros((n, len(self.channels), len(self.free)))
+        for i, f in enumerate(self.free):
+            word, *rest = f.name.split(".")
+            if word == ZERO:
+                which = slice(None) if len(rest) == 1 else int(rest[1])
+                found[which, self.channels.index(rest[0]), i] = 1.0
+        return found
+
+    @cached_property
+    def state_noise(self) -> np.ndarray:
+        """Standard deviation that counts as 1 in each state, (n_states,).
+
+        The noise of the channels; that of other states is in proportion to their spread over the starts.
+        """
+        spread = self.starts.std(axis=0) + 1e-12 * np.array(self.model.scales)
+        reference = float(np.mean(self.noise / spread[list(self.columns)]))
+        noise = reference * spread
+        noise[list(self.columns)] = self.noise
+        return np.asarray(noise)
+
+    def values(self, theta: np.ndarray) -> dict[str, float]:
+        """Parameters by name for values of the unknowns."""
+        found = self.fixed.as_dict()
+        found |= {self.free[i].name: float(theta[i]) for i in self.moving}
+        for name, (factor, other) in self.tied.items():
+            found[name] = factor * found[other]
+        return found
+
+    def pack(self, thetas: np.ndarray) -> np.ndarray:
+        """Packed parameters for rows of unknowns, (n, n_parameters)."""
+        names = list(self.fixed.names)
+        packed = np.tile(self.fixed.pack(), (len(thetas), 1))
+        for i in self.moving:
+            packed[:, names.index(self.free[i].name)] = thetas[:, i]
+        for name, (factor, other) in self.tied.items():
+            packed[:, names.index(name)] = factor * packed[:, names.index(other)]
+        more = len(self.system.parameter_names) - len(names)
+        return np.hstack([packed, np.zeros((len(thetas), more))])
+
+    def without(self, fixed: Mapping[str, float]) -> Problem:
+        """Return the problem with some unknowns held at given values.
+
+        A sensor's zero that is held moves into the measured values.
+        """
+        held = {name: value for name, value in fixed.items() if not name.startswith(f"{ZERO}.")}
+        kept = tuple(f for f in self.free if f.name not in fixed)
+        offset = np.array([fixed.get(f.name, 0.0) for f in self.free]) * [
+            f.name not in held and f.name in fixed for f in self.free
+        ]
+        pieces = tuple(
+            replace(p, measured=p.measured - self.zeros[p.recording] @ offset) for p in self.pieces
+        )
+        return replace(self, fixed=self.fixed.replace(**held), free=kept, pieces=pieces)

@@ -1,0 +1,145 @@
+"""Profile likelihoods: how the best fit gets worse as one parameter is held off its estimate.
+
+The interval is where twice the growth of the criterion stays below what the covariance makes of it, so that
+on a quadratic criterion it is the interval of the standard error, autocorrelated residuals included; where it
+is not, the profile's interval is the better one (Raue et al., Bioinformatics 25, 2009, 1923).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from pipeline.rig.identify.local import Fit
+    from pipeline.rig.identify.problem import Problem
+
+STEPS = (0.4, 0.8, 1.2, 1.6)
+"""Where a profile is taken, on either side, in half widths of the interval of the standard error."""
+
+UNKNOWN_STEP = 0.1
+"""Half width that is tried where the standard error is not known, as a share of the parameter's size."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How the criterion grows away from an estimate.
+
+    Attributes
+    ----------
+    name : str
+    values : ndarray (n,)
+        Rising, in the parameter's unit; the estimate is among them.
+    growth : ndarray (n,)
+        Twice the growth of the cost over that of the best fit, divided by what one standard error makes of it
+        squared: 1 at one standard error on a quadratic criterion. NaN where a fit did not converge.
+    interval : tuple of float
+        95 %; infinite where the profile does not rise far enough within the bounds.
+    """
+
+    name: str
+    values: np.ndarray
+    growth: np.ndarray
+    interval: tuple[float, float]
+
+    @property
+    def lowest(self) -> float:
+        """Least growth: below 0 where a better fit than the best was found."""
+        return float(np.nanmin(self.growth))
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """What is known of a parameter near its estimate.
+
+    Attributes
+    ----------
+    error : float
+        Standard error; infinite if it is not known.
+    plain : float
+        Standard error of residuals that are independent and as large as the noise.
+    critical : float
+        Half width of the interval in standard errors.
+    size : float
+        Of the parameter.
+    """
+
+    error: float
+    plain: float
+    critical: float
+    size: float
+
+
+def profile(
+    problem: Problem, best: Fit, name: str, about: Curvature, fit_local: Callable[..., Fit]
+) -> Profile:
+    """Take the profile of one parameter: all others and all starts fitted again at each value.
+
+    Parameters
+    ----------
+    problem, best
+        What was fitted, and its best fit.
+    name
+        Of the free parameter.
+    about
+        Its curvature.
+    fit_local
+        See `pipeline.rig.identify.local.fit_local`.
+    """
+    index = [f.name for f in problem.free].index(name)
+    free = problem.free[index]
+    estimate = float(best.theta[index])
+    known = np.isfinite(about.error) and about.error > 0
+    half = about.critical * about.error if known else UNKNOWN_STEP * about.size
+    unit = (about.error / about.plain) ** 2 if known else 1.0
+    found = {estimate: 0.0}
+    for side in (-1.0, 1.0):
+        theta, starts = best.theta, best.starts
+        for step in STEPS:
+            value = float(np.clip(estimate + side * step * half, free.lower, free.upper))
+            if value in found:
+                break
+            fit = fit_local(problem, _moved(theta, index, value), starts=starts, fixed={name: value})
+            found[value] = 2.0 * (fit.cost - best.cost) / unit if fit.converged else np.nan
+            theta, starts = fit.theta, fit.starts
+    values = np.array(sorted(found))
+    growth = np.array([found[float(v)] for v in values])
+    return Profile(name, values, growth, interval_of(values, growth, estimate, about.critical))
+
+
+def _moved(theta: np.ndarray, index: int, value: float) -> np.ndarray:
+    moved = theta.copy()
+    moved[index] = value
+    return moved
+
+
+def interval_of(
+    values: np.ndarray, growth: np.ndarray, estimate: float, critical: float
+) -> tuple[float, float]:
+    """Where the signed root of a profile's growth crosses the critical value, by linear interpolation.
+
+    Parameters
+    ----------
+    values, growth
+        See `Profile`.
+    estimate
+        Where the growth is 0.
+    critical
+        In standard errors.
+    """
+    ends: list[Any] = []
+    for side in (-1.0, 1.0):
+        own = np.isfinite(growth) & (side * (values - estimate) >= 0)
+        order = np.argsort(np.abs(values[own] - estimate))
+        x, root = values[own][order], np.sqrt(np.maximum(growth[own][order], 0.0))
+        over = np.flatnonzero(root >= critical)
+        if not over.size:
+            ends.append(side * np.inf)
+            continue
+        k = int(over[0])
+        share = (critical - root[k - 1]) / (root[k] - root[k - 1])
+        ends.append(float(x[k - 1] + share * (x[k] - x[k - 1])))
+    return ends[0], ends[1]

@@ -1,0 +1,256 @@
+"""The global stage: many first guesses, each followed to an optimum over stretches that grow.
+
+Far from the truth a long piece is out of step with its recording and the cost is rugged. Short stretches
+from smoothed states are not, so a guess is first fitted to those, then to longer ones, and to the whole
+pieces
+with free starts at last (multiple shooting: Bezruchko et al., Chaos Solitons Fractals 29, 2006, 82).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.products.reporting import report
+from pipeline.rig.identify.local import Echo, Fit, fit_local
+from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.problem import Piece, Problem
+
+Array = NDArray[np.float64]
+
+STRETCHES = (0.35, 0.8, 1.8)
+"""Lengths of stretches in periods of the slowest oscillation of the recordings, before whole pieces."""
+
+STAGE_EVALUATIONS = 25
+STAGE_SAMPLES = 40
+"""Samples of a stretch that are looked at before whole pieces."""
+
+POPULATION = 32
+"""Members that are integrated at once."""
+
+
+class Keep(Protocol):
+    """Stores and recalls the outcome of a start by its number."""
+
+    def recall(self, number: int) -> Fit | None:
+        """Return the outcome if it is stored."""
+
+    def store(self, number: int, fit: Fit) -> None:
+        """Store it."""
+
+
+def search(
+    problem: Problem,
+    *,
+    n_starts: int,
+    seed: int,
+    spread: float,
+    method: str = "sobol",
+    n_samples: int = 256,
+    keep: Keep | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+) -> list[Fit]:
+    """Fit from many first guesses.
+
+    Parameters
+    ----------
+    problem
+    n_starts
+        First guesses that are followed to an optimum; the first is the problem's own.
+    seed
+        Of the guesses.
+    spread
+        They lie within this fraction of the problem's own guess around it, and within the bounds.
+    method
+        ``sobol``: the best of `n_samples` points of a Sobol sequence are followed, and CMA-ES is tried if
+        none of them converges; ``cma``: CMA-ES over the shortest stretches finds the guesses.
+    n_samples
+        Points that are looked at; at least `n_starts`.
+    keep
+        Stores outcomes one by one, so that a killed search goes on.
+    tell
+        Says what has been found.
+
+    Returns
+    -------
+    list of Fit
+        Best first; those that converged before those that did not.
+    """
+    stages = _stages(problem)
+    guesses = guess(problem, n_starts, seed, spread, method, n_samples, stages[0])
+    fits = [_kept(problem, stages, k, theta, len(guesses), keep, tell) for k, theta in enumerate(guesses)]
+    if method == "sobol" and not any(fit.converged for fit in fits):
+        tell("no start has converged; CMA-ES looks for a better one")
+        theta = _evolve(stages[0], problem.start, seed, spread)
+        fits.append(_kept(problem, stages, len(guesses), theta, len(guesses) + 1, keep, tell))
+    return sorted(fits, key=lambda fit: (not fit.converged, fit.cost))
+
+
+def _kept(
+    problem: Problem, stages: Sequence[Problem], k: int, theta: Array, total: int, keep: Keep | None,
+    tell: Callable[[str], None],
+) -> Fit:  # fmt: skip
+    """Return a start's outcome, from the store if it is there."""
+    fit = keep.recall(k) if keep is not None else None
+    if fit is None:
+        fit = refine(
+            problem,
+            theta,
+            stages=stages,
+            echo=lambda _, cost: report(f"start {k + 1}, cost {cost:.6g}", k, total),
+        )
+        if keep is not None:
+            keep.store(k, fit)
+    words = "" if fit.converged else f", not converged: {fit.message}"
+    tell(f"start {k + 1} of {total}: cost {fit.cost:.6g}{words}")
+    return fit
+
+
+def guess(
+    problem: Problem, n_starts: int, seed: int, spread: float, method: str, n_samples: int, shortest: Problem
+) -> list[Array]:
+    """Return first guesses, the problem's own first."""
+    if method == "cma":
+        return [
+            problem.start,
+            *(_evolve(shortest, problem.start, seed + k, spread) for k in range(n_starts - 1)),
+        ]
+    points = sobol(problem, max(n_samples, n_starts) - 1, seed, spread)
+    if len(points) > n_starts - 1:
+        order = np.argsort(costs(shortest, points), kind="stable")
+        points = points[order[: n_starts - 1]]
+    return [problem.start, *points]
+
+
+def sobol(problem: Problem, n: int, seed: int, spread: float) -> Array:
+    """Points of a scrambled Sobol sequence around the problem's own guess, (n, n_free)."""
+    from scipy.stats import qmc
+
+    if n < 1 or not problem.free:
+        return np.zeros((max(n, 0), len(problem.free)))
+    unit = qmc.Sobol(len(problem.free), seed=seed).random_base2(max(int(np.ceil(np.log2(n))), 0))[:n]
+    sizes = np.array([f.size for f in problem.free])
+    points = problem.start + spread * (2 * unit - 1) * sizes
+    return np.asarray(np.clip(points, problem.lower, problem.upper))
+
+
+def costs(problem: Problem, thetas: Array) -> Array:
+    """Costs of a population with the starts as guessed; infinite where a trajectory diverges."""
+    found = []
+    for at in range(0, len(thetas), POPULATION):
+        members = thetas[at : at + POPULATION]
+        starts = np.broadcast_to(problem.starts, (len(members), *problem.starts.shape))
+        found += [np.inf if e.failed else e.cost for e in evaluate(problem, members, starts, slopes=False)]
+    return np.array(found)
+
+
+def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
+    """Look for the least cost over short stretches by CMA-ES; a population per call of the engine."""
+    import cma
+
+    sizes = np.array([f.size for f in problem.free])
+    lower, upper = problem.lower / sizes, problem.upper / sizes
+    options = {
+        "bounds": [list(lower), list(upper)], "seed": seed + 1, "verbose": -9, "popsize": POPULATION,
+        "maxiter": 200, "tolfun": 1e-3, "tolx": 1e-5,
+    }  # fmt: skip
+    evolution = cma.CMAEvolutionStrategy(np.clip(start / sizes, lower, upper), max(spread, 0.05), options)
+    while not evolution.stop():
+        members = np.array(evolution.ask())
+        found = costs(problem, members * sizes)
+        worst = np.max(found[np.isfinite(found)], initial=0.0)
+        evolution.tell(list(members), list(np.where(np.isfinite(found), found, 10 * worst + 1e12)))
+    return np.asarray(evolution.result.xbest * sizes)
+
+
+def refine(
+    problem: Problem, theta: Array, *, stages: Sequence[Problem] | None = None, echo: Echo | None = None
+) -> Fit:
+    """Fit from one first guess: short stretches, longer ones, whole pieces with free starts."""
+    for stage in _stages(problem) if stages is None else stages:
+        fit = fit_local(stage, theta, free_starts=False, max_evaluations=STAGE_EVALUATIONS)
+        if np.isfinite(fit.cost):
+            theta = fit.theta
+    return fit_local(problem, theta, echo=echo)
+
+
+def _stages(problem: Problem) -> list[Problem]:
+    """Return the problem over stretches of growing lengths, with starts read off the recordings."""
+    longest = max(p.time[-1] for p in problem.pieces)
+    period = slowest_period(problem)
+    lengths = [share * period for share in STRETCHES if share * period < 0.8 * longest]
+    return [cut(problem, length) for length in lengths or [longest]]
+
+
+def slowest_period(problem: Problem) -> float:
+    """Longest period [s] of a channel's oscillations, by its crossings of its mean.
+
+    The length of the longest piece if there are none.
+    """
+    found = []
+    for k in range(len(problem.channels)):
+        times, crossings = 0.0, 0
+        for p in problem.pieces:
+            x = p.measured[:, k]
+            x = x[np.isfinite(x)]
+            signs = np.signbit(x - x.mean()) if len(x) else np.zeros(0, bool)
+            crossings += int(np.count_nonzero(signs[1:] != signs[:-1]))
+            times += p.time[-1]
+        if crossings:
+            found.append(2 * times / crossings)
+    return max(found, default=max(p.time[-1] for p in problem.pieces))
+
+
+def cut(problem: Problem, length_s: float) -> Problem:
+    """Return the problem over stretches of about a length, thinned out, with starts that are read off.
+
+    The rates at the starts are those of local cubic polynomials through a sixth of a stretch on either side.
+    """
+    pieces = [stretch for p in problem.pieces for stretch in _stretches(problem, p, length_s)]
+    return replace(problem, pieces=tuple(pieces), continuity=None, loss="linear")
+
+
+def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
+    n = len(piece.time)
+    count = max(int(piece.time[-1] / length_s), 1)
+    bounds = np.linspace(0, n, count + 1).astype(int)
+    found = []
+    for a, b in pairwise(bounds):
+        if b - a < 4 or not np.isfinite(piece.measured[a]).all():
+            continue
+        start = piece.start if a == 0 else _read_off(problem, piece, int(a), (b - a) // 6 + 2)
+        step = max((b - a) // STAGE_SAMPLES, 1)
+        drive = piece.drive
+        if drive is not None:
+            begin = drive.start_s + piece.time[a]
+            drive = drive.window(begin, drive.start_s + piece.time[b - 1])
+        time = piece.time[a:b:step] - piece.time[a]
+        found.append(
+            replace(piece, time=time, measured=piece.measured[a:b:step], start=start, drive=drive, follows=-1)
+        )
+    return found
+
+
+def _read_off(problem: Problem, piece: Piece, at: int, half: int) -> Array:
+    """State at a sample: measured channels, and their rates, by a local cubic polynomial."""
+    window = slice(max(at - half, 0), at + half + 1)
+    t = piece.time[window] - piece.time[at]
+    state = np.array(piece.start)
+    names = problem.model.state_names
+    zeros = problem.zeros[piece.recording] @ problem.start
+    for k, name in enumerate(problem.channels):
+        x = piece.measured[window, k]
+        good = np.isfinite(x)
+        if good.sum() < 4:
+            continue
+        value, rate = np.polynomial.polynomial.polyfit(t[good], x[good], min(3, int(good.sum()) - 1))[:2]
+        state[names.index(name)] = value - zeros[k]
+        rate_name = problem.model.state(name).rate
+        if rate_name and rate_name not in problem.channels:
+            state[names.index(rate_name)] = rate
+    return state

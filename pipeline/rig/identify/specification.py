@@ -1,0 +1,266 @@
+"""The specification of an identification: what a person writes in TOML, validated as a whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from magpend_core.models import ModelError, load_model, model_names
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import (
+    Parameters,
+    near_names,
+)
+from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
+from pipeline.spec.files import read_toml
+from pipeline.spec.problems import SpecError, unknown_choice, unknown_key
+from pipeline.spec.tables import Table
+
+KIND = "identification"
+
+
+class SensorsTable(Table):
+    """What of the sensors is identified as well."""
+
+    zero: Annotated[tuple[str, ...], Field(strict=False)] = ()
+
+
+class RecordingTable(Table):
+    """A recording, what its drive did, and what of it is used."""
+
+    file: str
+    mapping: str
+    drive: Literal["none", "recorded", "edges"] = "none"
+    piece_s: Annotated[float, Field(gt=0)] | None = None
+    window_s: Pair | None = None
+    hold_out: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = ()
+
+
+class FitTable(Table):
+    """The criterion."""
+
+    channels: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
+    continuity: Literal["free"] | Annotated[float, Field(gt=0, strict=False)] = "free"
+    decimate: Annotated[int, Field(ge=1)] = 1
+    rtol: Annotated[float, Field(gt=0, le=1e-3)] = 1e-8
+
+
+class SearchTable(Table):
+    """The global stage, and what is done after it."""
+
+    n_starts: Annotated[int, Field(ge=1, le=10_000)] = 8
+    seed: Annotated[int, Field(ge=0)] = 1
+    spread: Annotated[float, Field(ge=0, lt=1)] = 0.3
+    method: Literal["sobol", "cma"] = "sobol"
+    n_samples: Annotated[int, Field(ge=1, le=1_000_000)] = 256
+    profiles: bool = True
+
+
+@dataclass(frozen=True)
+class IdentificationSpec:
+    """A valid specification of an identification.
+
+    Attributes
+    ----------
+    title : str
+    model : Model
+    preset : str, optional
+        As written; by default the model's first.
+    parameters : dict
+        Fixed values by name, over the preset's.
+    values : Parameters
+        Of the preset with `parameters` put in.
+    unknowns : tuple of Unknown
+    tied : dict
+        Factor and name of the identified parameter that a parameter follows.
+    sensors, recordings, fit, search
+        The tables.
+    folder : Path
+        That relative paths are relative to.
+    """
+
+    title: str
+    model: Model
+    preset: str | None
+    parameters: dict[str, float]
+    values: Parameters
+    unknowns: tuple[Unknown, ...]
+    tied: dict[str, tuple[float, str]]
+    sensors: SensorsTable
+    recordings: tuple[RecordingTable, ...]
+    fit: FitTable
+    search: SearchTable
+    folder: Path
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the identified parameters."""
+        return tuple(u.name for u in self.unknowns)
+
+    def path(self, name: str) -> Path:
+        """A file that the specification names."""
+        return self.folder / name
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data with all defaults filled in, the title left out; equal for equal identifications."""
+        return {
+            "kind": KIND,
+            "model": self.model.name,
+            "values": self.values.as_dict(),
+            "identify": {
+                u.name: {
+                    "start": u.start,
+                    "bounds": [_plain(u.lower), _plain(u.upper)],
+                    **({"prior": u.prior.model_dump()} if u.prior else {}),
+                }
+                for u in self.unknowns
+            },
+            "tied": {name: [factor, other] for name, (factor, other) in self.tied.items()},
+            "sensors": self.sensors.model_dump(mode="json"),
+            "recordings": [r.model_dump(mode="json", exclude_none=True) for r in self.recordings],
+            "fit": self.fit.model_dump(mode="json"),
+            "search": self.search.model_dump(mode="json"),
+        }
+
+
+def _plain(bound: float) -> float | str:
+    """A bound as JSON has it."""
+    return bound if math.isfinite(bound) else str(bound)
+
+
+_KEYS = (
+    "kind", "title", "model", "preset", "parameters", "identify", "tied", "sensors", "recordings", "fit",
+    "search",
+)  # fmt: skip
+
+
+def load_identification(path: str | Path) -> IdentificationSpec:
+    """Read and validate the specification of an identification.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once; also if the file cannot be read or is not TOML.
+    """
+    path = Path(path)
+    return parse_identification(read_toml(path), path.parent)
+
+
+def parse_identification(data: Mapping[str, Any], folder: Path) -> IdentificationSpec:
+    """Validate plain data; `folder` is what the names of files are relative to.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once.
+    """
+    kind = data.get("kind")
+    if kind in ("sweep", "continuation"):
+        raise SpecError([f'kind = "{kind}": is a run, not an identification; use magpend run.'])
+    problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
+    if kind != KIND:
+        missing = f'kind: missing; add kind = "{KIND}".'
+        problems.append(missing if kind is None else unknown_choice("kind", kind, [KIND]))
+    title, preset = (_text(data, key, problems) for key in ("title", "preset"))
+    model = _model(data, problems)
+    sensors = _table(data, "sensors", SensorsTable, problems)
+    fit = _table(data, "fit", FitTable, problems)
+    search = _table(data, "search", SearchTable, problems)
+    recordings = _recordings(data, folder, problems)
+    if model is None:
+        raise SpecError(problems)
+    problems += _channel_problems(model, sensors, fit)
+    own = ParameterTables(data, model, preset, problems)
+    if problems:
+        raise SpecError(problems)
+    assert own.values is not None
+    return IdentificationSpec(
+        title or "", model, preset, own.fixed, own.values, own.unknowns, own.tied, sensors, recordings, fit,
+        search, folder,
+    )  # fmt: skip
+
+
+def _text(data: Mapping[str, Any], key: str, problems: list[str]) -> str | None:
+    value = data.get(key)
+    if value is not None and not isinstance(value, str):
+        problems.append(f"{key} = {value!r}: must be a text in quotes.")
+        return None
+    return value
+
+
+def _model(data: Mapping[str, Any], problems: list[str]) -> Model | None:
+    name = data.get("model")
+    if not isinstance(name, str):
+        known = ", ".join(model_names())
+        problems.append(
+            f"model: missing; add the name of one ({known})."
+            if name is None
+            else f"model = {name!r}: must be a name in quotes ({known})."
+        )
+        return None
+    try:
+        return load_model(name)
+    except ModelError as error:
+        problems += [f"model: {p}" for p in error.problems]
+        return None
+
+
+def _table(data: Mapping[str, Any], key: str, model: type[Table], problems: list[str]) -> Any:
+    return validate(model, table_at(data, key, problems), key, problems)
+
+
+def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[RecordingTable, ...]:
+    """Return the valid recordings."""
+    tables = data.get("recordings")
+    if not isinstance(tables, list) or not tables:
+        problems.append("recordings: missing; add a table [[recordings]] with file and mapping for each.")
+        return ()
+    found = []
+    for i, table in enumerate(tables):
+        one = validate(RecordingTable, table, f"recordings[{i}]", problems)
+        if one is None:
+            continue
+        found.append(one)
+        problems += [
+            f"recordings[{i}].{key} = {name!r}: no such file ({folder / name}); paths count from the "
+            "specification's folder."
+            for key, name in (("file", one.file), ("mapping", one.mapping))
+            if not (folder / name).is_file()
+        ]
+        if one.window_s is not None and not one.window_s[0] < one.window_s[1]:
+            problems.append(
+                f"recordings[{i}].window_s = {list(one.window_s)}: is empty; give [start, end] with the "
+                "start below the end [s]."
+            )
+        if len(set(one.hold_out)) < len(one.hold_out):
+            problems.append(f"recordings[{i}].hold_out: names a piece twice; name each once.")
+    return tuple(found)
+
+
+def _channel_problems(model: Model, sensors: SensorsTable | None, fit: FitTable | None) -> list[str]:
+    """Channels that are no states of the model."""
+    named = {
+        "sensors.zero": sensors.zero if sensors is not None else (),
+        "fit.channels": fit.channels if fit is not None else (),
+    }
+    known = model.state_names
+    problems = [
+        f"{key}: {name!r} is not a state of {model.name}; {near_names(name, known, 'states')}"
+        for key, names in named.items()
+        for name in names
+        if name not in known
+    ]
+    if fit is not None and sensors is not None and fit.channels:
+        problems += [
+            f"sensors.zero: {name!r} is not among fit.channels; add it there, or drop it here."
+            for name in sensors.zero
+            if name in known and name not in fit.channels
+        ]
+    return problems

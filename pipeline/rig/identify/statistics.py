@@ -1,0 +1,413 @@
+"""How sure estimates are: covariance with the starts eliminated, intervals, autocorrelated residuals.
+
+Everything is in units of the noise that the fit was weighted with. With slopes J = (A, B) of residuals with
+respect to the parameters and the starts, ``H = J'J`` and ``X = H_ss^-1 H_sp``, the slopes that are left
+to the parameters are ``A - B X``, and their information is the Schur complement ``S = H_pp - H_ps X``.
+
+Residuals of a real rig are autocorrelated: what the model lacks swings with the motion. Taking them as
+independent makes intervals too narrow by the square root of their number per independent one. So, where they
+are found to be autocorrelated, the variance of the scores comes from the scores themselves:
+
+- over pieces, which are independent stretches, by the delete-one jackknife (Bell & McCaffrey, Survey
+  Methodology 28, 2002, 169, "CR3"; one step from the optimum, exact for a linear model), with Student's t of
+  one less than their number, where there are at least `FEWEST_PIECES`;
+- along time else, after Newey & West (Econometrica 55, 1987, 703), with the critical values for a bandwidth
+  that is a share of the sample (Kiefer & Vogelsang, Econometric Theory 21, 2005, 1130, Table 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import signal, stats
+
+FEWEST_PIECES = 8
+"""Pieces below which their scatter says too little of a variance."""
+
+LEVEL = 0.95
+WHITE_LEVEL = 0.01
+"""Chance that white residuals are taken for autocorrelated ones."""
+
+LAGS = 20
+"""Lags that the test for autocorrelation looks at."""
+
+SINGULAR = 1e-12
+"""Share of the largest eigenvalue of the scaled information below which a direction is not determined."""
+
+Estimator = Literal["white", "pieces", "newey-west"]
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """The fit near its optimum, the starts eliminated; units of the noise.
+
+    Attributes
+    ----------
+    information : ndarray (n_free, n_free)
+        Of everything: data, priors, continuity.
+    prior : ndarray (n_free,)
+        Information of the priors, 1/sd^2; 0 where there is none.
+    residuals : tuple of ndarray (n, n_channels)
+        By piece, NaN where nothing was measured.
+    slopes : tuple of ndarray (n, n_channels, n_free)
+        Of the residuals with respect to the parameters, by piece, the starts following.
+    groups : tuple of int
+        The independent stretch that each piece belongs to.
+    n_starts : int
+        Number of fitted components of starts.
+    loss : str
+        As `scipy.optimize.least_squares` names it.
+    loss_scale : float
+        Residual from which on a robust loss grows slower than the square.
+    """
+
+    information: np.ndarray
+    prior: np.ndarray
+    residuals: tuple[np.ndarray, ...]
+    slopes: tuple[np.ndarray, ...]
+    groups: tuple[int, ...]
+    n_starts: int
+    loss: str = "linear"
+    loss_scale: float = 1.0
+
+    @property
+    def n_samples(self) -> int:
+        """Number of measured values."""
+        return int(sum(np.isfinite(r).sum() for r in self.residuals))
+
+    @property
+    def n_fitted(self) -> int:
+        """Number of fitted values: parameters without a prior, and starts."""
+        return int((self.prior == 0).sum()) + self.n_starts
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance of the estimates, and what it rests on.
+
+    Attributes
+    ----------
+    matrix : ndarray (n_free, n_free)
+        NaN in rows and columns of what is not determined.
+    estimator : str
+    why : str
+        A sentence.
+    critical : float
+        Half width of a 95 % interval in standard errors.
+    degrees : float
+        Degrees of freedom of Student's t.
+    inflation : float
+        Factor by which standard errors exceed those of residuals as large as the noise that is weighted with.
+    """
+
+    matrix: np.ndarray
+    estimator: Estimator
+    why: str
+    critical: float
+    degrees: float
+    inflation: float
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Standard errors (n_free,); infinite where the data and priors say nothing."""
+        variance = np.diag(self.matrix)
+        return np.where(np.isnan(variance), np.inf, np.sqrt(np.abs(variance)))
+
+    @property
+    def correlations(self) -> np.ndarray:
+        """Correlation matrix (n_free, n_free), NaN for what is not determined."""
+        errors = np.sqrt(np.abs(np.diag(self.matrix)))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(np.clip(self.matrix / np.outer(errors, errors), -1.0, 1.0))
+
+
+def eliminate_starts(jacobian: np.ndarray, n_free: int) -> tuple[np.ndarray, np.ndarray]:
+    """Eliminate the starts from a least squares problem.
+
+    Parameters
+    ----------
+    jacobian
+        (m, n_free + n_starts), the parameters' columns first.
+    n_free
+        Number of parameters.
+
+    Returns
+    -------
+    information : ndarray (n_free, n_free)
+        Schur complement of the starts' block of ``jacobian.T @ jacobian``.
+    following : ndarray (n_starts, n_free)
+        By how much the starts' optimum moves *against* a change of the parameters: X above.
+    """
+    own, starts = jacobian[:, :n_free], jacobian[:, n_free:]
+    # without squaring the condition number; a start that nothing determines follows nothing
+    following = np.linalg.lstsq(starts, own, rcond=None)[0]
+    left = own - starts @ following
+    return left.T @ left, following
+
+
+def pooled_autocorrelation(residuals: Sequence[np.ndarray], most: int) -> np.ndarray:
+    """See `pooled_pairs`: the autocorrelation alone."""
+    return pooled_pairs(residuals, most)[0]
+
+
+def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Autocorrelation of residuals of one channel about 0, over all pieces together.
+
+    Parameters
+    ----------
+    residuals
+        (n,) of each piece; NaN counts as not measured.
+    most
+        Largest lag.
+
+    Returns
+    -------
+    autocorrelation : ndarray (most + 1,)
+        At lags 0, 1, ...; NaN where no piece is as long.
+    pairs : ndarray (most + 1,)
+        Number of pairs of residuals that each rests on.
+    """
+    products, pairs = np.zeros(most + 1), np.zeros(most + 1)
+    for r in residuals:
+        there = np.isfinite(r)
+        n = min(len(r), most + 1)
+        for sums, values in ((products, np.where(there, r, 0.0)), (pairs, there.astype(float))):
+            full = signal.correlate(values, values, method="auto")
+            sums[:n] += full[len(r) - 1 : len(r) - 1 + n]
+    pairs = np.rint(pairs)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        covariance = products / pairs
+        return np.asarray(covariance / covariance[0]), pairs
+
+
+def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
+    """Whether residuals of any channel are autocorrelated, by a Ljung-Box test over all pieces.
+
+    Parameters
+    ----------
+    residuals
+        (n, n_channels) of each piece.
+    """
+    n_channels = residuals[0].shape[1]
+    shortest = min(len(r) for r in residuals)
+    lags = max(1, min(LAGS, shortest // 5))
+    for c in range(n_channels):
+        own = [r[:, c] for r in residuals]
+        rho, pairs = pooled_pairs(own, lags)
+        portmanteau = float(np.nansum(pairs[1:] * rho[1:] ** 2))
+        if stats.chi2.sf(portmanteau, lags) < WHITE_LEVEL / n_channels:
+            return True
+    return False
+
+
+def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
+    """How long residuals remember.
+
+    Parameters
+    ----------
+    rho
+        Autocorrelation at lags 0, 1, ...
+    n
+        Number of residuals it comes from.
+
+    Returns
+    -------
+    lag : int
+        The last lag up to which it leaves the band of white noise again and again.
+    factor : float
+        ``1 + 2 sum rho`` up to there, at least 1: residuals per independent one.
+    """
+    band = stats.norm.ppf(0.5 + LEVEL / 2) / np.sqrt(max(n, 1))
+    outside = np.abs(np.nan_to_num(rho)) > 2.0 * band
+    outside[0] = True
+    quiet = max(3, len(rho) // 20)
+    inside = np.flatnonzero(np.convolve(outside, np.ones(quiet), "full")[quiet - 1 : len(rho)] == 0)
+    lag = int(inside[0]) if inside.size else len(rho) - 1
+    return max(lag, 1), max(1.0, 1.0 + 2.0 * float(np.nansum(rho[1 : lag + 1])))
+
+
+def n_effective(residuals: Sequence[np.ndarray]) -> list[float]:
+    """Number of independent residuals that those of each channel count for."""
+    most = max(1, max(len(r) for r in residuals) // 3)
+    found = []
+    for c in range(residuals[0].shape[1]):
+        own = [r[:, c] for r in residuals]
+        n = sum(int(np.isfinite(r).sum()) for r in own)
+        found.append(n / memory_of(pooled_autocorrelation(own, most), n)[1])
+    return found
+
+
+def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.ndarray]:
+    """Influence of residuals per residual, and its slope, of a loss of `scipy.optimize.least_squares`.
+
+    Returns
+    -------
+    weight : ndarray
+        psi(r)/r.
+    slope : ndarray
+        psi'(r), at least 0.
+    """
+    z = residuals**2
+    if loss == "linear":
+        return np.ones_like(z), np.ones_like(z)
+    if loss == "soft_l1":
+        return (1 + z) ** -0.5, (1 + z) ** -1.5
+    if loss == "cauchy":
+        return 1 / (1 + z), np.maximum(1 - z, 0.0) / (1 + z) ** 2
+    inner = z <= 1
+    return np.where(inner, 1.0, 1 / np.sqrt(np.maximum(z, 1.0))), inner.astype(float)
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """Scores along time, and the information, of each piece."""
+
+    scores: list[np.ndarray]
+    information: list[np.ndarray]
+    by_channel: list[np.ndarray]
+
+
+def _scores(fit: Linearised) -> _Scores:
+    scores, information, by_channel = [], [], []
+    for r, slopes in zip(fit.residuals, fit.slopes, strict=True):
+        there = np.isfinite(r)
+        known = np.where(there, r, 0.0)
+        weight, bend = robust_weights(known / fit.loss_scale, fit.loss)
+        own = np.where(there[..., None], slopes, 0.0)
+        scores.append(np.einsum("tc,tcp->tp", weight * known, own))
+        each = np.einsum("tcp,tc,tcq->cpq", own, bend, own)
+        by_channel.append(each)
+        information.append(each.sum(0))
+    return _Scores(scores, information, by_channel)
+
+
+def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | None = None) -> Covariance:
+    """Covariance of the estimates.
+
+    Parameters
+    ----------
+    fit
+        The fit near its optimum.
+    scale
+        (n_free,) size of each parameter, for telling what is singular.
+    estimator
+        By default what the residuals ask for; see the module.
+
+    Returns
+    -------
+    Covariance
+    """
+    parts = _scores(fit)
+    n_groups = len(set(fit.groups))
+    correlated = is_autocorrelated(fit.residuals)
+    if estimator is None:
+        asked = correlated or fit.loss != "linear"
+        estimator = "white" if not asked else "pieces" if n_groups >= FEWEST_PIECES else "newey-west"
+    reason = (
+        "the residuals are autocorrelated"
+        if correlated
+        else "the loss is robust"
+        if fit.loss != "linear"
+        else "the residuals are not found to be autocorrelated"
+    )
+    if estimator == "white":
+        matrix, degrees, critical = _white(fit, parts, scale)
+        why = f"{reason}: each residual counts, with the variance of its channel"
+    elif estimator == "pieces":
+        matrix, degrees, critical = _pieces(fit, parts, scale)
+        why = f"{reason}: the {n_groups} pieces count, by the delete-one jackknife"
+    else:
+        matrix, degrees, critical, bandwidth = _newey_west(fit, parts, scale)
+        why = f"{reason}, and there are {n_groups} pieces: Newey-West with {bandwidth} lags"
+    known = np.flatnonzero(np.isfinite(np.diag(matrix)))
+    both = np.ix_(known, known)
+    trace = float(np.trace(matrix[both] @ fit.information[both])) if known.size else 1.0
+    inflation = float(np.sqrt(max(trace, 0.0) / max(known.size, 1)))
+    return Covariance(matrix, estimator, why, critical, degrees, inflation)
+
+
+def _inverse(information: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse on what is determined, and which parameters are not."""
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    good = values > SINGULAR * max(float(values.max(initial=0.0)), 1e-300)
+    inverse = (vectors[:, good] / values[good]) @ vectors[:, good].T
+    lost = (np.abs(vectors[:, ~good]) > 1e-3).any(axis=1)
+    return inverse * np.outer(scale, scale), lost
+
+
+def _sandwich(fit: Linearised, meat: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    inverse, lost = _inverse(fit.information, scale)
+    return _without(inverse @ meat @ inverse, lost)
+
+
+def _without(matrix: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    result = matrix.copy()
+    result[lost, :] = np.nan
+    result[:, lost] = np.nan
+    return result
+
+
+def _t(degrees: float) -> float:
+    return float(stats.t.ppf(0.5 + LEVEL / 2, degrees))
+
+
+def _white(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.ndarray, float, float]:
+    degrees = max(fit.n_samples - fit.n_fitted, 1)
+    share = degrees / fit.n_samples
+    stacked = np.concatenate(fit.residuals)
+    weight, _ = robust_weights(np.nan_to_num(stacked) / fit.loss_scale, fit.loss)
+    counts = np.isfinite(stacked).sum(0)
+    variance = np.nansum((weight * stacked) ** 2, axis=0) / np.maximum(counts, 1) / share
+    data = np.sum(parts.by_channel, axis=0)
+    meat = np.einsum("c,cpq->pq", variance, data)
+    # priors, and continuity, are as sure as they say
+    meat = meat + (fit.information - data.sum(0))
+    return _sandwich(fit, meat, scale), float(degrees), _t(degrees)
+
+
+def _pieces(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.ndarray, float, float]:
+    names = sorted(set(fit.groups))
+    n = len(names)
+    moves = []
+    for name in names:
+        own = [i for i, g in enumerate(fit.groups) if g == name]
+        score = np.sum([parts.scores[i].sum(0) for i in own], axis=0)
+        left = fit.information - np.sum([parts.information[i] for i in own], axis=0)
+        moves.append(_inverse(left, scale)[0] @ score)
+    about = np.array(moves) - np.mean(moves, axis=0)
+    matrix = (n - 1) / n * about.T @ about
+    inverse, lost = _inverse(fit.information, scale)
+    matrix = matrix + (inverse * fit.prior) @ inverse
+    return _without(matrix, lost), float(n - 1), _t(n - 1)
+
+
+def _newey_west(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.ndarray, float, float, int]:
+    n = fit.n_samples // fit.residuals[0].shape[1]
+    longest = max(len(r) for r in fit.residuals)
+    memory = 1
+    for c in range(fit.residuals[0].shape[1]):
+        own = [r[:, c] for r in fit.residuals]
+        memory = max(memory, memory_of(pooled_autocorrelation(own, max(1, longest // 3)), n)[0])
+    bandwidth = max(1, min(2 * memory, longest // 3))
+    meat = np.diag(fit.prior).astype(float)
+    for s in parts.scores:
+        meat = meat + _bartlett(s, min(bandwidth, len(s) - 1))
+    degrees = max(min(n_effective(fit.residuals)) - fit.n_fitted / len(fit.groups), 2.0)
+    b = bandwidth / max(n, 1)
+    critical = 1.9600 + 2.9694 * b + 0.4160 * b**2 - 0.5324 * b**3
+    share = max(fit.n_samples - fit.n_fitted, 1) / fit.n_samples
+    return _sandwich(fit, meat / share, scale), degrees, max(critical, _t(degrees)), bandwidth
+
+
+def _bartlett(scores: np.ndarray, bandwidth: int) -> np.ndarray:
+    """Long-run covariance of scores along time, times their number, with Bartlett's weights."""
+    n, p = scores.shape
+    window = 1.0 - np.abs(np.arange(-bandwidth, bandwidth + 1)) / (bandwidth + 1)
+    smoothed = np.stack(
+        [signal.convolve(scores[:, i], window, "full")[bandwidth : bandwidth + n] for i in range(p)], axis=1
+    )
+    meat = scores.T @ smoothed
+    return np.asarray((meat + meat.T) / 2)

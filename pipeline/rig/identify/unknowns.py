@@ -1,0 +1,215 @@
+"""Which parameters of a model are identified, follow others, or are fixed: checked against each other."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import BaseModel, Field, ValidationError
+
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import (
+    FRACTION,
+    NON_NEGATIVE,
+    POSITIVE,
+    ParameterError,
+    Parameters,
+    unknown_name_problem,
+)
+from pipeline.spec.problems import problems_of
+from pipeline.spec.tables import Table
+
+_LEAST = 1e-9
+"""Smallest value of a parameter that must be greater than 0, as a share of its start."""
+
+_FRACTION_MARGIN = 1e-6
+"""How near a fraction comes to 0 and 1."""
+
+Pair = Annotated[tuple[float, float], Field(strict=False)]
+
+
+class Prior(Table):
+    """What is known of a parameter besides the recordings: its value and standard deviation."""
+
+    mean: float
+    sd: Annotated[float, Field(gt=0)]
+
+
+class Identified(Table):
+    """A parameter that is identified."""
+
+    start: float | None = None
+    bounds: Pair | None = None
+    prior: Prior | None = None
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """An identified parameter with everything filled in.
+
+    Attributes
+    ----------
+    name : str
+    start, lower, upper : float
+        In the parameter's unit.
+    prior : Prior, optional
+    """
+
+    name: str
+    start: float
+    lower: float
+    upper: float
+    prior: Prior | None
+
+
+def validate(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
+    """Return a validated table, or None after adding its problems."""
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        problems += problems_of(error, model, path)
+        return None
+
+
+def table_at(data: Mapping[str, Any], key: str, problems: list[str]) -> Mapping[str, Any]:
+    """Return a table of a table, empty if it is not there, or after adding that it is none."""
+    table = data.get(key, {})
+    if isinstance(table, dict):
+        return table
+    problems.append(f"{key} = {table!r}: must be a table; write [{key}].")
+    return {}
+
+
+_TIE = re.compile(r"\s*(?:([+-]?\s*[0-9.]+(?:[eE][+-]?[0-9]+)?)\s*\*\s*|(-)\s*)?([A-Za-z_]\w*)\s*")
+
+
+class ParameterTables:
+    """Values, unknowns and ties, checked against the model and each other."""
+
+    def __init__(
+        self, data: Mapping[str, Any], model: Model, preset: str | None, problems: list[str]
+    ) -> None:
+        self._model, self._problems = model, problems
+        identified = table_at(data, "identify", problems)
+        tied = table_at(data, "tied", problems)
+        self.fixed = dict(table_at(data, "parameters", problems))
+        self.values = self._values(preset)
+        if not identified:
+            problems.append("identify: missing; add a table [identify.NAME] for each parameter to identify.")
+        self.unknowns = tuple(
+            one for name, table in identified.items() if (one := self._unknown(name, table)) is not None
+        )
+        self.tied = self._ties(tied, identified)
+        for name in self.fixed:
+            if name in identified or name in tied:
+                where = "identify" if name in identified else "tied"
+                problems.append(f"parameters.{name}: is also in {where}; keep one of the two.")
+        if self.values is not None and not problems:
+            self._check_together()
+
+    def _values(self, preset: str | None) -> Parameters | None:
+        try:
+            self._model.load(preset)
+        except ParameterError as error:
+            self._problems += [f"preset: {p}" for p in error.problems]
+            return None
+        try:
+            return self._model.load(preset, **self.fixed)
+        except ParameterError as error:
+            self._problems += [f"parameters: {p}" for p in error.problems]
+            return None
+
+    def _unknown(self, name: str, table: Any) -> Unknown | None:
+        if name not in self._model.parameter_names:
+            self._problems.append(
+                f"identify.{name}: {unknown_name_problem(name, self._model.parameter_names)}"
+            )
+            return None
+        one = validate(Identified, table, f"identify.{name}", self._problems)
+        if one is None or (self.values is None and one.start is None):
+            return None
+        start = one.start if one.start is not None else self.values[name]  # type: ignore[index]
+        wrong = self._model.parameter(name).problem(start)
+        if wrong is not None:
+            self._problems.append(f"identify.{name}.start: {wrong}")
+            return None
+        low, high = one.bounds or self._bounds(name, start)
+        for bound in one.bounds or ():
+            wrong = self._model.parameter(name).problem(bound)
+            # an open bound of the model may be named as the end of a range
+            if wrong is not None and bound not in (0.0, 1.0):
+                self._problems.append(f"identify.{name}.bounds: {wrong}")
+        if not low < high:
+            self._problems.append(f"identify.{name}.bounds = [{low:g}, {high:g}]: must rise.")
+        elif not low <= start <= high:
+            self._problems.append(
+                f"identify.{name}.bounds = [{low:g}, {high:g}]: exclude the start {start:g}; widen them, or "
+                f"give another start."
+            )
+        least, most = self._bounds(name, start)
+        return Unknown(name, start, max(low, least), min(high, most), one.prior)
+
+    def _bounds(self, name: str, start: float) -> tuple[float, float]:
+        """What the model allows; an open bound is kept away from by a little."""
+        return {
+            POSITIVE: (_LEAST * start, math.inf),
+            NON_NEGATIVE: (0.0, math.inf),
+            FRACTION: (_FRACTION_MARGIN, 1.0 - _FRACTION_MARGIN),
+        }.get(self._model.parameter(name).bound, (-math.inf, math.inf))
+
+    def _ties(self, table: Mapping[str, Any], identified: Mapping[str, Any]) -> dict[str, tuple[float, str]]:
+        found = {}
+        for name, text in table.items():
+            one = self._tie(name, text, table, identified)
+            if one is not None:
+                found[name] = one
+        return found
+
+    def _tie(
+        self, name: str, text: Any, table: Mapping[str, Any], identified: Mapping[str, Any]
+    ) -> tuple[float, str] | None:
+        known, path = self._model.parameter_names, f"tied.{name}"
+        match = _TIE.fullmatch(text) if isinstance(text, str) else None
+        factor, other = math.nan, ""
+        if match is not None:
+            number, minus, other = match.groups()
+            factor = -1.0 if minus else _number(number)
+        if name not in known:
+            problem = unknown_name_problem(name, known)
+        elif not math.isfinite(factor):
+            problem = 'must be a name, or a number times one, such as "NAME" or "-1.0*NAME".'
+        elif name in identified:
+            problem = "is also in identify; keep one of the two."
+        elif other == name:
+            problem = "is tied to itself; name the identified parameter that it follows."
+        elif other not in known:
+            problem = unknown_name_problem(other, known)
+        elif other in table:
+            problem = f"follows {other}, which is tied itself; tie both to one identified parameter."
+        elif other not in identified:
+            problem = f"follows {other}, which is not identified; give its value under [parameters]."
+        else:
+            return factor, other
+        self._problems.append(f"{path} = {text!r}: {problem}")
+        return None
+
+    def _check_together(self) -> None:
+        """The start must be one that the model allows as a whole, with what is tied put in."""
+        assert self.values is not None
+        starts = {u.name: u.start for u in self.unknowns}
+        tied = {name: factor * starts[other] for name, (factor, other) in self.tied.items()}
+        try:
+            Parameters(self._model, {**self.values.as_dict(), **starts, **tied})
+        except ParameterError as error:
+            self._problems += [f"identify: at the start, {p}" for p in error.problems]
+
+
+def _number(text: str | None) -> float:
+    """Factor of a tie; NaN for what is no number."""
+    try:
+        return 1.0 if text is None else float(text.replace(" ", ""))
+    except ValueError:
+        return math.nan

@@ -1,0 +1,387 @@
+"""A measurement of the magnets' torque: a table of readings and a header that says what they are.
+
+The header is a TOML file; ``workflows/magnet/discs.toml`` is an example, docs/magnet.md lists its keys. All
+that is wrong with the header or the table is said at once.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, create_model, model_validator
+
+from magpend_core.models import load_model
+from magpend_core.models.parameters import ParameterError, Parameters
+from magpend_core.models.pendulum import magnet_torque as laws
+from magpend_core.models.presets import find_preset
+from pipeline.spec.files import read_toml
+from pipeline.spec.problems import SpecError, unknown_choice, validated
+from pipeline.spec.tables import Table
+
+MIN_READINGS = 5
+"""Least readings of a curve: a bump has three numbers, and what is left over says how well it fits."""
+
+MIN_CURVES = 4
+"""Least curves of a side: the height over the locked angle has three numbers."""
+
+MAX_NAMED = 3
+SAME_ANGLE = 1e-6
+"""Locked angles that differ by less are one curve's [rad]."""
+
+ANGLE_UNITS = {"deg": math.pi / 180.0, "rad": 1.0}
+TORQUE_UNITS = {"N m": 1.0, "mN m": 1e-3, "N": 1.0}
+
+
+class AngleColumn(Table):
+    """A column of angles."""
+
+    column: str = Field(description="Its name in the table's first row.")
+    unit: Literal["deg", "rad"] = Field(description="Unit in the file.")
+    range: Annotated[tuple[float, float], Field(strict=False)] | None = Field(
+        None, description="Least and largest angle that the rig allows, in the unit; by default half a turn."
+    )
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Least and largest allowed angle, in the column's unit."""
+        half = math.pi / ANGLE_UNITS[self.unit]
+        return self.range or (-half, half)
+
+
+class TorqueColumn(Table):
+    """A column of readings."""
+
+    column: str = Field(description="Its name in the table's first row.")
+    unit: Literal["N m", "mN m", "N"] = Field(description="Unit in the file; N: a force at the end of arm_m.")
+    arm_m: Annotated[float, Field(gt=0)] | None = Field(None, description="Lever of a force in N [m].")
+    sign: Literal[1, -1] = Field(1, description="-1 where a positive reading turns the pendulum back.")
+
+    @model_validator(mode="after")
+    def _lever(self) -> TorqueColumn:
+        if (self.unit == "N") != (self.arm_m is not None):
+            raise ValueError('arm_m goes with unit = "N" and with it alone: a force needs its lever.')
+        return self
+
+    @property
+    def scale(self) -> float:
+        """Factor from the file to N m."""
+        return self.sign * TORQUE_UNITS[self.unit] * (self.arm_m or 1.0)
+
+
+class SideColumn(Table):
+    """A column that says on which side of the fixed magnet the pendulum was."""
+
+    column: str = Field(description="Its name in the table's first row.")
+    right: str = Field("right", description="What stands there for the right, where torques are positive.")
+    left: str = Field("left", description="What stands there for the left.")
+
+
+class Tie(Table):
+    """What hangs on link 1 of the tie that holds it."""
+
+    mass_kg: float = Field(ge=0, description="Mass that hangs on the link [kg].")
+    lever_m: float = Field(ge=0, description="From joint 1 along link 1 to where it hangs [m].")
+
+
+class Correction(Table):
+    """What readings have besides the magnets' torque."""
+
+    weights: bool = Field(
+        description="Whether they have the torque of the links' weights, from masses and lengths."
+    )
+    tie: Tie | None = Field(None, description="The tie's weight, if they have that.")
+    without: str | None = Field(
+        None, description="Column of readings without the magnets, taken off in place of all others."
+    )
+
+    @model_validator(mode="after")
+    def _once(self) -> Correction:
+        if self.without is not None and (self.weights or self.tie is not None):
+            raise ValueError(
+                "readings without the magnets have the weights already; set weights = false, no tie."
+            )
+        return self
+
+
+_COLUMNS: dict[str, Any] = {
+    laws.ANGLE: (AngleColumn, Field(description="Angle over which torques are read.")),
+    laws.LOCKED: (AngleColumn, Field(description="Angle that is locked.")),
+    "torque": (TorqueColumn, Field(description="Readings.")),
+    "side": (SideColumn, Field(description="Side of the fixed magnet.")),
+}
+Columns: Any = create_model("Columns", __base__=Table, **_COLUMNS)
+
+
+class Header(Table):
+    """What a measurement's header says."""
+
+    title: str = Field(description="What was measured, in a line.")
+    synthetic: bool = Field(False, description="Whether the readings were computed; all results say so.")
+    file: str = Field(description="The table, CSV with names in its first row, seen from the header.")
+    model: str = Field(laws.MODEL, description="Model whose torque is fitted.")
+    preset: str | None = Field(None, description="Preset, or a file of one, with what is not fitted.")
+    columns: Columns = Field(description="Where what stands in the table.")
+    parameters: dict[str, float] = Field(
+        {}, description="What is known of the rig, over the preset's values."
+    )
+    provenance: dict[str, str] = Field({}, description="Where each of [parameters] comes from.")
+    correction: Correction = Field(description="What the readings have besides the magnets' torque.")
+    hold: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        (), description="Parameters that the joint fit leaves as they are."
+    )
+    synthesis: dict[str, Any] = Field({}, description="How synthetic readings were made; for people.")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The readings of one locked angle on one side.
+
+    Attributes
+    ----------
+    side : int
+        Place in `laws.SIDES`.
+    locked : float
+        [rad].
+    rows : ndarray
+        Its readings' places in the measurement.
+    """
+
+    side: int
+    locked: float
+    rows: np.ndarray
+
+    def __str__(self) -> str:
+        return f"{laws.LOCKED} = {math.degrees(self.locked):.4g} deg, {laws.SIDES[self.side]}"
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Readings in SI units, corrected.
+
+    Attributes
+    ----------
+    header : Header
+    path : Path
+        Of the header.
+    digest : str
+        sha256 of the table.
+    parameters : Parameters
+        Of the model: what is known before the fit.
+    angle, locked : ndarray
+        [rad], one per reading.
+    side : ndarray of int
+        Places in `laws.SIDES`.
+    reading : ndarray
+        As read [N m].
+    torque : ndarray
+        Of the magnets alone [N m].
+    """
+
+    header: Header
+    path: Path
+    digest: str
+    parameters: Parameters
+    angle: np.ndarray
+    locked: np.ndarray
+    side: np.ndarray
+    reading: np.ndarray
+    torque: np.ndarray
+
+    @cached_property
+    def curves(self) -> tuple[Curve, ...]:
+        """The curves: those right of the fixed magnet first, by rising locked angle."""
+        return curves_of(self.locked, self.side)
+
+    @property
+    def label(self) -> str:
+        """What a figure or a preset calls it."""
+        return ("SYNTHETIC: " if self.header.synthetic else "") + self.header.title
+
+
+def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
+    """Group readings by side and locked angle."""
+    found = []
+    for code in range(len(laws.SIDES)):
+        rows = np.flatnonzero(side == code)
+        rows = rows[np.argsort(locked[rows], kind="stable")]
+        breaks = np.flatnonzero(np.diff(locked[rows]) > SAME_ANGLE) + 1
+        found += [Curve(code, float(locked[r].mean()), np.sort(r)) for r in np.split(rows, breaks) if len(r)]
+    return tuple(found)
+
+
+def read_measurement(path: str | Path) -> Measurement:
+    """Read a header and its table.
+
+    Raises
+    ------
+    SpecError
+        With all that is wrong at once: unknown or missing keys and columns, what is no number, angles out of
+        range, curves with too few readings, sides with too few curves.
+    """
+    path = Path(path)
+    header = validated(Header, read_toml(path))
+    parameters, problems = _known(header, path.parent)
+    table, content, more = _table(path.parent / header.file, header)
+    problems += more
+    columns = _numbers(header, table, problems) if table else {}
+    if columns:
+        curves = curves_of(columns[laws.LOCKED], columns["side"])
+        problems += _curve_problems(curves)
+    if problems or parameters is None:
+        raise SpecError(problems)
+    angle, locked, reading = columns[laws.ANGLE], columns[laws.LOCKED], columns["torque"]
+    torque = reading - _besides(header.correction, parameters, angle, locked, columns)
+    digest = hashlib.sha256(content).hexdigest()
+    return Measurement(header, path, digest, parameters, angle, locked, columns["side"], reading, torque)
+
+
+def _besides(
+    correction: Correction,
+    p: Parameters,
+    angle: np.ndarray,
+    locked: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+) -> np.ndarray:
+    """Torque in the readings that is not the magnets' [N m]."""
+    if correction.without is not None:
+        return columns["without"]
+    found = laws.weight_torque(angle, locked, p) if correction.weights else np.zeros_like(angle)
+    if correction.tie is not None:
+        found = found - correction.tie.mass_kg * p["g"] * correction.tie.lever_m * np.sin(angle)
+    return found
+
+
+def _known(header: Header, folder: Path) -> tuple[Parameters | None, list[str]]:
+    """Parameters before the fit, and what is wrong with them."""
+    problems = [
+        f"parameters.{name}: has no provenance; say in [provenance] where the value comes from."
+        for name in header.parameters
+        if not header.provenance.get(name, "").strip()
+    ]
+    problems += [unknown_choice("hold", name, laws.FITTED) for name in header.hold if name not in laws.FITTED]
+    try:
+        model = load_model(header.model)
+    except ParameterError as error:
+        return None, problems + [f"model: {p}" for p in error.problems]
+    lacking = [name for name in laws.FITTED if name not in model.parameter_names]
+    if lacking:
+        problems.append(f"model = {header.model!r}: has no {', '.join(lacking)}; set {laws.MODEL!r}.")
+        return None, problems
+    fitted = [name for name in header.parameters if name in laws.FITTED and name not in header.hold]
+    problems += [f"parameters.{n}: is fitted; drop it, or name it in hold." for n in fitted]
+    try:
+        preset = None if header.preset is None else find_preset(header.preset, folder)
+        return model.load(preset, **header.parameters), problems
+    except ParameterError as error:
+        return None, problems + [f"parameters: {p}" for p in error.problems]
+
+
+# ---- the table -----------------------------------------------------------------------------------
+
+
+def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, list[str]]:
+    """Columns as they stand in the file, its bytes, and what is wrong with it as a table."""
+    try:
+        content = path.read_bytes()
+        lines = [line for line in content.decode("utf-8-sig").splitlines() if line.strip()]
+    except OSError as error:
+        return {}, b"", [f"file = {header.file!r}: cannot be read ({error.strerror or error})."]
+    except UnicodeDecodeError:
+        return {}, b"", [f"file = {header.file!r}: is not text in UTF-8; write the table as CSV."]
+    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    if len(rows) < 2:
+        return (
+            {},
+            content,
+            [f"file = {header.file!r}: has no readings; names in the first row, then numbers."],
+        )
+    names = [name.strip() for name in rows[0]]
+    wanted = _wanted(header)
+    problems = [
+        f"columns.{key} = {name!r}: {header.file} has no such column; it has: {', '.join(names)}."
+        for key, name in wanted.items()
+        if name not in names
+    ]
+    ragged = [i for i, row in enumerate(rows[1:], 1) if len(row) != len(names)]
+    if ragged:
+        problems.append(f"{header.file}: {_places(ragged)}: not {len(names)} fields as in the first row.")
+    if problems:
+        return {}, content, problems
+    columns = {key: [row[names.index(name)].strip() for row in rows[1:]] for key, name in wanted.items()}
+    return columns, content, []
+
+
+def _wanted(header: Header) -> dict[str, str]:
+    """Names of columns in the file by what they are."""
+    found = {name: getattr(header.columns, name).column for name in type(header.columns).model_fields}
+    if header.correction.without is not None:
+        found["without"] = header.correction.without
+    return found
+
+
+def _numbers(header: Header, table: Mapping[str, list[str]], problems: list[str]) -> dict[str, np.ndarray]:
+    """Return the columns in SI units, or nothing after adding what is wrong with them."""
+    before, found = len(problems), {}
+    where = header.file
+    for key in (name for name in table if name != "side"):
+        found[key] = values = np.array([_number(text) for text in table[key]])
+        bad = np.flatnonzero(~np.isfinite(values)) + 1
+        if bad.size:
+            problems.append(f"{where}: {key}: {_places(bad)}: no finite number; mend it or drop the row.")
+    for key in (laws.ANGLE, laws.LOCKED):
+        column = getattr(header.columns, key)
+        low, high = column.limits
+        out = np.flatnonzero((found[key] < low) | (found[key] > high)) + 1
+        if out.size:
+            problems.append(
+                f"{where}: {key}: {_places(out)}: outside of {low:g} to {high:g} {column.unit}; "
+                f"check unit and zero, or set columns.{key}.range."
+            )
+        found[key] = found[key] * ANGLE_UNITS[column.unit]
+    for key in {"torque", "without"} & set(found):
+        found[key] = found[key] * header.columns.torque.scale
+    words = {header.columns.side.right: 0, header.columns.side.left: 1}
+    unknown = [i for i, text in enumerate(table["side"], 1) if text not in words]
+    if unknown:
+        choice = " or ".join(repr(word) for word in words)
+        problems.append(f"{where}: side: {_places(unknown)}: must be {choice}; see columns.side.")
+    found["side"] = np.array([words.get(text, -1) for text in table["side"]])
+    return found if len(problems) == before else {}
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _places(rows: Any) -> str:
+    """Name rows of the table, the first reading being 1."""
+    named = ", ".join(str(i) for i in rows[:MAX_NAMED])
+    more = f" and {len(rows) - MAX_NAMED} more" if len(rows) > MAX_NAMED else ""
+    return f"row{'s' if len(rows) > 1 else ''} {named}{more}"
+
+
+def _curve_problems(curves: tuple[Curve, ...]) -> list[str]:
+    problems = [
+        f"curve {curve}: has {len(curve.rows)} readings; at least {MIN_READINGS} are needed: "
+        "add some, or leave the curve out."
+        for curve in curves
+        if len(curve.rows) < MIN_READINGS
+    ]
+    for code, side in enumerate(laws.SIDES):
+        n = sum(curve.side == code for curve in curves)
+        if n < MIN_CURVES:
+            problems.append(
+                f"side {side!r}: has {n} curves; the fit over the locked angle needs at least {MIN_CURVES}."
+            )
+    return problems

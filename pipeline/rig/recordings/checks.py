@@ -1,0 +1,185 @@
+"""What is wrong with the readings of one channel, found in the file's own units."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pipeline.rig.recordings.findings import Finding, runs
+from pipeline.rig.recordings.mapping import ChannelMap
+
+CLIPPED_SAMPLES = 5
+"""Fewest equal readings at the extreme that are looked at as a cut-off top."""
+
+CLIPPED_RISE = 8.0
+"""A top is cut off if it lasts so long that the slope before it would have led this many grains further."""
+
+JUMP_TURNS = 0.6
+"""A step between neighbouring samples of an angle that is a wrap [turns]."""
+
+
+class Signal:
+    """One channel on the recording's clock.
+
+    Parameters
+    ----------
+    name
+        In the dataset.
+    raw
+        (n,) readings [the file's unit].
+    time
+        (n,) [s].
+    piece
+        (n,).
+    """
+
+    def __init__(self, name: str, raw: np.ndarray, time: np.ndarray, piece: np.ndarray) -> None:
+        self.name, self.raw, self.time, self.piece = name, raw, time, piece
+
+    def found(self, kind: str, start: int, end: int, severity: str, text: str) -> Finding:
+        """Return a finding on the samples from `start` to before `end`."""
+        first, last = float(self.time[start]), float(self.time[end - 1])
+        return Finding(kind, self.name, first, last, severity, text)  # type: ignore[arg-type]
+
+
+def missing(signal: Signal) -> list[Finding]:
+    """Find samples that are no numbers."""
+    return [
+        signal.found("missing", i, k, "warning", f"{k - i} samples are no numbers.")
+        for i, k in runs(~np.isfinite(signal.raw), signal.piece)
+    ]
+
+
+def constant(signal: Signal, severity: str = "warning") -> list[Finding]:
+    """Find out whether a channel does not move at all."""
+    known = signal.raw[np.isfinite(signal.raw)]
+    if known.size and np.ptp(known) > 0.0:
+        return []
+    level = f"is {known[0]:.6g} throughout" if known.size else "has no number"
+    return [
+        signal.found(
+            "constant", 0, len(signal.raw), severity, f"{level}; is the sensor connected, and mapped?"
+        )
+    ]
+
+
+def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
+    """Find samples at the ends of the sensor's range; without one, tops that look cut off.
+
+    The dead band is no saturation: where the mapping states one that reaches the range's end, its samples
+    are left to `in_dead_band`.
+    """
+    if entry.range is None:
+        return _cut_off(signal)
+    low, high = entry.range
+    at_end = (signal.raw <= low) | (signal.raw >= high)
+    if entry.dead_band is not None:
+        at_end &= ~_within(signal.raw, entry.dead_band)
+    if entry.wraps:  # a reading that wraps passes both ends
+        at_end &= ~_beside_wraps(signal, 0.5 * (high - low))
+    return [
+        signal.found(
+            "saturated", i, k, "warning",
+            f"{k - i} samples at the end of the range from {low:g} to {high:g}: the true value lies beyond.",
+        )
+        for i, k in runs(at_end, signal.piece)
+    ]  # fmt: skip
+
+
+def _beside_wraps(signal: Signal, least: float) -> np.ndarray:
+    """Samples next to a jump of at least this size."""
+    jump = np.abs(np.diff(signal.raw)) > least
+    beside = np.zeros(len(signal.raw), dtype=bool)
+    beside[1:] |= jump
+    beside[:-1] |= jump
+    return beside
+
+
+def _cut_off(signal: Signal) -> list[Finding]:
+    """Find equal readings at the extremes that last longer than a turning point can.
+
+    Near a turning point of acceleration a, a reading of grain q stays for about 2*sqrt(2*q/a): the slope
+    before it, times half of that, is a few grains. Where it is many, the top is cut off.
+    """
+    raw, piece = signal.raw, signal.piece
+    values = np.unique(raw[np.isfinite(raw)])
+    if values.size < 3:  # a switching signal
+        return []
+    grain = max(float(np.median(np.diff(values))), 1e-12 * float(np.abs(values).max()))
+    findings = []
+    for level in (values[0], values[-1]):
+        for i, k in runs(raw == level, piece):
+            length = k - i
+            lead = max(3, length // 2)
+            if length < CLIPPED_SAMPLES or i < lead or piece[i - lead] != piece[i]:
+                continue
+            slope = abs(raw[i - 1] - raw[i - lead]) / (lead - 1)
+            if slope * length / 2.0 > CLIPPED_RISE * grain:
+                findings.append(signal.found(
+                    "saturated", i, k, "warning",
+                    f"{length} samples stay at {level:.6g}, the extreme: the top looks cut off. State the "
+                    "sensor's range in the mapping.",
+                ))  # fmt: skip
+    return findings
+
+
+def _within(raw: np.ndarray, band: tuple[float, float]) -> np.ndarray:
+    inside: np.ndarray = (raw >= band[0]) & (raw <= band[1])
+    return inside
+
+
+def in_dead_band(signal: Signal, entry: ChannelMap) -> tuple[np.ndarray, list[Finding]]:
+    """Return which samples lie in the dead band, and the findings."""
+    if entry.dead_band is None:
+        return np.zeros(len(signal.raw), dtype=bool), []
+    mask = _within(signal.raw, entry.dead_band)
+    low, high = entry.dead_band
+    return mask, [
+        signal.found(
+            "dead-band", i, k, "warning",
+            f"{k - i} samples in the dead band from {low:g} to {high:g} are not measured; they are NaN.",
+        )
+        for i, k in runs(mask, signal.piece)
+    ]  # fmt: skip
+
+
+def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarray, list[Finding]]:
+    """Unwrap an angle within its pieces if that is asked for; else find the jumps of a turn.
+
+    Parameters
+    ----------
+    signal
+        The channel.
+    angle
+        (n,) [rad], NaN where it is not measured.
+    wraps
+        Whether the mapping says that the reading wraps.
+
+    Returns
+    -------
+    ndarray, list of Finding
+        The angle, continuous from one measured sample to the next of a piece where `wraps`.
+    """
+    result = angle.copy()
+    findings = []
+    known = np.flatnonzero(np.isfinite(angle))
+    turn = 2.0 * math.pi
+    step = np.diff(angle[known])
+    same = signal.piece[known[1:]] == signal.piece[known[:-1]]
+    if wraps:
+        turns = np.where(same, -np.round(step / turn), 0.0)
+        # each piece begins with the angle as it was read
+        total = np.concatenate([[0.0], np.cumsum(turns)])
+        begins = np.concatenate([[0], np.flatnonzero(~same) + 1]) if known.size else np.empty(0, np.int64)
+        base = np.repeat(total[begins], np.diff([*begins, len(known)])) if known.size else total[:0]
+        result[known] += turn * (total[: known.size] - base)
+        places = np.flatnonzero(turns)
+        severity, text = "note", "wraps here; it is unwrapped, as asked for."
+    else:
+        places = np.flatnonzero(same & (np.abs(step) > JUMP_TURNS * turn))
+        severity = "error"
+        text = "jumps by a turn; if the reading wraps, add wraps = true to its mapping."
+    for i in places:
+        findings.append(signal.found("wrap", int(known[i]), int(known[i + 1]) + 1, severity, text))
+    return result, findings

@@ -1,0 +1,359 @@
+"""From the clocks of a file's channels to one uniform time, in pieces between gaps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipeline.rig.recordings.findings import Finding, runs
+from pipeline.rig.recordings.raw import Channel
+from pipeline.spec.problems import SpecError
+
+MIXED = 1e-3
+"""Relative difference of two sampling intervals from which on they are two rates."""
+
+GAP_STEPS = 1.5
+"""Distance of two time stamps from which on there is a gap [sampling intervals]."""
+
+REPEATING = 0.01
+"""Share of equal neighbouring time stamps from which on they are coarser than the sampling."""
+
+EVEN = 0.01
+"""Deviation of a time stamp from even steps that is not worth a word [sampling intervals]."""
+
+UNEVEN = 0.5
+"""Deviation from which on samples are not where even steps put them [sampling intervals]."""
+
+
+@dataclass(eq=False)
+class Clock:
+    """Where the samples of a recording are in time, and in the channels of its stretches.
+
+    Attributes
+    ----------
+    time : ndarray
+        (n,) [s since the first sample], even within a piece.
+    piece : ndarray
+        (n,) 0, 1, ...
+    step_s : float
+        Sampling interval [s].
+    taken : list of mappings
+        For each stretch the first sample, and the one after the last, by channel.
+    findings : list of Finding
+    """
+
+    time: np.ndarray
+    piece: np.ndarray
+    step_s: float
+    taken: list[dict[str, tuple[int, int]]]
+    findings: list[Finding] = field(default_factory=list)
+
+
+def clock_of(
+    stretches: Sequence[Mapping[str, Channel]],
+    sampling_rate_hz: float | None,
+    source: str,
+    *,
+    numbers: np.ndarray | None = None,
+    apart: bool = False,
+) -> Clock:
+    """Put the channels of all stretches on one clock.
+
+    Parameters
+    ----------
+    stretches
+        The channels that are used, by name, with time stamps or sampling intervals.
+    sampling_rate_hz
+        Stated by the mapping; goes before what the file states.
+    source
+        Name of the file, for messages.
+    numbers
+        (n,) of the samples of the first channel, one stretch after the other: a new piece begins where it
+        changes.
+    apart
+        Whether each stretch is a piece, even one that follows on the one before.
+
+    Returns
+    -------
+    Clock
+        Channels that begin later than others, or end earlier, decide; what is left out is a finding.
+
+    Raises
+    ------
+    SpecError
+        If no sampling interval is known, channels have different ones, time stamps go backwards, or there
+        are no samples.
+    """
+    stated = None if sampling_rate_hz is None else 1.0 / sampling_rate_hz
+    step = _common_step(stretches, stated, source)
+    findings = _rate_findings(stretches, stated)
+    taken, stamps = [], []
+    for channels in stretches:
+        where, found = _aligned(channels, step, source)
+        first = next(iter(channels.values()))
+        begin, end = where[first.name]
+        taken.append(where)
+        stamps.append(_stamps(first, stated)[begin:end] if len(first) else np.empty(0))
+        findings += found
+    stamps, cut = _one_after_another(_checked_stamps(stamps, step, source), step, findings)
+    begins = np.cumsum([0, *(len(s) for s in stamps)])[:-1]
+    forced = np.zeros(sum(map(len, stamps)), dtype=bool)
+    forced[begins] = apart or cut
+    if numbers is not None:
+        forced |= _changes(numbers, stretches, taken)
+    time, piece, own_step, found = _cut(np.concatenate(stamps) - stamps[0][0], forced, step, stated)
+    return Clock(time, piece, own_step, taken, findings + found)
+
+
+def _changes(
+    numbers: np.ndarray,
+    stretches: Sequence[Mapping[str, Channel]],
+    taken: Sequence[Mapping[str, tuple[int, int]]],
+) -> np.ndarray:
+    """Samples on the clock from which on a file numbers a new piece."""
+    parts, first = [], 0
+    for channels, where in zip(stretches, taken, strict=True):
+        name, channel = next(iter(channels.items()))
+        begin, end = where[name]
+        parts.append(numbers[first + begin : first + end])
+        first += len(channel)
+    own = np.concatenate(parts)
+    return np.concatenate([[False], own[1:] != own[:-1]])
+
+
+def _stamps(channel: Channel, stated: float | None) -> np.ndarray:
+    """Instants of a channel's samples [s]; they begin at NaN where the file does not say when."""
+    if channel.time is not None and stated is None:
+        return channel.time
+    step = channel.step_s if stated is None else stated
+    return np.asarray(channel.start_s + step * np.arange(len(channel)))
+
+
+def step_of(channel: Channel) -> float:
+    """Sampling interval of one channel [s]: the usual distance of its stamps, or what is stated."""
+    if channel.time is None or len(channel.time) < 2:
+        return channel.step_s
+    steps = np.diff(channel.time)
+    usual = float(np.median(steps))
+    if usual > 0.0 and np.mean(steps == 0.0) < REPEATING:
+        return usual
+    # stamps coarser than the sampling repeat: their mean, without the gaps
+    mean = (channel.time[-1] - channel.time[0]) / len(steps)
+    short = steps[steps <= GAP_STEPS * mean + steps[steps > 0.0].min(initial=mean)]
+    return float(short.mean()) if short.size else mean
+
+
+def _common_step(stretches: Sequence[Mapping[str, Channel]], stated: float | None, source: str) -> float:
+    steps = {name: step_of(c) for channels in stretches for name, c in channels.items()}
+    if stated is not None and not any(c.time is not None for s in stretches for c in s.values()):
+        rates = {n: s for n, s in steps.items() if math.isfinite(s)}
+        _refuse_mixed(rates, source)
+        return stated
+    unknown = [name for name, s in steps.items() if not (math.isfinite(s) and s > 0.0)]
+    if unknown:
+        raise SpecError(
+            [
+                f"{source}: the sampling interval of {', '.join(unknown)} is not known; add to the mapping "
+                'time = { channel = "NAME" } if there are time stamps, or sampling_rate_hz = NUMBER.'
+            ]
+        )
+    _refuse_mixed(steps, source)
+    return stated if stated is not None else float(np.median(list(steps.values())))
+
+
+def _refuse_mixed(steps: Mapping[str, float], source: str) -> None:
+    if steps and max(steps.values()) > (1.0 + MIXED) * min(steps.values()):
+        told = ", ".join(f"{name} {1.0 / s:.6g} Hz" for name, s in steps.items())
+        raise SpecError(
+            [
+                f"{source}: the mapped channels have different sampling rates ({told}); map channels of one "
+                "rate, or resample the file to one before it is read."
+            ]
+        )
+
+
+def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | None) -> list[Finding]:
+    """Say where the file states another rate than the mapping."""
+    if stated is None:
+        return []
+    own = {c.name: step_of(c) for c in stretches[0].values()}
+    return [
+        Finding(
+            "rate", name, math.nan, math.nan, "warning",
+            f"the file says {1.0 / step:.8g} Hz, the mapping {1.0 / stated:.8g} Hz; the mapping's is used.",
+        )
+        for name, step in own.items() if math.isfinite(step) and abs(step / stated - 1.0) > 1e-6
+    ]  # fmt: skip
+
+
+def _aligned(
+    channels: Mapping[str, Channel], step: float, source: str
+) -> tuple[dict[str, tuple[int, int]], list[Finding]]:
+    """Let all channels of a stretch begin at the latest start and end at the earliest end."""
+    starts = {
+        n: float(c.time[0]) if c.time is not None and len(c) else c.start_s for n, c in channels.items()
+    }
+    known = [s for s in starts.values() if math.isfinite(s)]
+    first = max(known, default=0.0)
+    late = {n: (first - s) / step if math.isfinite(s) else 0.0 for n, s in starts.items()}
+    begins = {n: min(round(d), len(channels[n])) for n, d in late.items()}
+    n_common = min(len(c) - begins[n] for n, c in channels.items())
+    if n_common < 2:
+        told = ", ".join(f"{n} has {len(c)} samples from {starts[n]:.6g} s" for n, c in channels.items())
+        raise SpecError([f"{source}: the mapped channels have no stretch in common ({told})."])
+    findings = _start_findings(late, step, len(known) == len(channels))
+    findings += _length_findings({n: len(c) - begins[n] for n, c in channels.items()}, n_common, step)
+    return {n: (b, b + n_common) for n, b in begins.items()}, findings
+
+
+def _start_findings(late: Mapping[str, float], step: float, all_known: bool) -> list[Finding]:
+    findings = []
+    for name, distance in late.items():
+        whole, rest = round(distance), distance - round(distance)
+        if whole:
+            findings.append(Finding(
+                "start", name, 0.0, 0.0, "warning",
+                f"begins {whole * step:.6g} s before the last channel to begin; its first {whole} "
+                "samples are left out.",
+            ))  # fmt: skip
+        if abs(rest) > EVEN:
+            findings.append(Finding(
+                "start", name, 0.0, 0.0, "warning",
+                f"is sampled {abs(rest) * step:.3g} s {'after' if rest < 0.0 else 'before'} the others; "
+                "it is laid on their instants as it is.",
+            ))  # fmt: skip
+    if not all_known and any(late.values()):
+        findings.append(Finding(
+            "start", "", 0.0, 0.0, "warning",
+            "some channels do not say when they begin; with the last is assumed.",
+        ))  # fmt: skip
+    return findings
+
+
+def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> list[Finding]:
+    short = [n for n, length in lengths.items() if length == n_common]
+    return [
+        Finding(
+            "length", name, n_common * step, length * step, "warning",
+            f"has {length} samples, {', '.join(short)} only {n_common}; the last {length - n_common} are "
+            "left out.",
+        )
+        for name, length in lengths.items() if length > n_common
+    ]  # fmt: skip
+
+
+def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[np.ndarray]:
+    """Return stamps that are numbers and rise; count from 0 where the file does not say when it began."""
+    if all(np.isnan(s).all() for s in stamps):
+        return [step * np.arange(len(s)) for s in stamps]
+    for s in stamps:
+        bad = np.flatnonzero(~np.isfinite(s))
+        if bad.size:
+            raise SpecError(
+                [f"{source}: time stamp {bad[0]} is no number; give sampling_rate_hz instead of time."]
+            )
+    _refuse_backwards(stamps, source)
+    return stamps
+
+
+def _cut(
+    time: np.ndarray, forced: np.ndarray, step: float, stated: float | None
+) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
+    """Cut the samples at gaps and where it is asked for, and make time even within each piece."""
+    distance = np.diff(time)
+    # stamps coarser than the sampling repeat, and then leap by a grain of theirs
+    repeats = bool(np.mean(distance == 0.0) >= REPEATING) if distance.size else False
+    grain = float(distance[distance > 0.0].min(initial=np.inf)) if repeats else 0.0
+    is_gap = np.concatenate([[False], distance > GAP_STEPS * step + grain])
+    piece = np.cumsum(is_gap | np.concatenate([[False], forced[1:]])).astype(np.int64)
+    even, own_step, residual = _even(time, piece, step, stated)
+    findings = [
+        Finding(
+            "gap", "", float(time[i - 1]), float(time[i]), "warning",
+            f"{round((time[i] - time[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
+        )
+        for i in np.flatnonzero(is_gap)
+    ]  # fmt: skip
+    return even, piece, own_step, findings + _jitter_findings(even, residual, own_step)
+
+
+def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
+    for s in stamps:
+        falling = np.flatnonzero(np.diff(s) < 0.0)
+        if falling.size:
+            i = int(falling[0])
+            raise SpecError(
+                [
+                    f"{source}: time goes backwards after sample {i} ({s[i]:.9g} s, then {s[i + 1]:.9g} s; "
+                    f"{falling.size} times in all); give sampling_rate_hz instead of time if the "
+                    "samples are even, or cut the file there."
+                ]
+            )
+
+
+def _one_after_another(
+    stamps: list[np.ndarray], step: float, findings: list[Finding]
+) -> tuple[list[np.ndarray], bool]:
+    """Shift stretches whose clock begins anew behind the one before, a step apart; say whether any was."""
+    placed = [stamps[0]]
+    moved = 0
+    for s in stamps[1:]:
+        last = placed[-1][-1]
+        anew = s[0] <= last
+        placed.append(s - s[0] + last + step if anew else s)
+        moved += anew
+    if moved:
+        findings.append(Finding(
+            "pieces", "", math.nan, math.nan, "note",
+            f"the clock begins anew in {moved} of {len(stamps)} stretches; they are laid one after another, "
+            "a sampling interval apart. How far apart they were is not known.",
+        ))  # fmt: skip
+    return placed, moved > 0
+
+
+def _even(
+    time: np.ndarray, piece: np.ndarray, step: float, stated: float | None
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Fit lines of one slope through the stamps of all pieces; return the lines, the slope, the residuals."""
+    count = np.bincount(piece)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    index = np.arange(len(time)) - first[piece]
+    index = index - ((count - 1) / 2.0)[piece]
+    mean = np.bincount(piece, time) / count
+    spread = float(index @ index)
+    slope = float(index @ (time - mean[piece])) / spread if spread > 0.0 else step
+    if stated is not None:
+        slope = stated
+    else:
+        # a round rate, if the stamps do not contradict it
+        rounded = 1.0 / float(f"{1.0 / slope:.5g}")
+        if abs(rounded - slope) * count.max() < EVEN * slope:
+            slope = rounded
+    even = mean[piece] + slope * index
+    return even - even[0], slope, time - even
+
+
+def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> list[Finding]:
+    """Say how far stamps are from even steps, and where it is so far that samples change places."""
+    worst, spread = float(np.abs(residual).max()), float(residual.std())
+    if worst <= EVEN * step:
+        return []
+    text = (
+        f"time stamps deviate from even steps of {step:.6g} s by {spread:.3g} s (standard deviation), "
+        f"{worst:.3g} s at most"
+    )
+    if worst < UNEVEN * step:
+        return [
+            Finding("jitter", "", float(time[0]), float(time[-1]), "note", f"{text}; even steps are used.")
+        ]
+    far = runs(np.abs(residual) >= UNEVEN * step)
+    return [
+        Finding(
+            "jitter", "", float(time[far[0, 0]]), float(time[far[-1, 1] - 1]), "warning",
+            f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it "
+            "is read.",
+        )
+    ]  # fmt: skip

@@ -1,0 +1,149 @@
+"""CSV files: delimiter, header and decimal comma, stated or found out."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.rig.recordings.findings import Finding
+from pipeline.rig.recordings.mapping import CsvMap
+from pipeline.rig.recordings.raw import Channel, Raw, digest
+from pipeline.rig.recordings.text import number, read_text, split, table, unique, without_end
+from pipeline.spec.problems import SpecError
+
+SIMULATED = "# simulated"
+"""First line of a file that nobody measured."""
+
+DELIMITERS = (";", "\t", ",", " ")
+LOOKED_AT = 50
+"""Lines from which the form of a file is found out."""
+
+_BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
+
+
+@dataclass(frozen=True)
+class _Form:
+    """How a text is to be read.
+
+    Attributes
+    ----------
+    delimiter, decimal : str
+    n_columns : int
+    n_head : int
+        Rows before the numbers.
+    """
+
+    delimiter: str
+    decimal: str
+    n_columns: int
+    n_head: int
+
+
+def read_csv(path: Path, stated: CsvMap) -> Raw:
+    """Read all columns of a CSV file.
+
+    Lines that begin with ``#`` are comments. The first row with names, if there is one, gives the channels'
+    names; a second one their units, as do brackets after a name: ``angle [V]``. Without names the columns are
+    ``1``, ``2``, ... What is empty, or no number, is NaN; after the last number of a column it is nothing.
+
+    Parameters
+    ----------
+    path
+        The file.
+    stated
+        What need not be found out.
+
+    Raises
+    ------
+    SpecError
+        If it is no table of numbers, or can be read in two ways.
+    """
+    lines = read_text(path).splitlines()
+    is_simulated = bool(lines) and lines[0].startswith(SIMULATED)
+    rows = [line for line in lines[stated.skip_rows :] if line.strip() and not line.startswith("#")]
+    form = _form(path, rows, stated)
+    head = [split(line, form.delimiter) for line in rows[: form.n_head]]
+    names, units = _names(head, form.n_columns)
+    body = rows[form.n_head :]
+    findings = []
+    last = split(body[-1], form.delimiter)
+    if len(body) > 1 and len(last) < len(split(body[-2], form.delimiter)):
+        body = body[:-1]
+        findings.append(Finding(
+            "truncated", "", math.nan, math.nan, "warning",
+            f"the last row has {len(last)} of {form.n_columns} fields; it is left out.",
+        ))  # fmt: skip
+    values = table(body, form.n_columns, form.delimiter, form.decimal)
+    found = {
+        name: Channel(name, without_end(values[:, j]), unit)
+        for j, (name, unit) in enumerate(zip(names, units, strict=True))
+        if np.isfinite(values[:, j]).any()
+    }
+    return Raw(path, "csv", digest(path), (found,), tuple(findings), simulated=is_simulated)
+
+
+def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
+    """Find the one way to read the rows as numbers."""
+    delimiters = (stated.delimiter,) if stated.delimiter else DELIMITERS
+    decimals = (stated.decimal,) if stated.decimal else (".", ",")
+    found = []
+    for delimiter, decimal in itertools.product(delimiters, decimals):
+        if delimiter != decimal:
+            form = _try(rows, delimiter, decimal, stated.header)
+            if form is not None:
+                found.append(form)
+    if not found:
+        raise SpecError(
+            [
+                f"{path}: is not a table of numbers with one of the delimiters ; , tab or blank; state "
+                "[csv] delimiter, decimal, header or skip_rows in the mapping."
+            ]
+        )
+    # a row of names has as many fields as the rows of numbers
+    named = [f for f in found if f.n_head and len(split(rows[0], f.delimiter)) == f.n_columns]
+    best = max(f.n_columns for f in named or found)
+    chosen = [f for f in named or found if f.n_columns == best]
+    ambiguous = {f.decimal for f in found if "," in (f.delimiter, f.decimal)} == {".", ","} and not named
+    if ambiguous and any("," in row for row in rows[-2:]):
+        raise SpecError(
+            [
+                f"{path}: a comma may be between fields or in numbers ({rows[-1]!r}); state [csv] decimal = "
+                '"," or delimiter = "," in the mapping.'
+            ]
+        )
+    return chosen[0]
+
+
+def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> _Form | None:
+    """Return the form with this delimiter and decimal point, None if it does not fit."""
+    sample = rows[:LOOKED_AT]
+    parsed = [[number(part, decimal) for part in split(row, delimiter)] for row in sample]
+    is_text = [any(v is None for v in row) or all(v is None or v != v for v in row) for row in parsed]
+    n_head = next((i for i, text in enumerate(is_text) if not text), len(sample))
+    if header is not None:
+        n_head = max(n_head, 1) if header else 0
+    body = parsed[n_head:]
+    if not body or n_head > LOOKED_AT // 2:
+        return None
+    n_columns = max(len(row) for row in body)
+    whole = body[:-1] if len(rows) <= LOOKED_AT and len(body) > 1 else body
+    if any(len(row) != n_columns or all(v is None for v in row) for row in whole):
+        return None
+    n_bad = sum(v is None for row in body for v in row)
+    return _Form(delimiter, decimal, n_columns, n_head) if n_bad <= 0.1 * len(body) * n_columns else None
+
+
+def _names(head: list[list[str]], n_columns: int) -> tuple[list[str], list[str]]:
+    """Names and units of the columns from the rows before the numbers."""
+    whole = [[part.strip().strip('"').strip() for part in row] for row in head if len(row) == n_columns]
+    if not whole:
+        return [str(j + 1) for j in range(n_columns)], [""] * n_columns
+    names = unique([name or str(j + 1) for j, name in enumerate(whole[0])])
+    in_names = [m[1].strip() if (m := _BRACKETS.search(name)) else "" for name in names]
+    below = [part.strip("[]() ") for part in whole[1]] if len(whole) > 1 else [""] * n_columns
+    return names, [a or b for a, b in zip(in_names, below, strict=True)]

@@ -1,0 +1,167 @@
+"""The figure of a recording: what was measured over time, and what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from pipeline.layout.vocabulary import model_of
+from pipeline.plots import labels, style
+from pipeline.rig.recordings.findings import findings_of
+from pipeline.rig.recordings.mapping import DRIVE
+
+MOST_DOTS = 6000
+"""Samples of a line that are drawn one by one; of more, the least and the greatest of each column."""
+
+LINES = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE)
+MARKS = {
+    "gap": "0.75", "dead-band": style.ORANGE, "saturated": style.VERMILLION, "missing": "0.55",
+    "wrap": style.SKY, "jitter": style.PURPLE, "start": style.GREEN, "length": style.GREEN,
+}  # fmt: skip
+"""Colour by kind of finding; kinds that have no place are in the caption."""
+
+LEAST_MARK = 0.003
+"""Least width of a mark [width of the axes]."""
+
+
+def plot_recording(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
+    """Draw the measured quantities of a recording over time, with the findings marked.
+
+    Parameters
+    ----------
+    ds
+        As `read_recording` or `smooth` give it.
+    frame
+        Width of the figure, and the range of time [s].
+
+    Returns
+    -------
+    DataFigure
+        A panel for each unit and one for the drive. Findings are coloured stretches of the panels that they
+        concern; ends of pieces are thin lines. Its `data` are `ds`.
+    """
+    rows = _rows(ds)
+    fig = style.new_figure(1.0 + 1.45 * len(rows), ds, frame)
+    grid = fig.subplots(len(rows), 1, sharex=True, squeeze=False)
+    axes: list[Axes] = list(grid[:, 0])
+    time = ds["time"].values
+    span = frame.xlim or (float(time[0]), float(time[-1]))
+    for ax, names in zip(axes, rows, strict=True):
+        style.style_axes(ax)
+        for colour, name in zip(LINES, names, strict=False):
+            _draw(ax, ds, name, span, colour)
+        style.label_axes(ax, None, _label(ds, names))
+        ax.set_xlim(*style.check_range("xlim", span))
+    kinds = _mark(axes, rows, ds, span)
+    style.label_axes(axes[-1], labels.with_unit("time", "s"), None)
+    fig.align_ylabels(axes)
+    handles = _line_handles(ds, rows) + [
+        Patch(color=MARKS[k], alpha=0.5, linewidth=0.0, label=k) for k in kinds
+    ]
+    style.complete(fig, axes[0], _caption(ds), handles)
+    return fig
+
+
+def _rows(ds: xr.Dataset) -> list[tuple[str, ...]]:
+    """Quantities that share a panel: those of one unit; the drive has its own."""
+    units: dict[str, tuple[str, ...]] = {}
+    for name in map(str, ds.data_vars):
+        if name != DRIVE:
+            unit = str(ds[name].attrs.get("units", ""))
+            units[unit] = (*units.get(unit, ()), name)
+    return [*units.values(), *([(DRIVE,)] if DRIVE in ds else [])]
+
+
+def _symbol(ds: xr.Dataset, name: str) -> str:
+    model = model_of(ds)
+    symbols = {s.name: s.symbol for s in model.states} | {q.name: q.symbol for q in model.quantities}
+    symbol = symbols.get(name, "")
+    return f"${symbol}$" if symbol else name
+
+
+def _label(ds: xr.Dataset, names: Sequence[str]) -> str:
+    text = ", ".join(_symbol(ds, name) for name in names)
+    return labels.with_unit(text, str(ds[names[0]].attrs.get("units", "")))
+
+
+def _draw(ax: Axes, ds: xr.Dataset, name: str, span: tuple[float, float], colour: str) -> None:
+    """Draw a quantity as a line that breaks between pieces."""
+    time, values, piece = ds["time"].values, ds[name].values, ds["piece"].values
+    inside = (time >= span[0]) & (time <= span[1])
+    time, values, piece = time[inside], values[inside].astype(np.float64), piece[inside]
+    cuts = np.flatnonzero(np.diff(piece)) + 1
+    if len(time) > MOST_DOTS:
+        time, values = _envelope(time, values)
+    elif cuts.size:
+        time = np.insert(time, cuts, time[cuts])
+        values = np.insert(values, cuts, np.nan)
+    ax.plot(time, values, color=colour, linewidth=0.8, gid=f"recording-{name}")
+
+
+def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest of neighbouring samples, in their order; NaN where none is known."""
+    n = len(time) // (MOST_DOTS // 2) + 1
+    whole = len(time) // n * n
+    blocks = values[:whole].reshape(-1, n)
+    known = np.isfinite(blocks).any(axis=1)
+    low = np.where(np.isfinite(blocks), blocks, np.inf).argmin(axis=1)
+    high = np.where(np.isfinite(blocks), blocks, -np.inf).argmax(axis=1)
+    rows = np.arange(len(blocks))
+    pair = np.sort(np.column_stack([low, high]), axis=1) + n * rows[:, None]
+    picked = values[pair]
+    picked[~known] = np.nan
+    return (
+        np.append(time[pair].ravel(), time[whole:]),
+        np.append(picked.ravel(), values[whole:]),
+    )
+
+
+def _mark(
+    axes: Sequence[Axes], rows: Sequence[Sequence[str]], ds: xr.Dataset, span: tuple[float, float]
+) -> list[str]:
+    """Shade what was found, and draw the ends of pieces; return the kinds that are marked."""
+    least = LEAST_MARK * (span[1] - span[0])
+    kinds: dict[str, None] = {}
+    for f in findings_of(ds):
+        if f.kind not in MARKS or np.isnan(f.start_s) or f.end_s < span[0] or f.start_s > span[1]:
+            continue
+        kinds[f.kind] = None
+        middle, half = 0.5 * (f.start_s + f.end_s), 0.5 * max(f.end_s - f.start_s, least)
+        for ax, names in zip(axes, rows, strict=True):
+            if f.channel in ("", *names):
+                ax.axvspan(
+                    middle - half, middle + half, color=MARKS[f.kind], alpha=0.35, linewidth=0.0, zorder=0
+                )
+    time, piece = ds["time"].values, ds["piece"].values
+    for i in np.flatnonzero(np.diff(piece)):
+        for ax in axes:
+            ax.axvline(0.5 * (time[i] + time[i + 1]), color="0.8", linewidth=0.5, zorder=0.5)
+    return list(kinds)
+
+
+def _line_handles(ds: xr.Dataset, rows: Sequence[Sequence[str]]) -> list[Any]:
+    """Legend of the panels with more than one line; colours are the same in all panels."""
+    return [
+        Line2D([], [], color=colour, linewidth=1.2, label=_symbol(ds, name))
+        for names in rows if len(names) > 1 for colour, name in zip(LINES, names, strict=False)
+    ]  # fmt: skip
+
+
+def _caption(ds: xr.Dataset) -> str:
+    """File, rate, pieces, and what has no place in time."""
+    n_pieces = len(np.unique(ds["piece"].values))
+    parts = [
+        Path(str(ds.attrs.get("file", ""))).name.replace("_", "\\_").replace("\\_", "_"),
+        f"{float(ds.attrs['sampling_rate_hz']):.6g} Hz",
+        f"{n_pieces} pieces" if n_pieces > 1 else "",
+        "simulated" if ds.attrs.get("simulated") else "",
+    ]
+    others = sorted({f.kind for f in findings_of(ds) if f.kind not in MARKS or np.isnan(f.start_s)})
+    return style.join([*parts, f"also found: {', '.join(others)}" if others else ""])

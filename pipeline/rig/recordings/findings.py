@@ -1,0 +1,106 @@
+"""What is wrong with a recording, or was done to it: told, never silently mended."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+
+Severity = Literal["note", "warning", "error"]
+SEVERITIES: tuple[Severity, ...] = ("note", "warning", "error")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that a recording's user must know.
+
+    Attributes
+    ----------
+    kind : str
+        One word, such as ``gap``; `KINDS` says what each means.
+    channel : str
+        Name in the dataset, or in the file before it is mapped; empty if it concerns all of them.
+    start_s, end_s : float
+        Where in the recording [s since its first sample]; NaN if that is not known.
+    severity : str
+        ``note``: done as asked, nothing is lost. ``warning``: some samples cannot be used, or are less than
+        they seem. ``error``: what is computed from this recording will be wrong unless it is mended.
+    text : str
+        A sentence with the remedy, if there is one.
+    """
+
+    kind: str
+    channel: str
+    start_s: float
+    end_s: float
+    severity: Severity
+    text: str
+
+
+KINDS = {
+    "truncated": "the file ends before the end that its own header states",
+    "length": "channels of one file have different numbers of samples",
+    "start": "channels of one file begin at different instants",
+    "rate": "the sampling rate is not what the file or the mapping states",
+    "jitter": "time stamps deviate from even steps",
+    "gap": "samples are missing between two time stamps",
+    "pieces": "the file's stretches have no common clock",
+    "missing": "samples are no numbers",
+    "constant": "a channel does not move at all",
+    "saturated": "samples lie at the end of the sensor's range",
+    "dead-band": "samples lie where the sensor does not measure",
+    "wrap": "the angle jumps by a turn",
+    "unit": "the file states another unit than the mapping",
+}
+"""All kinds of findings."""
+
+
+def findings_of(ds: xr.Dataset) -> list[Finding]:
+    """Return the findings of a recording, from its attribute ``findings``."""
+    rows = json.loads(ds.attrs.get("findings", "[]"))
+    return [
+        Finding(**{**row, **{k: math.nan if row[k] is None else row[k] for k in ("start_s", "end_s")}})
+        for row in rows
+    ]
+
+
+def to_json(findings: Iterable[Finding]) -> str:
+    """Return findings as a JSON list; instants that are not known are null."""
+    rows = [
+        {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(f).items()}
+        for f in findings
+    ]
+    return json.dumps(rows)
+
+
+def runs(mask: np.ndarray, piece: np.ndarray | None = None) -> np.ndarray:
+    """Stretches of true entries.
+
+    Parameters
+    ----------
+    mask
+        (n,).
+    piece
+        (n,); no stretch goes from one piece into another.
+
+    Returns
+    -------
+    ndarray
+        (n_runs, 2): the first index of each, and the one after its last.
+    """
+    inside = np.concatenate([[False], np.asarray(mask, dtype=bool), [False]])
+    change = inside[1:] != inside[:-1]
+    if piece is not None and len(piece) > 1:
+        parted = (piece[1:] != piece[:-1]) & mask[1:] & mask[:-1]
+        cuts = np.flatnonzero(parted) + 1
+    else:
+        cuts = np.empty(0, dtype=np.int64)
+    places = np.flatnonzero(change)
+    starts = np.sort(np.concatenate([places[::2], cuts]))
+    ends = np.sort(np.concatenate([places[1::2], cuts]))
+    return np.column_stack([starts, ends])

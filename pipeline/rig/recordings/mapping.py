@@ -1,0 +1,320 @@
+"""The mapping of a recording: which channel of the file is which quantity, and how it is scaled."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping as AnyMapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
+from magpend_core.models import ModelError, load_model
+from magpend_core.models.model import Model
+from pipeline.rig.recordings import units
+from pipeline.spec.files import read_toml
+from pipeline.spec.problems import SpecError, problems_of, unknown_key
+from pipeline.spec.tables import Table
+
+FORMATS = ("tdms", "lvm", "csv", "matlab")
+DRIVE = "drive"
+"""Name of the drive in a recording's dataset."""
+
+Name = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
+Pair = Annotated[tuple[float, float], Field(strict=False)]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class Scaled(Table):
+    """A channel and how its numbers become SI units: ``sign*scale*unit*(raw - zero) + offset``."""
+
+    channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
+    unit: str = Field(default="", description="Unit in the file; by default that of the quantity.")
+    scale: float | None = Field(
+        default=None, description="Of a unit that is not the quantity's: SI units per unit."
+    )
+    zero: float = Field(default=0.0, description="Reading that is 0 [the file's unit].")
+    offset: float = Field(default=0.0, description="Added after scaling [SI units].")
+    sign: Literal[-1, 1] = Field(default=1, description="-1 if it counts the other way round.")
+
+
+class ChannelMap(Scaled):
+    """``[channels.NAME]``: a measured quantity, under the name of the model's state."""
+
+    range: Pair | None = Field(default=None, description="Ends of the sensor's range [the file's unit].")
+    wraps: bool = Field(default=False, description="Whether the reading jumps back once a turn.")
+    dead_band: Pair | None = Field(
+        default=None, description="Readings where it does not measure [the file's unit]."
+    )
+    relative_to: str | None = Field(
+        default=None, description="Channel to which this angle is relative; it is added."
+    )
+
+    @model_validator(mode="after")
+    def _rise(self) -> ChannelMap:
+        for key in ("range", "dead_band"):
+            pair = getattr(self, key)
+            if pair is not None and pair[1] <= pair[0]:
+                raise ValueError(f"{key} = {list(pair)!r}: the second number must be the greater one.")
+        return self
+
+
+class DriveMap(Scaled):
+    """``[drive]``: a torque, or a signal that switches with it."""
+
+    kind: Literal["torque", "signal"] = Field(description="A torque [N m], or the level of a signal.")
+
+
+class TimeMap(Table):
+    """``time``: the channel with a time stamp for each sample."""
+
+    channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
+    unit: str = Field(default="s", description="Unit in the file.")
+
+
+class PieceMap(Table):
+    """``piece``: a channel that changes where a new piece begins."""
+
+    channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
+
+
+class CsvMap(Table):
+    """``[csv]``: how the text is to be read where it is not to be found out."""
+
+    delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
+        default=None, description="Between fields."
+    )
+    decimal: Literal[".", ","] | None = Field(default=None, description="Decimal point.")
+    header: bool | None = Field(default=None, description="Whether the first row has names.")
+    skip_rows: int = Field(default=0, ge=0, description="Rows before the names.")
+
+
+class Mapping(Table):
+    """What the channels of a recording are.
+
+    The keys are those of the TOML file; `load_mapping` reads and checks one.
+    """
+
+    model: str = Field(description="Model whose states are measured.")
+    format: Literal["tdms", "lvm", "csv", "matlab"] | None = Field(
+        default=None, description="By default by the suffix."
+    )
+    time: TimeMap | None = Field(default=None, description="Channel of time stamps.")
+    piece: PieceMap | None = Field(default=None, description="Channel with a number for each piece.")
+    sampling_rate_hz: Positive | None = Field(
+        default=None, description="Where the file does not state it [Hz]."
+    )
+    window_s: Pair | None = Field(default=None, description="Part to be read [s since the first sample].")
+    csv: CsvMap = Field(default=CsvMap(), description="How a text is read.")
+    channels: dict[str, ChannelMap] = Field(min_length=1, description="By name of a state.")
+    drive: DriveMap | Literal["none"] = Field(default="none", description="Channel of the drive.")
+
+    @property
+    def system(self) -> Model:
+        """The model."""
+        return load_model(self.model)
+
+    @property
+    def drive_map(self) -> DriveMap | None:
+        """The drive's channel, None if there is none."""
+        return None if isinstance(self.drive, str) else self.drive
+
+    def unit_of(self, name: str) -> str:
+        """SI unit of a quantity of the recording."""
+        if name == DRIVE:
+            return "N m" if self.drive_map is not None and self.drive_map.kind == "torque" else "1"
+        return _units(self.system)[name]
+
+    def factor_of(self, name: str) -> float:
+        """What a number of the file is in SI units, with its sign."""
+        entry: Scaled = self.drive_map if name == DRIVE and self.drive_map else self.channels[name]
+        known = units.factor(entry.unit, self.unit_of(name))
+        return entry.sign * (1.0 if entry.scale is None else entry.scale) * (1.0 if known is None else known)
+
+    def toml(self) -> str:
+        """Return the text of a file that `load_mapping` reads as this mapping."""
+        plain = self.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+        tables = {
+            key: plain.pop(key) for key in ("csv", "channels", "drive") if isinstance(plain.get(key), dict)
+        }
+        lines = [f"{key} = {_literal(value)}" for key, value in plain.items()]
+        channels = {f"channels.{_key(name)}": entry for name, entry in tables.pop("channels", {}).items()}
+        for head, table in {**channels, **tables}.items():
+            lines += ["", f"[{head}]", *(f"{key} = {_literal(value)}" for key, value in table.items())]
+        return "\n".join(lines) + "\n"
+
+
+def load_mapping(path: str | Path) -> Mapping:
+    """Read and check a mapping.
+
+    Parameters
+    ----------
+    path
+        A TOML file.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once; also if the file cannot be read or is not TOML.
+    """
+    return parse_mapping(read_toml(path), str(path))
+
+
+def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "") -> Mapping:
+    """Check a mapping given as plain data, or as the text of a TOML file.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once.
+    """
+    tables = tomllib.loads(data) if isinstance(data, str) else dict(data)
+    problems: list[str] = []
+    model = _model(tables, problems)
+    channels = _entries(tables, problems)
+    drive = tables.get("drive", "none")
+    if isinstance(drive, dict):
+        drive = _checked(DriveMap, drive, "drive", problems)
+    elif drive != "none":
+        problems.append(f'drive = {drive!r}: must be "none", or a table [drive] with channel and kind.')
+    rest = {key: value for key, value in tables.items() if key not in ("model", "channels", "drive")}
+    known = _rest(rest, problems)
+    if model is not None:
+        problems += _quantity_problems(model, channels, drive if isinstance(drive, DriveMap) else None)
+    if problems:
+        raise SpecError([f"{source}: {p}" if source else p for p in problems])
+    return Mapping(model=tables["model"], channels=channels, drive=drive, **known)
+
+
+def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
+    """Check the keys that stand for themselves, one by one, so that none hides another's problems."""
+    found = {}
+    for key, value in rest.items():
+        if key not in Mapping.model_fields:
+            problems.append(unknown_key(key, key, Mapping.model_fields))
+            continue
+        kinds: dict[str, type[BaseModel]] = {"time": TimeMap, "piece": PieceMap, "csv": CsvMap}
+        kind = kinds.get(key)
+        if kind is not None:
+            found[key] = _checked(kind, value, key, problems)
+            continue
+        probe = {"model": "-", "channels": {"-": {"channel": "-"}}, key: value}
+        if _checked(Mapping, probe, "", problems) is not None:
+            found[key] = tuple(value) if isinstance(value, list) else value
+    if found.get("time") is not None and "sampling_rate_hz" in found:
+        problems.append("sampling_rate_hz: the time channel gives it; keep time or sampling_rate_hz.")
+    if found.get("time") is not None and units.factor(found["time"].unit, "s") is None:
+        problems.append(f"time.unit = {found['time'].unit!r}: must be one of {', '.join(units.UNITS['s'])}.")
+    window = found.get("window_s")
+    if window is not None and window[1] <= window[0]:
+        problems.append(f"window_s = {list(window)!r}: the second number must be the greater one.")
+    return found
+
+
+def _model(tables: AnyMapping[str, Any], problems: list[str]) -> Model | None:
+    if "model" not in tables:
+        problems.append(
+            "model: missing; name the model whose states are measured, as magpend models lists them."
+        )
+        return None
+    try:
+        return load_model(tables["model"])
+    except (ModelError, TypeError) as error:
+        problems += [f"model: {p}" for p in getattr(error, "problems", [f"{tables['model']!r} is no name."])]
+        return None
+
+
+def _entries(tables: AnyMapping[str, Any], problems: list[str]) -> dict[str, ChannelMap]:
+    channels = tables.get("channels", {})
+    if not isinstance(channels, dict) or not channels:
+        problems.append(
+            "channels: missing; add a table [channels.STATE] for each measured state of the model."
+        )
+        return {}
+    found = {}
+    for name, entry in channels.items():
+        checked = _checked(ChannelMap, entry, f"channels.{name}", problems)
+        if checked is not None:
+            found[name] = checked
+    return found
+
+
+def _checked(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        problems += problems_of(error, model, path)
+        return None
+
+
+def _units(model: Model) -> dict[str, str]:
+    return {s.name: s.unit for s in model.states} | {q.name: q.unit for q in model.quantities}
+
+
+def _quantity_problems(model: Model, channels: dict[str, ChannelMap], drive: DriveMap | None) -> list[str]:
+    """Problems of names and units with the model."""
+    problems = []
+    known = _units(model)
+    for name, entry in channels.items():
+        path = f"channels.{name}"
+        if name not in known:
+            problems.append(unknown_key(path, name, model.state_names))
+            continue
+        problems += _unit_problems(path, entry, known[name])
+        problems += _angle_problems(path, name, entry, channels, known)
+    if drive is not None and drive.kind == "torque":
+        problems += _unit_problems("drive", drive, "N m")
+    return problems
+
+
+def _unit_problems(path: str, entry: Scaled, wanted: str) -> list[str]:
+    known, kind = units.factor(entry.unit, wanted), units.kind_of(entry.unit)
+    if entry.scale == 0.0:
+        return [f"{path}.scale = 0: must not be 0; give {wanted} per {entry.unit or 'unit of the file'}."]
+    if known is None and kind is not None and kind != "s":
+        choices = ", ".join(units.UNITS.get(wanted, {wanted: 1.0}))
+        return [
+            f"{path}.unit = {entry.unit!r}: is not one of {wanted}; give one of {choices}, or another "
+            "channel."
+        ]
+    if known is None and entry.scale is None:
+        return [f"{path}.scale: missing; the unit {entry.unit!r} needs one, in {wanted} per {entry.unit}."]
+    if known not in (None, 1.0) and entry.scale is not None and abs(entry.scale / known - 1.0) < 0.02:
+        return [
+            f"{path}.scale = {entry.scale!r}: the unit {entry.unit!r} is converted already; drop "
+            "scale, or unit."
+        ]
+    return []
+
+
+def _angle_problems(
+    path: str, name: str, entry: ChannelMap, channels: dict[str, ChannelMap], known: AnyMapping[str, str]
+) -> list[str]:
+    problems = []
+    if known[name] != "rad":
+        problems += [
+            f"{path}.{key}: only an angle has one, and {name} is in {known[name]}; drop the key."
+            for key, given in (("wraps", entry.wraps), ("dead_band", entry.dead_band is not None)) if given
+        ]  # fmt: skip
+    other = entry.relative_to
+    if other is not None and (other not in channels or other == name):
+        problems.append(f"{path}.relative_to = {other!r}: must be another channel of this mapping.")
+    elif other is not None and channels[other].relative_to is not None:
+        problems.append(f"{path}.relative_to = {other!r}: is itself relative; name one that is absolute.")
+    elif other is not None and known.get(other) != known[name]:
+        problems.append(f"{path}.relative_to = {other!r}: must be in the same unit, {known[name]}.")
+    return problems
+
+
+def _literal(value: Any) -> str:
+    """Spell a value as TOML does."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(k)} = {_literal(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_literal, value)) + "]"
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value).lower()
+
+
+def _key(name: str) -> str:
+    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)

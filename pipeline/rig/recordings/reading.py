@@ -1,0 +1,255 @@
+"""A file and its mapping to one labelled dataset: what the other parts of the rig work with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping as AnyMapping
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.rig.recordings import checks, formats, units
+from pipeline.rig.recordings.clock import Clock, clock_of
+from pipeline.rig.recordings.findings import Finding, to_json
+from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, Scaled, load_mapping
+from pipeline.rig.recordings.raw import Channel, Raw
+from pipeline.spec.problems import SpecError, unknown_name
+
+DIM = "sample"
+
+
+def read_recording(
+    path: str | Path, mapping: Mapping | str | Path, *, window_s: tuple[float, float] | None = None
+) -> xr.Dataset:
+    """Read a recording and check it.
+
+    Parameters
+    ----------
+    path
+        A TDMS, LVM, CSV or MATLAB file.
+    mapping
+        What its channels are: a mapping, or the path of its file.
+    window_s
+        Part to be kept [s since the first sample]; goes before the mapping's.
+
+    Returns
+    -------
+    Dataset
+        Over the dim ``sample``: the coords ``time`` [s since the recording's first sample] and ``piece``, a
+        number for each stretch without a gap; the mapped quantities in SI units, under the names of the
+        model's states; ``drive``, if there is one. NaN is what was not measured. Its attributes say what was
+        read, with which mapping, and what was found (see `findings_of`); nothing is mended in silence.
+
+    Raises
+    ------
+    SpecError
+        If the file or the mapping cannot be read, a channel is not there, the channels have different
+        sampling rates, or nothing is in the window.
+    """
+    chosen = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
+    raw = formats.read_raw(Path(path), chosen.format, chosen.csv)
+    return recording_of(raw, chosen, window_s=window_s)
+
+
+def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | None = None) -> xr.Dataset:
+    """Return what `read_recording` makes of a file that is read already.
+
+    Parameters
+    ----------
+    raw
+        All channels of a file.
+    mapping
+        What they are.
+    window_s
+        Part to be kept [s since the first sample]; goes before the mapping's.
+
+    Raises
+    ------
+    SpecError
+        As `read_recording` does.
+    """
+    columns = _resolved(raw, mapping)
+    stretches = [_timed(raw, s, mapping, columns) for s in raw.stretches]
+    numbers = None
+    if mapping.piece is not None:
+        numbers = np.concatenate([s[columns["piece"]].values for s in raw.stretches])
+    clock = clock_of(stretches, mapping.sampling_rate_hz, str(raw.path), numbers=numbers, apart=raw.apart)
+    findings = [*raw.findings, *clock.findings, *_unit_findings(raw, mapping, columns)]
+    variables: dict[str, np.ndarray] = {}
+    for name in _entries(mapping):
+        signal = checks.Signal(name, _joined(stretches, name, clock), clock.time, clock.piece)
+        variables[name], found = _converted(signal, mapping)
+        findings += found
+    _make_absolute(variables, mapping)
+    ds = _labelled(variables, clock, raw, mapping, findings)
+    part = window_s or mapping.window_s
+    return ds if part is None else window(ds, part)
+
+
+def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
+    """Return a part of a recording; time goes on counting from the recording's first sample.
+
+    Parameters
+    ----------
+    ds
+        A recording.
+    window_s
+        First and last instant [s since the recording's first sample].
+
+    Raises
+    ------
+    SpecError
+        If fewer than two samples are in it.
+    """
+    time = ds["time"].values
+    low, high = window_s
+    slack = 1e-6 / float(ds.attrs["sampling_rate_hz"])
+    inside = (time >= low - slack) & (time <= high + slack)
+    if int(inside.sum()) < 2:
+        raise SpecError(
+            [
+                f"window_s = [{low:g}, {high:g}]: holds {int(inside.sum())} samples; the recording "
+                f"{Path(str(ds.attrs.get('file', ''))).name} goes from {time[0]:g} to {time[-1]:g} s."
+            ]
+        )
+    return ds.isel({DIM: np.flatnonzero(inside)})
+
+
+def _entries(mapping: Mapping) -> dict[str, Scaled]:
+    drive = mapping.drive_map
+    return {**mapping.channels, **({DRIVE: drive} if drive is not None else {})}
+
+
+def _resolved(raw: Raw, mapping: Mapping) -> dict[str, str]:
+    """Name in the file of each mapped channel, and of ``time`` and ``piece`` if there are any."""
+    wanted: dict[str, tuple[str, str | int]] = {
+        name: (f"channels.{name}" if name != DRIVE else DRIVE, entry.channel)
+        for name, entry in _entries(mapping).items()
+    }
+    for name, axis in (("time", mapping.time), ("piece", mapping.piece)):
+        if axis is not None:
+            wanted[name] = (name, axis.channel)
+    found, problems = {}, []
+    for name, (key, channel) in wanted.items():
+        own = _name_of(channel, raw.names)
+        if own is None:
+            told = unknown_name("channel", str(channel), raw.names or ("none",))
+            problems.append(f"{key}.channel = {channel!r}: {raw.path.name} has no such channel: {told}")
+        elif any(own not in stretch for stretch in raw.stretches):
+            problems.append(f"{key}.channel = {channel!r}: is not in all stretches of {raw.path.name}.")
+        else:
+            found[name] = own
+    if problems:
+        raise SpecError(problems)
+    return found
+
+
+def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
+    if isinstance(channel, int):
+        return names[channel - 1] if channel <= len(names) else None
+    if channel in names:
+        return channel
+    near = [name for name in names if name.strip() == channel.strip()]
+    return near[0] if len(near) == 1 else None
+
+
+def _timed(
+    raw: Raw, stretch: AnyMapping[str, Channel], mapping: Mapping, columns: dict[str, str]
+) -> dict[str, Channel]:
+    """Channels of a stretch by their names in the dataset, with the time stamps that the mapping names."""
+    chosen = {name: replace(stretch[columns[name]], name=name) for name in _entries(mapping)}
+    if mapping.time is None:
+        return chosen
+    scale = units.factor(mapping.time.unit, "s") or 1.0
+    stamps = scale * stretch[columns["time"]].values
+    timed = {}
+    for name, channel in chosen.items():
+        n = min(len(channel), len(stamps))
+        timed[name] = replace(channel, values=channel.values[:n], time=stamps[:n])
+    return timed
+
+
+def _joined(stretches: Sequence[AnyMapping[str, Channel]], name: str, clock: Clock) -> np.ndarray:
+    """Readings of a channel on the clock."""
+    return np.concatenate(
+        [s[name].values[slice(*taken[name])] for s, taken in zip(stretches, clock.taken, strict=True)]
+    )
+
+
+def _converted(signal: checks.Signal, mapping: Mapping) -> tuple[np.ndarray, list[Finding]]:
+    """Check a channel and convert it to SI units."""
+    entry = _entries(mapping)[signal.name]
+    found = checks.missing(signal)
+    raw = np.where(np.isfinite(signal.raw), signal.raw, np.nan)
+    value = mapping.factor_of(signal.name) * (raw - entry.zero) + entry.offset
+    if isinstance(entry, DriveMap):
+        return value, found + checks.constant(signal, "note")
+    assert isinstance(entry, ChannelMap)
+    dead, in_band = checks.in_dead_band(signal, entry)
+    found += checks.constant(signal) + checks.saturated(signal, entry) + in_band
+    value[dead] = np.nan
+    if mapping.unit_of(signal.name) == "rad":
+        value, wraps = checks.unwrapped(signal, value, entry.wraps)
+        found += wraps
+    return value, found
+
+
+def _make_absolute(variables: dict[str, np.ndarray], mapping: Mapping) -> None:
+    """Add to relative angles what they are relative to."""
+    own = dict(variables)
+    for name, entry in mapping.channels.items():
+        if entry.relative_to is not None:
+            variables[name] = own[name] + own[entry.relative_to]
+
+
+def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
+    """Say where the file states a unit that is not the mapping's."""
+    findings = []
+    for name, entry in _entries(mapping).items():
+        stated = units.spelled(raw.stretches[0][columns[name]].unit)
+        own = units.spelled(entry.unit or mapping.unit_of(name))
+        known = [units.factor(u, units.kind_of(u) or "") for u in (stated, own)]
+        same = stated == own or (
+            known[0] == known[1] is not None and units.kind_of(stated) == units.kind_of(own)
+        )
+        if stated and not same:
+            findings.append(Finding(
+                "unit", name, math.nan, math.nan, "warning",
+                f"the file says {stated!r}, the mapping {own!r}; the mapping's is used.",
+            ))  # fmt: skip
+    return findings
+
+
+def _labelled(
+    variables: AnyMapping[str, np.ndarray], clock: Clock, raw: Raw, mapping: Mapping, findings: list[Finding]
+) -> xr.Dataset:
+    """Names, units and provenance."""
+    model = mapping.system
+    meanings = {s.name: s.meaning for s in model.states} | {q.name: q.meaning for q in model.quantities}
+    data: dict[str, Any] = {}
+    for name, values in variables.items():
+        attrs = {"units": mapping.unit_of(name), "long_name": meanings.get(name, "drive")}
+        if name == DRIVE and mapping.drive_map is not None:
+            kind = mapping.drive_map.kind
+            attrs |= {
+                "kind": kind,
+                "long_name": "driving torque" if kind == "torque" else "signal of the drive",
+            }
+        data[name] = (DIM, values, attrs)
+    coords = {
+        "time": (DIM, clock.time, {"units": "s", "long_name": "time since the recording's first sample"}),
+        "piece": (DIM, clock.piece, {"units": "1", "long_name": "stretch without a gap"}),
+    }
+    about: dict[str, Any] = {
+        "sampling_rate_hz": 1.0 / clock.step_s, "file": str(raw.path), "sha256": raw.sha256,
+        "format": raw.format, "mapping": mapping.toml(), "model": mapping.model,
+        "findings": to_json(findings), "magpend_version": metadata.version("magpend"),
+    }  # fmt: skip
+    if raw.simulated:
+        about["simulated"] = 1
+    return xr.Dataset(data, coords=coords, attrs=about)

@@ -1,0 +1,236 @@
+"""Smooth states and rates by local polynomials without lag, and the noise that they leave.
+
+A polynomial of low order is fitted by least squares to the samples of a window (Savitzky and Golay, Anal.
+Chem. 36, 1964, 1627). In the middle of a stretch the window is centred, which shifts no phase; at its ends
+it is the last whole window, evaluated off its centre. A stretch ends where a piece does, where samples are
+not measured, and where the drive switches: there the acceleration jumps, and no polynomial spans that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.layout.vocabulary import model_of
+from pipeline.rig.recordings.findings import runs
+from pipeline.rig.recordings.mapping import DRIVE
+from pipeline.spec.problems import SpecError
+
+LEAP, LEAP_SAMPLES = 0.4, 5
+"""A drive leaps if it changes by this share of its range within so many samples."""
+
+QUIET = 10.0
+"""Least range of a drive whose leaps are looked for, in units of its change from sample to sample."""
+
+GROWTH = 1.25
+"""Ratio of neighbouring windows that are tried."""
+
+ENOUGH = 1.5
+"""A window whose score is so many times the least ends the search for a longer one."""
+
+MOST_SAMPLES = 200_000
+"""Samples from which the window is chosen; of longer recordings, the first."""
+
+
+def smooth(
+    ds: xr.Dataset,
+    *,
+    window_s: float | None = None,
+    order: int = 3,
+    edges_s: Sequence[float] | np.ndarray | None = None,
+) -> xr.Dataset:
+    """Smooth the measured quantities and add the rates that are not measured.
+
+    Parameters
+    ----------
+    ds
+        A recording.
+    window_s
+        Length of the windows [s]. By default it is chosen for each quantity: of windows that grow by a
+        quarter, the one whose polynomials predict samples best that they have not seen (leave-one-out
+        cross-validation, which for these fits is the mean square of residual/(1 - leverage)). It balances
+        noise against distortion if the noise of neighbouring samples is independent; if it is not, state a
+        window.
+    order
+        Of the polynomials, 1 or more.
+    edges_s
+        Instants at which the drive switches [s]; by default those at which ``drive`` leaps from one level to
+        another, if it is there.
+
+    Returns
+    -------
+    Dataset
+        As `ds`, with the measured quantities smoothed and the rates of the model's states added by name; NaN
+        where nothing was measured, or a stretch has no more than `order` samples. Attributes of the
+        quantities: ``noise``, the standard deviation of a raw sample [SI units], from the residuals and the
+        degrees of freedom that the polynomials take; ``noise_smoothed``, what is left of it in the middle of
+        a stretch (of rates, too); ``window_s``.
+
+    Raises
+    ------
+    SpecError
+        If `order` or `window_s` is out of bounds.
+    """
+    step = 1.0 / float(ds.attrs["sampling_rate_hz"])
+    width = _checked(window_s, order, step)
+    edges = _switches(ds) if edges_s is None else np.asarray(edges_s, dtype=np.float64)
+    rate_of = {s.name: s for s in model_of(ds).states if s.rate}
+    result = ds.copy()
+    for name in [str(n) for n in ds.data_vars if n != DRIVE]:
+        fit = _fit(ds[name].values, _parts(ds, name, edges), width, order, step)
+        result[name] = ds[name].copy(data=fit.values).assign_attrs(fit.attrs(order, step, 0))
+        rate = rate_of[name].rate if name in rate_of else ""
+        if rate and rate not in ds:
+            state = model_of(ds).state(rate)
+            about = {"units": state.unit, "long_name": state.meaning, **fit.attrs(order, step, 1)}
+            result[rate] = (ds[name].dims, fit.rates, about)
+    return result.assign_attrs(smoothing=f"local polynomials of order {order}")
+
+
+def _checked(window_s: float | None, order: int, step: float) -> int | None:
+    """Return the samples of a window that is asked for, an odd number."""
+    problems = []
+    if order < 1:
+        problems.append(f"order = {order}: must be 1 or more, so that there is a rate.")
+    width = None if window_s is None else 2 * round((window_s / step - 1.0) / 2.0) + 1
+    if width is not None and width < order + 2:
+        problems.append(
+            f"window_s = {window_s!r}: holds {max(width, 0)} samples; polynomials of order {order} need at "
+            f"least {order + 2 + order % 2}, which is {(order + 2 + order % 2) * step:.6g} s."
+        )
+    if problems:
+        raise SpecError(problems)
+    return width
+
+
+def _switches(ds: xr.Dataset) -> np.ndarray:
+    """Instants at which the drive leaps between any of its levels [s].
+
+    A drive that is switched off has three levels, so that these are not the edges about one middle that
+    `pipeline.rig.edges` finds.
+    """
+    if DRIVE not in ds:
+        return np.empty(0)
+    time, drive, piece = ds["time"].values, ds[DRIVE].values, ds["piece"].values
+    known = drive[np.isfinite(drive)]
+    if len(known) <= LEAP_SAMPLES:
+        return np.empty(0)
+    low, high = np.quantile(known, (0.01, 0.99))
+    noise = float(np.median(np.abs(np.diff(known))))
+    if not high - low > QUIET * noise:
+        return np.empty(0)
+    leap = np.abs(drive[LEAP_SAMPLES:] - drive[:-LEAP_SAMPLES]) > LEAP * (high - low)
+    step = np.abs(np.diff(drive))
+    found = [i + int(np.argmax(step[i : k + LEAP_SAMPLES - 1])) for i, k in runs(leap, piece[LEAP_SAMPLES:])]
+    return np.array([0.5 * (time[i] + time[i + 1]) for i in found])
+
+
+def _parts(ds: xr.Dataset, name: str, edges: np.ndarray) -> np.ndarray:
+    """First and last-plus-one sample of each stretch that polynomials may span; (n, 2)."""
+    values, piece, time = ds[name].values, ds["piece"].values, ds["time"].values
+    known = np.isfinite(values)
+    number = piece + 0.0
+    change = np.concatenate([[True], (number[1:] != number[:-1]) | (known[1:] != known[:-1])])
+    if edges.size:
+        change[np.unique(np.searchsorted(time, edges[(edges > time[0]) & (edges <= time[-1])]))] = True
+    begins = np.flatnonzero(change)
+    ends = np.append(begins[1:], len(values))
+    kept = known[begins]
+    return np.column_stack([begins[kept], ends[kept]])
+
+
+@cache
+def _leverage(width: int, order: int) -> np.ndarray:
+    """Weight of a sample in its own fitted value, by its place in the window."""
+    x = np.linspace(-1.0, 1.0, width)
+    q, _ = np.linalg.qr(np.polynomial.legendre.legvander(x, order))
+    return np.asarray((q**2).sum(axis=1))
+
+
+class _Fit:
+    """Values, rates and noise of one quantity with one window."""
+
+    def __init__(self, values: np.ndarray, rates: np.ndarray, noise: float, width: int, score: float) -> None:
+        self.values, self.rates, self.noise, self.width, self.score = values, rates, noise, width, score
+
+    def attrs(self, order: int, step: float, derivative: int) -> dict[str, Any]:
+        """What the dataset says of the values, or of the rates."""
+        gain = _gain(self.width, order, derivative, step)
+        raw = {"noise": self.noise} if derivative == 0 else {}
+        return {**raw, "noise_smoothed": self.noise * gain, "window_s": self.width * step}
+
+
+def _gain(width: int, order: int, derivative: int, step: float) -> float:
+    """Standard deviation of a smoothed value, or rate, in the middle of a window over that of a sample."""
+    from scipy.signal import savgol_coeffs
+
+    fitted = min(order, width - 1)
+    return float(np.linalg.norm(savgol_coeffs(width, fitted, deriv=derivative, delta=step)))
+
+
+def _fit(values: np.ndarray, parts: np.ndarray, width: int | None, order: int, step: float) -> _Fit:
+    if width is None:
+        width = _best_width(values, parts, order)
+    return _smoothed(values, parts, width, order, step)
+
+
+def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
+    """Window with the least error of prediction."""
+    first = order + 2 + order % 2
+    lengths = np.diff(parts, axis=1).ravel()
+    used = parts[np.concatenate([[0], np.cumsum(lengths)[:-1]]) < MOST_SAMPLES] if len(parts) else parts
+    longest = int(lengths.max(initial=first))
+    best, best_score, width = first, math.inf, first
+    while width <= longest:
+        score = _smoothed(values, used, width, order, 1.0).score
+        if score < best_score:
+            best, best_score = width, score
+        if score > ENOUGH * best_score:
+            break
+        width = 2 * math.ceil((GROWTH * width - 1.0) / 2.0) + 1
+    return best
+
+
+def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, step: float) -> _Fit:
+    """Fit all stretches with one window, or a shorter one where a stretch is shorter."""
+    from scipy.signal import savgol_filter
+
+    smooth_values, rates = np.full(len(values), np.nan), np.full(len(values), np.nan)
+    squares = freedom = predicted = 0.0
+    count = 0
+    for begin, end in parts.tolist():
+        n = end - begin
+        own = min(width, n if n % 2 else n - 1)
+        if own <= order:
+            continue
+        y = values[begin:end]
+        mean = float(y.mean())
+        centred = y - mean
+        fitted = savgol_filter(centred, own, order, mode="interp")
+        smooth_values[begin:end] = fitted + mean
+        rates[begin:end] = savgol_filter(centred, own, order, deriv=1, delta=step, mode="interp")
+        leverage = _along(own, order, n)
+        residual = centred - fitted
+        free = 1.0 - leverage
+        squares += float(residual @ residual)
+        freedom += float(free.sum())
+        inner = free > 1e-9
+        predicted += float(((residual[inner] / free[inner]) ** 2).sum())
+        count += int(inner.sum())
+    noise = math.sqrt(squares / freedom) if freedom > 0.5 else math.nan
+    return _Fit(smooth_values, rates, noise, width, predicted / count if count else math.inf)
+
+
+def _along(width: int, order: int, n: int) -> np.ndarray:
+    """Leverage of the samples of a stretch: of the centred window, and off its centre at the ends."""
+    own = _leverage(width, order)
+    half = width // 2
+    result = np.full(n, own[half])
+    result[:half] = own[:half]
+    result[n - half :] = own[width - half :]
+    return result

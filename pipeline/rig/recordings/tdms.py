@@ -1,0 +1,130 @@
+"""TDMS files of LabVIEW, through npTDMS."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.rig.recordings.findings import Finding
+from pipeline.rig.recordings.raw import Channel, Raw, digest
+from pipeline.spec.problems import SpecError
+
+SIMULATED = "simulated"
+"""Property of the file that says that nobody measured it."""
+
+_UNITS = ("unit_string", "NI_UnitDescription", "unit")
+
+
+def read_tdms(path: Path) -> Raw:
+    """Read all channels of numbers and of instants; their names are ``GROUP/CHANNEL``.
+
+    Waveforms bring their sampling interval and their start, which is read with all its digits; npTDMS by
+    itself cuts it to microseconds. A last segment that is shorter than it says, of which npTDMS only
+    warns, is a finding.
+
+    Raises
+    ------
+    SpecError
+        If it is no TDMS file.
+    """
+    from nptdms import TdmsFile
+
+    with _listening() as warnings:
+        try:
+            file = TdmsFile.read(str(path), raw_timestamps=True)
+        except Exception as error:  # npTDMS raises what its parser meets: struct.error, KeyError, ...
+            raise SpecError(
+                [
+                    f"{path}: is not a TDMS file that can be read ({error}); write it anew, or "
+                    "export it as CSV."
+                ]
+            ) from None
+    found = {}
+    zero = _earliest(file)
+    for group in file.groups():
+        for channel in group.channels():
+            values = _numbers(channel[:], zero)
+            if values is not None:
+                name = f"{group.name}/{channel.name}"
+                found[name] = _channel(name, values, channel.properties, zero)
+    is_simulated = bool(file.properties.get(SIMULATED, 0))
+    findings = tuple(_truncations(file, warnings))
+    return Raw(path, "tdms", digest(path), (found,), findings, simulated=is_simulated)
+
+
+def _channel(name: str, values: np.ndarray, properties: Mapping[str, Any], zero: int) -> Channel:
+    unit = next((str(properties[key]) for key in _UNITS if properties.get(key)), "")
+    start = float(properties.get("wf_start_offset", 0.0))
+    if "wf_start_time" in properties:
+        start += _seconds(properties["wf_start_time"], zero)
+    elif "wf_start_offset" not in properties:
+        start = math.nan
+    step = float(properties.get("wf_increment", math.nan))
+    return Channel(name, values, unit, start, step if step > 0.0 else math.nan)
+
+
+def _numbers(data: Any, zero: int) -> np.ndarray | None:
+    """Return readings as floating-point numbers, instants in seconds; None of what is neither."""
+    array = np.asarray(data)
+    names = array.dtype.names or ()
+    if "second_fractions" in names:
+        seconds = (array["seconds"] - zero).astype(np.float64)
+        return np.asarray(seconds + array["second_fractions"].astype(np.float64) * 2.0**-64)
+    return array.astype(np.float64) if array.dtype.kind in "fiub" and array.ndim == 1 else None
+
+
+def _earliest(file: Any) -> int:
+    """Whole second before all starts, on TDMS's own scale: instants since then keep their digits."""
+    starts = [c.properties.get("wf_start_time") for g in file.groups() for c in g.channels()]
+    return min((int(s.seconds) for s in starts if s is not None), default=0)
+
+
+def _seconds(stamp: Any, zero: int) -> float:
+    return float(int(stamp.seconds) - zero) + float(stamp.second_fractions) * 2.0**-64
+
+
+def _truncations(file: Any, warnings: list[str]) -> list[Finding]:
+    """Say what npTDMS warned of, with the numbers of samples where it knows them."""
+    status = file.file_status
+    remedy = "copy the file again, or take care that the writing program closes it"
+    if status.channel_statuses:
+        return [
+            Finding(
+                "truncated", path.replace("'", "").strip("/"), math.nan, math.nan, "warning",
+                f"the last segment holds {s.read_length} of the {s.expected_length} samples that it "
+                f"states; {remedy}.",
+            )
+            for path, s in status.channel_statuses.items()
+            if s.read_length < s.expected_length
+        ] or [_truncated(f"the last segment was not closed; {remedy}.")]  # fmt: skip
+    return [_truncated(f"{text[:1].lower()}{text[1:]}; {remedy}.") for text in warnings]
+
+
+def _truncated(text: str) -> Finding:
+    return Finding("truncated", "", math.nan, math.nan, "warning", text)
+
+
+@contextlib.contextmanager
+def _listening() -> Iterator[list[str]]:
+    """Collect what npTDMS logs, which then goes nowhere else."""
+    heard: list[str] = []
+
+    def keep(record: logging.LogRecord) -> bool:
+        heard.append(record.getMessage())
+        return False
+
+    names = [name for name in logging.root.manager.loggerDict if name.startswith("nptdms")]
+    loggers = [logging.getLogger(name) for name in names]
+    for logger in loggers:
+        logger.addFilter(keep)
+    try:
+        yield heard
+    finally:
+        for logger in loggers:
+            logger.removeFilter(keep)

@@ -1,0 +1,110 @@
+"""Numbers in texts: encodings, decimal commas, empty fields."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.spec.problems import SpecError
+
+MAX_LINE = 1_000_000
+"""Longest line of a text that is one [characters]."""
+
+
+def read_text(path: Path) -> str:
+    """Return a text in UTF-8, or else in the Western encoding of Windows that LabVIEW writes.
+
+    Raises
+    ------
+    SpecError
+        If it is none.
+    """
+    data = path.read_bytes()
+    if b"\x00" in data[:4096]:
+        raise SpecError([f"{path}: is not a text; state its format in the mapping if the suffix misleads."])
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace")
+
+
+def number(field: str, decimal: str) -> float | None:
+    """Return the number in a field, NaN of an empty one, None of another text."""
+    text = field.strip().strip('"').strip()
+    if not text:
+        return float("nan")
+    if decimal == ",":
+        if "." in text:
+            return None
+        text = text.replace(",", ".")
+    if "_" in text:  # a number for Python alone
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def split(line: str, delimiter: str) -> list[str]:
+    """Return the fields of a line; a blank as delimiter stands for any number of them."""
+    if delimiter == " ":
+        return line.split()
+    if '"' in line:
+        import csv
+
+        return next(csv.reader([line], delimiter=delimiter))
+    return line.split(delimiter)
+
+
+def table(lines: Sequence[str], n_columns: int, delimiter: str, decimal: str) -> np.ndarray:
+    """Return rows of numbers; what is empty, missing or no number is NaN.
+
+    Parameters
+    ----------
+    lines
+        Without their ends.
+    n_columns
+        Fields that count; further ones are left out, such as comments.
+
+    Returns
+    -------
+    ndarray
+        (n_lines, n_columns).
+    """
+    text = "\n".join(lines)
+    if decimal == ",":
+        text = text.replace(",", ".")
+    try:
+        found = np.loadtxt(
+            io.StringIO(text), delimiter=None if delimiter == " " else delimiter, usecols=range(n_columns),
+            ndmin=2, comments=None, quotechar='"',
+        )  # fmt: skip
+        if found.shape == (len(lines), n_columns):
+            return found
+    except (ValueError, IndexError):
+        pass  # empty or short rows: slower, field by field
+    rows = np.full((len(lines), n_columns), np.nan)
+    for i, line in enumerate(lines):
+        for j, part in enumerate(split(line, delimiter)[:n_columns]):
+            value = number(part, decimal)
+            rows[i, j] = np.nan if value is None else value
+    return rows
+
+
+def unique(names: Sequence[str]) -> list[str]:
+    """Return names of which none comes twice: the second ``a`` is ``a (2)``."""
+    seen: dict[str, int] = {}
+    result = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        result.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
+    return result
+
+
+def without_end(values: np.ndarray) -> np.ndarray:
+    """Return a column without the empty fields after its last number."""
+    known = np.flatnonzero(np.isfinite(values))
+    return values[: known[-1] + 1] if known.size else values[:0]

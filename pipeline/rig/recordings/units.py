@@ -1,0 +1,49 @@
+"""Units in which recordings are written, and what they are in SI units."""
+
+from __future__ import annotations
+
+import math
+
+_DEGREE, _TURN = math.pi / 180.0, 2.0 * math.pi
+
+UNITS: dict[str, dict[str, float]] = {
+    "rad": {
+        "rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "degree": _DEGREE, "degrees": _DEGREE, "°": _DEGREE,
+        "turn": _TURN, "turns": _TURN, "rev": _TURN,
+    },
+    "rad/s": {
+        "rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEGREE, "°/s": _DEGREE, "turns/s": _TURN, "rev/s": _TURN,
+        "rpm": _TURN / 60.0,
+    },
+    "N m": {"N m": 1.0, "Nm": 1.0, "N*m": 1.0, "mN m": 1e-3, "mNm": 1e-3, "N cm": 1e-2, "Ncm": 1e-2},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
+}  # fmt: skip
+"""Factors to an SI unit, by that unit and by the unit in a file."""
+
+_SPELLINGS = {
+    "volt": "V", "volts": "V", "ampere": "A", "amperes": "A", "radian": "rad", "radians": "rad",
+    "second": "s", "seconds": "s", "newtons": "N", "newton": "N",
+}  # fmt: skip
+
+
+def spelled(unit: str) -> str:
+    """Return a unit as it is usually written; LabVIEW writes ``Volts``."""
+    return _SPELLINGS.get(unit.strip().lower(), unit.strip())
+
+
+def factor(unit: str, wanted: str) -> float | None:
+    """Return what a unit is in another, or None if it is not one of that kind: a volt is no angle.
+
+    Parameters
+    ----------
+    unit
+        As a mapping or a file states it; empty for the wanted one.
+    wanted
+        SI unit of the quantity.
+    """
+    return 1.0 if unit in ("", wanted) else UNITS.get(wanted, {}).get(unit)
+
+
+def kind_of(unit: str) -> str | None:
+    """Return the SI unit of the quantities that are measured in this unit, None if that is not known."""
+    return next((si for si, known in UNITS.items() if unit in known), None)

@@ -1,0 +1,226 @@
+"""The specification of a virtual rig: what a person writes in TOML, validated as a whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping as AnyMapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, Field, ValidationError
+
+from magpend_core.models import ModelError, load_model
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import ParameterError, Parameters
+from pipeline.rig.recordings.mapping import DRIVE, Mapping, TimeMap
+from pipeline.rig.recordings.raw import Raw
+from pipeline.rig.virtual import DriveSensor, Sensor, Step, readings
+from pipeline.spec.files import read_toml
+from pipeline.spec.problems import SpecError, problems_of, unknown_key, unknown_name
+from pipeline.spec.starts import degrees_key, state_keys, state_of_key
+from pipeline.spec.tables import Table
+
+KEYS = (
+    "model", "preset", "parameters", "initial_state", "sampling_rate_hz", "duration_s", "seed", "drive",
+    "sensors",
+)  # fmt: skip
+
+
+class SensorTable(Table):
+    """``[sensors.STATE]``."""
+
+    kind: Literal["potentiometer", "encoder"] = Field(
+        description="Potentiometer (wraps, 0 to 5 V) or encoder."
+    )
+    noise: float = Field(default=0.0, ge=0.0, description="Standard deviation [the state's unit].")
+    bits: Annotated[int, Field(ge=1, le=32)] | None = Field(default=None, description="Resolution.")
+    dead_band: float = Field(
+        default=0.0, ge=0.0, lt=math.pi, description="Part of a turn not measured [rad]."
+    )
+
+
+class DriveTable(Table):
+    """``[drive]``: what the drive does, and how it is recorded."""
+
+    kind: Literal["torque", "signal"] = Field(default="signal", description="What is recorded.")
+    noise: float = Field(default=0.0, ge=0.0, description="Standard deviation [N m, or V].")
+    steps: Annotated[tuple[dict[str, float], ...], Field(strict=False, min_length=1)] = Field(
+        description="One table each: frequency_hz, n_periods, and parameters that differ."
+    )
+
+
+class _Numbers(Table):
+    """Keys that are numbers by themselves."""
+
+    sampling_rate_hz: float = Field(gt=0.0)
+    duration_s: float | None = Field(default=None, gt=0.0)
+    seed: int = Field(default=0, ge=0)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A valid specification of a virtual rig.
+
+    Attributes
+    ----------
+    parameters : Parameters
+    initial_state : tuple of float
+        In the model's units.
+    times : ndarray
+        (n,) [s].
+    drive : tuple of Step, optional
+    sensors : mapping
+        By name of a state, and of the drive.
+    seed : int
+    """
+
+    parameters: Parameters
+    initial_state: tuple[float, ...]
+    times: np.ndarray
+    drive: tuple[Step, ...] | None
+    sensors: AnyMapping[str, Sensor | DriveSensor]
+    seed: int
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Read the specification of a virtual rig.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once; also if the file cannot be read or is not TOML.
+    """
+    return parse_rig(read_toml(path))
+
+
+def parse_rig(data: AnyMapping[str, Any]) -> Rig:
+    """Check the specification of a virtual rig given as plain data.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once.
+    """
+    problems = [unknown_key(key, key, KEYS) for key in data if key not in KEYS]
+    numbers = _checked(_Numbers, {k: v for k, v in data.items() if k in _Numbers.model_fields}, "", problems)
+    drive = None
+    if data.get("drive", "none") != "none":
+        drive = _checked(DriveTable, data["drive"], DRIVE, problems)
+    sensors = {
+        name: _checked(SensorTable, table, f"sensors.{name}", problems)
+        for name, table in _table(data, "sensors", problems).items()
+    }
+    parameters = _parameters(data, problems)
+    if parameters is None:
+        raise SpecError(problems)
+    start = _start(_table(data, "initial_state", problems), parameters.model, problems)
+    steps = _steps(drive, parameters, problems)
+    if numbers is not None and drive is None and numbers.duration_s is None:
+        problems.append("duration_s: missing; without drive nothing else says how long to record [s].")
+    if not sensors:
+        problems.append("sensors: missing; add a table [sensors.STATE] for each measured state.")
+    if problems:
+        raise SpecError(problems)
+    duration = numbers.duration_s or sum(step.duration_s for step in steps or ())
+    times = np.arange(max(math.floor(duration * numbers.sampling_rate_hz * (1.0 + 1e-12)), 2))
+    own: dict[str, Sensor | DriveSensor] = {name: Sensor(**dict(table)) for name, table in sensors.items()}
+    if drive is not None:
+        own[DRIVE] = DriveSensor(drive.kind, drive.noise)
+    return Rig(parameters, start, times / numbers.sampling_rate_hz, steps, own, numbers.seed)
+
+
+def simulated(rig: Rig, *, is_csv: bool = False) -> tuple[Raw, Mapping]:
+    """Return the readings of a virtual rig, and the mapping of the file that they are written to.
+
+    Parameters
+    ----------
+    rig
+        The specification.
+    is_csv
+        Whether the file is a CSV file, which has a column of time.
+
+    Raises
+    ------
+    SpecError
+        If sensors, drive and duration do not fit one another.
+    ArithmeticError
+        If the trajectory diverges or meets the step limit.
+    """
+    raw, mapping = readings(
+        rig.parameters, rig.drive, rig.initial_state, rig.times, sensors=rig.sensors, seed=rig.seed
+    )
+    if is_csv:
+        mapping = mapping.model_copy(update={"time": TimeMap(channel="time")})
+    return replace(raw, path=Path("simulated")), mapping
+
+
+def _checked(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        problems += problems_of(error, model, path)
+        return None
+
+
+def _table(data: AnyMapping[str, Any], name: str, problems: list[str]) -> dict[str, Any]:
+    value = data.get(name, {})
+    if not isinstance(value, dict):
+        problems.append(f"{name} = {value!r}: must be a table; write [{name}].")
+        return {}
+    return value
+
+
+def _parameters(data: AnyMapping[str, Any], problems: list[str]) -> Parameters | None:
+    if "model" not in data:
+        problems.append("model: missing; name the model, as magpend models lists them.")
+        return None
+    try:
+        model = load_model(data["model"])
+    except (ModelError, TypeError) as error:
+        problems += [f"model: {p}" for p in getattr(error, "problems", [f"{data['model']!r} is no name."])]
+        return None
+    overrides = _table(data, "parameters", problems)
+    try:
+        return model.load(data.get("preset"), **overrides)
+    except ParameterError as error:
+        problems += [f"parameters: {p}" for p in error.problems]
+        return None
+
+
+def _start(given: AnyMapping[str, Any], model: Model, problems: list[str]) -> tuple[float, ...]:
+    """Initial state from values by name, angles and rates also in degrees."""
+    values = dict.fromkeys(model.state_names, 0.0)
+    for key, value in given.items():
+        name = state_of_key(key, model)
+        if name is None:
+            problems.append(f"initial_state.{key}: {unknown_name('state', key, state_keys(model))}")
+        elif isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            problems.append(f"initial_state.{key} = {value!r}: must be a finite number.")
+        elif key != name and name in given:
+            problems.append(f"initial_state: {name} and {degrees_key(name)} are both given; keep one.")
+        else:
+            values[name] = math.radians(value) if key != name else float(value)
+    return tuple(values.values())
+
+
+def _steps(drive: DriveTable | None, parameters: Parameters, problems: list[str]) -> tuple[Step, ...] | None:
+    if drive is None:
+        return None
+    steps = []
+    for i, table in enumerate(drive.steps):
+        own = dict(table)
+        frequency, count = own.pop("frequency_hz", math.nan), own.pop("n_periods", math.nan)
+        path = f"drive.steps[{i}]"
+        if not frequency > 0.0:
+            problems.append(f"{path}.frequency_hz: must be there, and above 0 [Hz].")
+        elif not (count >= 1 and float(count).is_integer()):
+            problems.append(f"{path}.n_periods: must be there, a whole number of 1 or more.")
+        else:
+            steps.append(Step(float(frequency), int(count), own))
+        try:
+            parameters.replace(**own)
+        except ParameterError as error:
+            problems += [f"{path}: {p}" for p in error.problems]
+    return tuple(steps)

@@ -1,0 +1,332 @@
+"""A virtual rig: a model, its drive and its sensors, recorded as a laboratory records a real one.
+
+What it gives is simulated, and says so: the readings of sensors with noise, finite resolution and dead bands,
+which go through the same mapping, checks and files as measured ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping as AnyMapping
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping
+from pipeline.rig.recordings.raw import Channel, Raw
+from pipeline.rig.recordings.reading import recording_of
+from pipeline.spec.problems import SpecError, unknown_name
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magpend_core.models.parameters import Parameters
+
+GROUP = "rig"
+"""Group of the channels."""
+
+SUPPLY_V = 5.0
+TRACK_V = (0.25, 4.75)
+"""Voltages at the ends of a potentiometer's track."""
+
+DEAD_V = 0.1
+"""Below this voltage the wiper is off the track, where a resistor pulls it to 0 V."""
+
+TURN = 2.0 * math.pi
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor of one state.
+
+    Attributes
+    ----------
+    kind : str
+        ``"potentiometer"``: an angle as a voltage from 0 to 5 V, which wraps at half a turn from 0.
+        ``"encoder"``: the state as it is, without end.
+    noise : float
+        Standard deviation of white noise [the state's unit], before it is quantised.
+    bits : int, optional
+        Resolution: levels of 5 V, or of a turn of an encoder (of 1 unit of a state that is no angle); without
+        it, what floating-point numbers resolve.
+    dead_band : float
+        Part of a turn in which a potentiometer does not measure, half a turn from 0 [rad].
+    """
+
+    kind: Literal["potentiometer", "encoder"] = "encoder"
+    noise: float = 0.0
+    bits: int | None = None
+    dead_band: float = 0.0
+
+
+@dataclass(frozen=True)
+class DriveSensor:
+    """How the drive is recorded.
+
+    Attributes
+    ----------
+    kind : str
+        ``"torque"``: the model's forcing as it is; ``"signal"``: its sign, as -1 and 1 [V].
+    noise : float
+        Standard deviation of white noise [unit of the kind].
+    """
+
+    kind: Literal["torque", "signal"] = "signal"
+    noise: float = 0.0
+
+
+@dataclass(frozen=True)
+class Step:
+    """Drive periods of one frequency.
+
+    Attributes
+    ----------
+    frequency_hz : float
+    n_periods : int
+    values : mapping
+        Parameters that are different in this step, by name, such as the duty cycle, or an amplitude of 0.
+    """
+
+    frequency_hz: float
+    n_periods: int
+    values: AnyMapping[str, float] = field(default_factory=dict)
+
+    @property
+    def duration_s(self) -> float:
+        """Length [s]."""
+        return self.n_periods / self.frequency_hz
+
+
+Sensors = AnyMapping[str, Sensor | DriveSensor]
+
+
+def record(
+    parameters: Parameters,
+    drive: Sequence[Step] | None,
+    initial_state: Sequence[float] | np.ndarray,
+    times: np.ndarray,
+    *,
+    sensors: Sensors,
+    seed: int,
+) -> xr.Dataset:
+    """Simulate a recording.
+
+    Parameters
+    ----------
+    parameters
+        The model and its parameters.
+    drive
+        What the drive does from time 0 on, one step after the other; the state is carried on. None for a
+        drive that does nothing: set the parameter of its amplitude to 0.
+    initial_state
+        The model's states at time 0.
+    times
+        (n,) evenly spaced instants from 0 on [s]; the steps must cover them.
+    sensors
+        By name of a state, and of the drive under ``drive``; the others are not recorded.
+    seed
+        Of the noise.
+
+    Returns
+    -------
+    Dataset
+        As `pipeline.rig.recordings.read_recording` gives it, with the attributes ``simulated`` and
+        ``parameters``, the true ones.
+
+    Raises
+    ------
+    SpecError
+        With all that is wrong with the arguments.
+    ArithmeticError
+        If the trajectory diverges or meets the step limit.
+    """
+    raw, mapping = readings(parameters, drive, initial_state, times, sensors=sensors, seed=seed)
+    return recording_of(raw, mapping).assign_attrs(parameters=_lines(parameters))
+
+
+def readings(
+    parameters: Parameters,
+    drive: Sequence[Step] | None,
+    initial_state: Sequence[float] | np.ndarray,
+    times: np.ndarray,
+    *,
+    sensors: Sensors,
+    seed: int,
+) -> tuple[Raw, Mapping]:
+    """Return what the sensors of `record` read, and the mapping that makes states of it.
+
+    Returns
+    -------
+    Raw, Mapping
+        Channels ``rig/STATE`` and ``rig/drive`` as they can be written by
+        `pipeline.rig.recordings.write_raw`.
+
+    Raises
+    ------
+    SpecError, ArithmeticError
+        As for `record`.
+    """
+    instants = np.asarray(times, dtype=np.float64)
+    _check(parameters, drive, instants, sensors)
+    step = float(instants[-1] - instants[0]) / (len(instants) - 1)
+    states = _states(parameters, drive, np.asarray(initial_state, dtype=np.float64), instants)
+    names = parameters.model.state_names
+    channels, entries = {}, {}
+    seeds = np.random.SeedSequence(seed).spawn(len(names) + 1)
+    for i, name in enumerate(names):
+        sensor = sensors.get(name)
+        if isinstance(sensor, Sensor):
+            unit = parameters.model.states[i].unit
+            read = _potentiometer if sensor.kind == "potentiometer" else _encoder
+            values, entries[name], unit = read(
+                f"{GROUP}/{name}", states[:, i], unit, sensor, np.random.default_rng(seeds[i])
+            )
+            channels[f"{GROUP}/{name}"] = Channel(f"{GROUP}/{name}", values, unit, 0.0, step)
+    mapped: DriveMap | Literal["none"] = "none"
+    sensor = sensors.get(DRIVE)
+    if isinstance(sensor, DriveSensor):
+        rng = np.random.default_rng(seeds[-1])
+        channel, mapped = _drive_channel(parameters, drive, instants, sensor, rng, step)
+        channels[channel.name] = channel
+    raw = Raw(Path("simulated"), "simulated", "", (channels,), simulated=True)
+    return raw, Mapping(model=parameters.model.name, channels=entries, drive=mapped)
+
+
+def _check(parameters: Parameters, drive: Sequence[Step] | None, times: np.ndarray, sensors: Sensors) -> None:
+    problems = []
+    model = parameters.model
+    if times.ndim != 1 or len(times) < 2 or times[0] != 0.0 or np.ptp(np.diff(times)) > 1e-6 * times[1]:
+        problems.append("times: must be evenly spaced from 0 on, two at least.")
+    known = (*model.state_names, DRIVE)
+    problems += [f"sensors: {unknown_name('state', name, known)}" for name in sensors if name not in known]
+    if not any(name in model.state_names for name in sensors):
+        problems.append(f"sensors: no state is measured; add one of {', '.join(model.state_names)}.")
+    for name in model.state_names:
+        sensor = sensors.get(name)
+        if isinstance(sensor, Sensor):
+            problems += _sensor_problems(f"sensors.{name}", sensor, model.state(name).on_circle)
+    for i, step in enumerate(drive or ()):
+        problems += [
+            f"drive.steps[{i}]: {unknown_name('parameter', name, model.parameter_names)}"
+            for name in step.values if name not in model.parameter_names
+        ]  # fmt: skip
+        if not (step.frequency_hz > 0.0 and step.n_periods >= 1):
+            problems.append(f"drive.steps[{i}]: frequency_hz must be above 0, and n_periods 1 or more.")
+    if drive is not None and not problems:
+        covered = sum(step.duration_s for step in drive)
+        if covered < times[-1] * (1.0 - 1e-9):
+            problems.append(
+                f"drive.steps: last {covered:.6g} s together, the recording {times[-1]:.6g} s; add periods, "
+                "or shorten it."
+            )
+    if problems:
+        raise SpecError(problems)
+
+
+def _sensor_problems(path: str, sensor: Sensor, is_angle: bool) -> list[str]:
+    problems = []
+    if sensor.kind == "potentiometer" and not is_angle:
+        problems.append(f'{path}.kind = "potentiometer": measures angles alone; take "encoder".')
+    if sensor.noise < 0.0:
+        problems.append(f"{path}.noise = {sensor.noise!r}: must be 0 or more.")
+    if sensor.bits is not None and not 1 <= sensor.bits <= 32:
+        problems.append(f"{path}.bits = {sensor.bits!r}: must be from 1 to 32.")
+    if not 0.0 <= sensor.dead_band < math.pi:
+        problems.append(f"{path}.dead_band = {sensor.dead_band!r}: must be from 0 to less than half a turn.")
+    if sensor.dead_band and sensor.kind == "encoder":
+        problems.append(f'{path}.dead_band: an encoder has none; take kind = "potentiometer".')
+    return problems
+
+
+def _states(
+    parameters: Parameters, drive: Sequence[Step] | None, start: np.ndarray, times: np.ndarray
+) -> np.ndarray:
+    """Integrate; (n, n_states), angles not wrapped."""
+    from magpend_core.sampling import sample
+    from magpend_core.status import Status
+
+    drives = None if drive is None else [_intervals(parameters, drive, times[-1])]
+    found = sample(parameters.model.system, parameters.pack()[None], start[None], [times], drives=drives)
+    status = Status(int(found.status[0]))
+    if not np.isfinite(found.states[0]).all():
+        raise ArithmeticError(f"The trajectory ended early: {status.sentence}.")
+    return np.asarray(found.states[0])
+
+
+def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> Any:
+    """The drive's periods, one by one, with the parameters that change."""
+    from magpend_core.sampling import Drive
+
+    names = tuple(dict.fromkeys(name for step in drive for name in step.values))
+    rows = [[step.values.get(name, parameters[name]) for name in names] for step in drive]
+    counts = [step.n_periods for step in drive]
+    durations = np.repeat([1.0 / step.frequency_hz for step in drive], counts)
+    # rounding must not leave the last sample outside
+    durations[-1] += max(end_s - float(durations.sum()), 0.0)
+    return Drive(durations, names, np.repeat(np.array(rows).reshape(len(drive), len(names)), counts, axis=0))
+
+
+def _potentiometer(
+    channel: str, angle: np.ndarray, unit: str, sensor: Sensor, rng: np.random.Generator
+) -> tuple[np.ndarray, ChannelMap, str]:
+    """Voltage of the wiper, the mapping back, the unit."""
+    low, high = TRACK_V
+    middle, per_rad = 0.5 * (low + high), (high - low) / (TURN - sensor.dead_band)
+    folded = np.mod(angle + math.pi, TURN) - math.pi
+    volts = middle + per_rad * folded
+    is_off = np.abs(folded) > math.pi - 0.5 * sensor.dead_band
+    volts[is_off] = 0.0
+    noisy = np.clip(volts + per_rad * sensor.noise * rng.standard_normal(len(volts)), 0.0, SUPPLY_V)
+    if sensor.bits is not None:
+        grain = SUPPLY_V / (2**sensor.bits - 1)
+        noisy = grain * np.round(noisy / grain)
+    entry = ChannelMap(
+        channel=channel, unit="V", scale=1.0 / per_rad, zero=middle, range=(0.0, SUPPLY_V), wraps=True,
+        dead_band=(0.0, DEAD_V) if sensor.dead_band else None,
+    )  # fmt: skip
+    return noisy, entry, "V"
+
+
+def _encoder(
+    channel: str, state: np.ndarray, unit: str, sensor: Sensor, rng: np.random.Generator
+) -> tuple[np.ndarray, ChannelMap, str]:
+    """Reading in the state's unit, or in counts; the mapping back, the unit."""
+    noisy = state + sensor.noise * rng.standard_normal(len(state))
+    if sensor.bits is None:
+        return noisy, ChannelMap(channel=channel, unit=unit), unit
+    grain = (TURN if unit == "rad" else 1.0) / 2**sensor.bits
+    return np.round(noisy / grain), ChannelMap(channel=channel, unit="counts", scale=grain), "counts"
+
+
+def _drive_channel(
+    parameters: Parameters,
+    drive: Sequence[Step] | None,
+    times: np.ndarray,
+    sensor: DriveSensor,
+    rng: np.random.Generator,
+    step_s: float,
+) -> tuple[Channel, DriveMap]:
+    """What is recorded of the drive."""
+    from magpend_core.pointwise import drive_level
+
+    level = np.zeros(len(times))
+    begin = 0.0
+    for step in drive or ():
+        end = begin + step.duration_s
+        inside = (times >= begin - 1e-12) & (times < end - 1e-12)
+        own = parameters.replace(**dict(step.values))
+        # a sample on an edge belongs to what follows
+        level[inside] = drive_level(times[inside] - begin + 1e-12, own, step.frequency_hz)
+        begin = end
+    if sensor.kind == "signal":
+        level = np.sign(level)
+    name, unit = f"{GROUP}/{DRIVE}", "V" if sensor.kind == "signal" else "N m"
+    values = level + sensor.noise * rng.standard_normal(len(level))
+    return Channel(name, values, unit, 0.0, step_s), DriveMap(channel=name, unit=unit, kind=sensor.kind)
+
+
+def _lines(parameters: Parameters) -> str:
+    return "\n".join(f"{name} = {value!r}" for name, value in parameters.as_dict().items())

@@ -1,0 +1,111 @@
+"""A problem with a closed form: pieces of ring-downs of a linear oscillator, each with a free start.
+
+    x(t) = exp(-d t) (x0 cos(w t) + (v0 + d x0)/w sin(w t))
+
+Parameters d and w; slopes by complex steps, which are exact to rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from pipeline.rig.identify.statistics import Linearised, eliminate_starts
+
+TRUTH = np.array([0.4, 6.0])
+RATE_HZ = 50.0
+
+
+def motion(t, d, w, x0, v0):
+    return np.exp(-d * t) * (x0 * np.cos(w * t) + (v0 + d * x0) / w * np.sin(w * t))
+
+
+def slopes(t, values):
+    """(n, 4) of d(motion)/d(d, w, x0, v0)."""
+    h = 1e-30
+    moved = [np.array(values, dtype=complex) + 1j * h * np.eye(4)[i] for i in range(4)]
+    return np.stack([motion(t, *m).imag / h for m in moved], axis=1)
+
+
+@dataclass
+class Fitted:
+    theta: np.ndarray
+    starts: np.ndarray
+    residuals: list[np.ndarray]
+    jacobian: np.ndarray
+    linear: Linearised
+
+
+def fit(times, measured, *, noise=1.0, prior=None) -> Fitted:
+    """Gauss-Newton from the truth; measured NaN is not measured; residuals in units of the noise."""
+    theta = TRUTH.copy()
+    starts = np.array([[m[0] if np.isfinite(m[0]) else 1.0, 0.0] for m in measured])
+    mean, sd = prior or (theta, np.full(2, np.inf))
+    for k in range(7):
+        jacobian, residuals = linearise(times, measured, theta, starts, noise)
+        rows = np.concatenate([np.nan_to_num(r) for r in residuals])
+        jac = np.vstack([jacobian, np.hstack([np.diag(1 / sd), np.zeros((2, starts.size))])])
+        rows = np.concatenate([rows, (theta - mean) / sd])
+        step = -np.linalg.lstsq(jac, rows, rcond=None)[0]
+        theta = theta + (step[:2] if k else 0.0)  # starts first: rates are far off
+        starts = starts + step[2:].reshape(starts.shape)
+    jacobian, residuals = linearise(times, measured, theta, starts, noise)
+    information, following = eliminate_starts(
+        np.vstack([jacobian, np.hstack([np.diag(1 / sd), np.zeros((2, starts.size))])]), 2
+    )
+    reduced, row = [], 0
+    for r in residuals:
+        own = jacobian[row : row + len(r)]
+        reduced.append((own[:, :2] - own[:, 2:] @ following)[:, None, :])
+        row += len(r)
+    linear = Linearised(
+        information, 1 / sd**2, tuple(r[:, None] for r in residuals), tuple(reduced),
+        tuple(range(len(times))), starts.size,
+    )  # fmt: skip
+    return Fitted(theta, starts, residuals, jacobian, linear)
+
+
+def linearise(times, measured, theta, starts, noise):
+    blocks, residuals = [], []
+    for k, (t, y) in enumerate(zip(times, measured, strict=True)):
+        values = (*theta, *starts[k])
+        own = -slopes(t, values) / noise
+        own[~np.isfinite(y)] = 0.0
+        block = np.zeros((len(t), 2 + starts.size))
+        block[:, :2] = own[:, :2]
+        block[:, 2 + 2 * k : 4 + 2 * k] = own[:, 2:]
+        blocks.append(block)
+        residuals.append((y - motion(t, *values)) / noise)
+    return np.vstack(blocks), residuals
+
+
+def record(rng, *, n_pieces=10, n=120, noise=0.01, memory=0.0, bits=None, dead_band=False):
+    """Times and measured angles of pieces of ring-downs from random starts.
+
+    `memory` is the lag-1 correlation of the noise; `bits` quantise +-pi; a dead band has no values.
+    """
+    times, measured = [], []
+    for _ in range(n_pieces):
+        t = np.arange(n) / RATE_HZ
+        x = motion(t, *TRUTH, rng.uniform(0.5, 1.0), rng.uniform(-3.0, 3.0))
+        white = rng.normal(size=n + 200) * noise
+        x = x + lfilter([np.sqrt(1 - memory**2)], [1, -memory], white)[200:]
+        if bits is not None:
+            least = 2 * np.pi / 2**bits
+            x = np.round(x / least) * least
+        if dead_band:
+            x = np.where((x > 0.2) & (x < 0.3), np.nan, x)
+        times.append(t)
+        measured.append(x)
+    return times, measured
+
+
+@pytest.fixture(scope="session")
+def ringdown():
+    return SimpleNamespace(
+        TRUTH=TRUTH, motion=motion, slopes=slopes, fit=fit, linearise=linearise, record=record
+    )
