@@ -75,7 +75,9 @@ def _read(paths: list[Path], mappings: list[Path]) -> list[xr.Dataset]:
     return found
 
 
-def _way(transient: int, window: int | None, window_s: float, hysteresis: float | None, max_period: int) -> Way:
+def _way(
+    transient: int, window: int | None, window_s: float, hysteresis: float | None, max_period: int
+) -> Way:
     from pipeline.rig.measured.measuring import Way
     from pipeline.spec.problems import SpecError
 
@@ -144,9 +146,7 @@ def diagram(
     run: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Run whose diagram is drawn beside or below it.")
     ] = None,
-    layout: Annotated[
-        str, typer.Option(help="side: beside the computed diagram; over: over it.")
-    ] = "side",
+    layout: Annotated[str, typer.Option(help="side: beside the computed diagram; over: over it.")] = "side",
     state: State = "",
     degrees: Degrees = False,
     width: Width = 178.0,
@@ -188,7 +188,9 @@ def compare(
     directory: Directory,
     recordings: Recordings,
     mapping: Mappings,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="For figures, tables and data; made if absent.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="For figures, tables and data; made if absent.")
+    ],
     state: State = "",
     degrees: Degrees = False,
     width: Width = 178.0,

@@ -13,12 +13,47 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.selection import choose, select_points, start_dims
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import ABSENT, BOUNDED_SET, CLOSED_ORBIT, FREQUENCY_DIM
+from pipeline.layout.vocabulary import ABSENT, BOUNDED_SET, CLOSED_ORBIT, FREQUENCY_DIM, split_dims
 from pipeline.rig.measured.distances import Candidate
-from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.derive import AnalysedRun, refused
 from pipeline.spec.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
+
+
+def cube_and_parameters(
+    run: AnalysedRun, model_name: str, at: Mapping[str, float] | None = None
+) -> tuple[xr.Dataset, Parameters]:
+    """Return a run's cells over the drive's frequency, and its parameters there.
+
+    Raises
+    ------
+    SpecError
+        If it is of another model, sweeps no frequency, or another axis has more than one value.
+    """
+    where = run.directory
+    if run.model.name != model_name:
+        raise SpecError([
+            f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model_name}: give "
+            "a run of that model, or correct model in the mapping."
+        ])  # fmt: skip
+    cube = run.cube()
+    if FREQUENCY_DIM not in cube["status"].dims:
+        raise SpecError([
+            f"{where}: sweeps no drive frequency, so there is nothing to hold a measured sweep against: run a "
+            "specification with axes.frequency_hz."
+        ])  # fmt: skip
+    with refused(where):
+        part = select_points(cube, at)
+        long = [d for d in split_dims(part["status"])[0] if d != FREQUENCY_DIM and part.sizes[d] > 1]
+        if long:
+            axes = ", ".join(f"{d} ({part.sizes[d]} values)" for d in long)
+            one = float(part[long[0]].values[part.sizes[long[0]] // 2])
+            raise ValueError(f"also sweeps {axes}: choose a value of each, such as --at {long[0]}={one:g}")
+    others = [d for d in split_dims(part["status"])[0] if d != FREQUENCY_DIM]
+    part = part.isel(dict.fromkeys(others, 0))
+    values = {d: float(part[d]) for d in others if d in run.parameters}
+    return part, run.parameters.replace(**values)
 
 
 @dataclass(frozen=True)
@@ -50,40 +85,13 @@ class Computed:
         SpecError
             If it is of another model, sweeps no frequency, or another axis has more than one value.
         """
-        where = run.directory
-        if run.model.name != model_name:
-            raise SpecError([
-                f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model_name}: "
-                "give a run of that model, or correct model in the mapping."
-            ])  # fmt: skip
-        cube = run.cube()
-        if FREQUENCY_DIM not in cube["status"].dims:
-            raise SpecError([
-                f"{where}: sweeps no drive frequency, so there is nothing to hold a measured sweep against: run a "
-                "specification with axes.frequency_hz."
-            ])  # fmt: skip
-        try:
-            part = select_points(cube, at)
+        cube, parameters = cube_and_parameters(run, model_name, at)
+        with refused(run.directory):
             found = run.derive("attractors")
             keep = (FREQUENCY_DIM, *start_dims(found))
-            found = choose(
-                found, at, keep, "measured frequencies are compared at one value of the other axes"
-            )
-        except SpecError:
-            raise
-        except ValueError as error:
-            raise SpecError([f"{where}: {error}"]) from None
-        fixed = {d: 0 for d in part["status"].dims if d in (at or {})}
-        part = part.isel(fixed)
-        values = {n: float(part[n]) for n in fixed if n in run.parameters}
-        order = np.argsort(found[FREQUENCY_DIM].values)
-        return cls(
-            found.isel({FREQUENCY_DIM: order}),
-            part,
-            run.parameters.replace(**values),
-            run.info.title,
-            run.digest,
-        )
+            found = choose(found, at, keep, "measured sweeps are compared at one value of the other axes")
+        found = found.isel({FREQUENCY_DIM: np.argsort(found[FREQUENCY_DIM].values)})
+        return cls(found, cube, parameters, run.info.title, run.digest)
 
     @property
     def model(self) -> Model:
@@ -166,4 +174,4 @@ class Computed:
         turned = [np.roll(there, k, axis=0) for k in range(period)]
         best = min(turned, key=lambda t: float(geometry.distance(t, points).mean()))
         share = (frequency_hz - f[place]) / (f[other] - f[place])
-        return points + share * geometry.difference(best, points) * np.array(self.model.scales)
+        return np.asarray(points + share * geometry.difference(best, points) * np.array(self.model.scales))

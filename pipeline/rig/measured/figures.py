@@ -115,7 +115,9 @@ def _ranges(
 def _data(measured: xr.Dataset, values: np.ndarray, measure: labels.Measure) -> xr.Dataset:
     about = {"units": measure.unit, "long_name": f"{measure.name} at the rising edge"}
     kept = ["orbit_period", "confidence", "side", "frequency_error_hz"]
-    data = measured[[n for n in kept if n in measured]].assign(value=(("step", "period_index"), values, about))
+    data = measured[[n for n in kept if n in measured]].assign(
+        value=(("step", "period_index"), values, about)
+    )
     return data.drop_vars(["state", "state_units"], errors="ignore").assign_attrs(title="measured diagram")
 
 
@@ -139,7 +141,12 @@ def _draw_steps(ax: Axes, measured: xr.Dataset, values: np.ndarray, over: bool) 
             shown = np.isfinite(values[chosen])
             size, tint = _LOOKS[way]
             colour = style.tinted(motions.colours[int(code)], tint)
-            look: dict[str, Any] = {"marker": "o", "markersize": size, "markeredgewidth": 0.0, "color": colour}
+            look: dict[str, Any] = {
+                "marker": "o",
+                "markersize": size,
+                "markeredgewidth": 0.0,
+                "color": colour,
+            }
             if over:
                 look = {"marker": _MARKERS[way], "markersize": 3.4, "markeredgewidth": 0.5,
                         "markeredgecolor": "black", "markerfacecolor": "none"}  # fmt: skip
@@ -225,9 +232,7 @@ def plot_comparison(
     return fig
 
 
-def _draw_attractors(
-    ax: Axes, computed: Computed, measure: labels.Measure, cast: palette.Cast
-) -> list[int]:
+def _draw_attractors(ax: Axes, computed: Computed, measure: labels.Measure, cast: palette.Cast) -> list[int]:
     """Draw the points of all attractors; return the ids that are there."""
     found = computed.attractors
     points = found["attractor_points"].sel(state=measure.name).transpose(FREQUENCY_DIM, "attractor", "point")
@@ -267,7 +272,10 @@ def _draw_regimes(ax: Axes, compared: xr.Dataset, motions: Motions, ways: Sequen
     for way in ways:
         chosen = np.flatnonzero(compared["direction"].values == way)
         chosen = chosen[np.argsort(compared["frequency"].values[chosen], kind="stable")]
-        for who, period, side in (("rig", "orbit_period", "side"), ("model", "computed_period", "computed_side")):
+        for who, period, side in (
+            ("rig", "orbit_period", "side"),
+            ("model", "computed_period", "computed_side"),
+        ):
             place = -len(rows)
             rows.append(f"{who}, {way}" if way != "none" else who)
             sides = compared[side].values[chosen] if side in compared else np.zeros(chosen.size, int)

@@ -18,7 +18,9 @@ RIG, MODEL = "0.15", style.VERMILLION
 SUFFIX = "_computed"
 
 
-def plot_series(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
+def plot_series(
+    ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE
+) -> style.DataFigure:
     """Draw the series of `pipeline.rig.measured.series.series_of` over each other, and their portraits.
 
     Parameters
@@ -47,7 +49,9 @@ def plot_series(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = s
     fig = style.new_figure(max(1.25 * n, 2.4 * m) + 0.7, ds, frame)
     outer = fig.add_gridspec(1, 2, width_ratios=[1.55, 1.0])
     left, right = outer[0].subgridspec(n, 1), outer[1].subgridspec(m, 1)
-    measures = {s.name: labels.state_measure(ds, s.name, degrees and s.unit.startswith("rad")) for s in model.states}
+    measures = {
+        s.name: labels.state_measure(ds, s.name, degrees and s.unit.startswith("rad")) for s in model.states
+    }
     axes = [fig.add_subplot(left[i]) for i in range(n)]
     _draw_series(axes, ds, model, measures)
     for k, pair in enumerate(model.portraits):

@@ -124,7 +124,9 @@ def _dataset(
     from pipeline.rig.recordings import smooth
 
     model = parameters.model
-    chosen = (recording["time"].values >= begin) & (recording["time"].values <= begin + n_periods / frequency_hz)
+    chosen = (recording["time"].values >= begin) & (
+        recording["time"].values <= begin + n_periods / frequency_hz
+    )
     margin = (recording["time"].values > begin - 1) & (
         recording["time"].values < begin + n_periods / frequency_hz + 1
     )
@@ -142,7 +144,11 @@ def _dataset(
         off = off - 2 * np.pi * np.round(off / (2 * np.pi)) if s.on_circle else off
         about = {"units": s.unit, "long_name": s.meaning}
         variables[s.name] = ("time", source - shift, about)
-        variables[f"{s.name}_computed"] = ("time", states[:, i], {**about, "long_name": f"{s.meaning}, computed"})
+        variables[f"{s.name}_computed"] = (
+            "time",
+            states[:, i],
+            {**about, "long_name": f"{s.meaning}, computed"},
+        )
         rms[s.name] = float(np.sqrt(np.nanmean(off**2)))
     if DRIVE in recording:
         variables[DRIVE] = ("time", recording[DRIVE].values[chosen], dict(recording[DRIVE].attrs))

@@ -126,5 +126,3 @@ def summary_lines(compared: xr.Dataset) -> list[str]:
             share = compared[name].values[known].mean()
             lines.append(f"{what} agree at {100 * share:.0f} % of the {int(known.sum())} steps that are sure")
     return lines
-
-

@@ -40,7 +40,9 @@ def write_comparison(
     figures = {
         "comparison": plot_comparison(compared, computed, state=state, degrees=degrees, frame=frame),
         "beside": plot_measured(compared, computed.cube, state=state, degrees=degrees, frame=frame),
-        "over": plot_measured(compared, computed.cube, state=state, degrees=degrees, layout="over", frame=frame),
+        "over": plot_measured(
+            compared, computed.cube, state=state, degrees=degrees, layout="over", frame=frame
+        ),
     }
     folder.mkdir(parents=True, exist_ok=True)
     written = []
