@@ -1,7 +1,7 @@
 """``magpend measured``: diagrams of recordings, alone and held against a run.
 
-These commands are about recordings, several of them, and their mapping; a run is what they are held against. So
-they are no analyses or figures of a run, which know nothing but its cells.
+These commands are about recordings, several of them, and their mapping; a run is what they are held against.
+So they are no analyses or figures of a run, which know nothing but its cells.
 """
 
 from __future__ import annotations

@@ -43,11 +43,11 @@ def compare(
         ``winner``: id of the nearest attractor, -1 where the run's axis does not reach; ``distance`` from it
         and ``runner_up`` from the next (NaN if there is no other), both in units of the states' scales, and
         ``distance_in_noise`` in units of the floor; ``computed_period`` (0: bounded set) and
-        ``computed_side`` of the winner; ``same_period``, ``same_side``: 1 if they agree, 0 if not, -1 unknown;
-        and (step, attractor) ``distances``. Of each window's end, dim ``edge``: ``edge_measured_hz``,
-        ``edge_measured_error_hz``, ``edge_computed_hz``, ``edge_computed_error_hz``, ``edge_shift_hz``,
-        ``edge_shift_error_hz``, ``edge_direction``, ``edge_before_period``, ``edge_before_side``,
-        ``edge_after_period``, ``edge_after_side``, ``edge_note``.
+        ``computed_side`` of the winner; ``same_period``, ``same_side``: 1 if they agree, 0 if not, -1
+        unknown; and (step, attractor) ``distances``. Of each window's end, dim ``edge``:
+        ``edge_measured_hz``, ``edge_measured_error_hz``, ``edge_computed_hz``, ``edge_computed_error_hz``,
+        ``edge_shift_hz``, ``edge_shift_error_hz``, ``edge_direction``, ``edge_before_period``,
+        ``edge_before_side``, ``edge_after_period``, ``edge_after_side``, ``edge_note``.
 
     Raises
     ------

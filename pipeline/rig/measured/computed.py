@@ -34,14 +34,14 @@ def cube_and_parameters(
     where = run.directory
     if run.model.name != model_name:
         raise SpecError([
-            f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model_name}: give "
-            "a run of that model, or correct model in the mapping."
+            f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model_name}: "
+            "give a run of that model, or correct model in the mapping."
         ])  # fmt: skip
     cube = run.cube()
     if FREQUENCY_DIM not in cube["status"].dims:
         raise SpecError([
-            f"{where}: sweeps no drive frequency, so there is nothing to hold a measured sweep against: run a "
-            "specification with axes.frequency_hz."
+            f"{where}: sweeps no drive frequency, so there is nothing to hold a measured sweep against: run "
+            "a specification with axes.frequency_hz."
         ])  # fmt: skip
     with refused(where):
         part = select_points(cube, at)

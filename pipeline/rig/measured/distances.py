@@ -1,9 +1,9 @@
 """Distances between sets of section points: Wasserstein-1, and what of it is noise.
 
 Wasserstein-1 of two sets of equally many points is the mean way of the cheapest pairing, found by
-`scipy.optimize.linear_sum_assignment` (a shortest augmenting path: Crouse, IEEE Trans. Aerosp. Electron. Syst. 52,
-2016, p. 1679). The way between two states is the largest difference of a component in units of the model's scales,
-angles on their circle, as everywhere in `pipeline.analysis`.
+`scipy.optimize.linear_sum_assignment` (a shortest augmenting path: Crouse, IEEE Trans. Aerosp. Electron.
+Syst. 52, 2016, p. 1679). The way between two states is the largest difference of a component in units of the
+model's scales, angles on their circle, as everywhere in `pipeline.analysis`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
     Parameters
     ----------
     a, b
-        Shapes (m, state) and (n, state). Each is repeated to the least common multiple of m and n, so that every
-        point of a set has the same weight.
+        Shapes (m, state) and (n, state). Each is repeated to the least common multiple of m and n, so that
+        every point of a set has the same weight.
     geometry
         Scales and circles of the states.
 
@@ -94,8 +94,8 @@ class Cloud:
     def size(self) -> int:
         """Sections of a half, whole cycles if there is room for any.
 
-        The halves of a motion that closes after k sections would otherwise hold its points in unequal numbers,
-        which costs a way from one point of the orbit to another.
+        The halves of a motion that closes after k sections would otherwise hold its points in unequal
+        numbers, which costs a way from one point of the orbit to another.
         """
         half = len(self.points) // 2
         return half // self.cycle * self.cycle or half
@@ -130,8 +130,9 @@ def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.
     Parameters
     ----------
     candidate
-        The attractor. As many of its points as a half has are drawn, and blurred by the noise of the sections,
-        several times, so that a model that is right is as far away as the halves are from each other.
+        The attractor. As many of its points as a half has are drawn, and blurred by the noise of the
+        sections, several times, so that a model that is right is as far away as the halves are from each
+        other.
     cloud
         The recording's sections.
     geometry
@@ -149,7 +150,7 @@ def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.
 
 
 def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
-    """At least `size` points of an attractor: of a closed orbit whole turns, so that each point weighs alike."""
+    """At least `size` points of an attractor: of a closed orbit whole turns, so that all weigh alike."""
     points = candidate.points
     if candidate.orbit_period:
         return np.tile(points, (max(1, -(-size // len(points))), 1))

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of
+from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.bifurcation import Diagram, with_diagram
 from pipeline.plots.motions import Motions, motions_of
@@ -193,9 +193,9 @@ def plot_comparison(
     Returns
     -------
     DataFigure
-        Three panels over one axis of frequency: the attractors in their colours with the measured sections
-        as open triangles; the distance from the nearest attractor in units of the noise floor, in its colour
-        and pointing the way of the sweep; strips of the regimes of rig and model, coloured by side, with their
+        Three panels over one axis of frequency: the attractors in their colours with the measured sections as
+        open triangles; the distance from the nearest attractor in units of the noise floor, in its colour and
+        pointing the way of the sweep; strips of the regimes of rig and model, coloured by side, with their
         periods (a cross: unclosed). Its `data` are `compared`.
 
     Raises
@@ -268,7 +268,7 @@ def _draw_distances(ax: Axes, compared: xr.Dataset, cast: palette.Cast) -> None:
 
 def _draw_regimes(ax: Axes, compared: xr.Dataset, motions: Motions, ways: Sequence[str]) -> None:
     """Draw strips of the regimes of rig and model, two for each direction."""
-    rows = []
+    rows: list[str] = []
     for way in ways:
         chosen = np.flatnonzero(compared["direction"].values == way)
         chosen = chosen[np.argsort(compared["frequency"].values[chosen], kind="stable")]
@@ -302,8 +302,10 @@ def _draw_strip(
         ax.add_patch(Rectangle((low, place - 0.42), high - low, 0.84, facecolor=colour, edgecolor="white",
                                linewidth=0.4, gid=f"regime:{period}:{side}"))  # fmt: skip
         if high - low > 0.012 * whole:
-            ax.text(0.5 * (low + high), place - 0.03, str(period) if period else "×", ha="center", va="center",
-                    fontsize=size, color="white" if period == 0 else "black")  # fmt: skip
+            text, ink = (str(period), "black") if period else ("×", "white")
+            ax.text(
+                0.5 * (low + high), place - 0.03, text, ha="center", va="center", fontsize=size, color=ink
+            )
 
 
 def _comparison_handles(

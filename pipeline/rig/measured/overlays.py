@@ -66,7 +66,8 @@ def plot_series(
         Line2D([], [], color=RIG, linewidth=1.2, label=who),
         Line2D([], [], color=MODEL, linewidth=1.2, label="computed from the same state"),
     ]
-    text = f"$f$ = {float(ds.attrs['frequency_hz']):.6g}\u00a0Hz, start at {float(ds.attrs['start_s']):.3f}\u00a0s"
+    f, begin = float(ds.attrs["frequency_hz"]), float(ds.attrs["start_s"])
+    text = f"$f$ = {f:.6g}\u00a0Hz, start at {begin:.3f}\u00a0s"
     style.complete(fig, axes[0], text, handles)
     return fig
 

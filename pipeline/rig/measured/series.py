@@ -38,7 +38,8 @@ def series_of(
     Parameters
     ----------
     recording
-        As `pipeline.rig.recordings.read_recording` gives it, with all states or the angles whose rates they are.
+        As `pipeline.rig.recordings.read_recording` gives it, with all states or the angles whose rates they
+        are.
     parameters
         Of the recording's model.
     start_s
@@ -53,7 +54,8 @@ def series_of(
     Dataset
         Over ``time`` [s since the edge]: the measured states under their names, smoothed rates where they are
         not measured, and the computed ones with the suffix ``_computed``. Attributes: ``frequency_hz``,
-        ``start_s`` of the edge, ``start`` and ``rms`` (JSON by state; of angles on their circle), ``duty_cycle``.
+        ``start_s`` of the edge, ``start`` and ``rms`` (JSON by state; of angles on their circle),
+        ``duty_cycle``.
 
     Raises
     ------
@@ -66,8 +68,8 @@ def series_of(
     model = parameters.model
     if str(recording.attrs["model"]) != model.name:
         raise SpecError([
-            f"{name_of(recording)}: mapped to the model {recording.attrs['model']}, while {model.name} is to be "
-            "computed: choose one of them."
+            f"{name_of(recording)}: mapped to the model {recording.attrs['model']}, while {model.name} is to "
+            "be computed: choose one of them."
         ])  # fmt: skip
     if n_periods < 1:
         raise SpecError([f"periods = {n_periods}: must be at least 1."])
@@ -76,8 +78,8 @@ def series_of(
     missing = [n for n in model.state_names if n not in sections["state"].values]
     if missing:
         raise SpecError([
-            f"{name_of(recording)}: {', '.join(missing)} at the start is not known: map its channel, or that of "
-            "the angle whose rate it is."
+            f"{name_of(recording)}: {', '.join(missing)} at the start is not known: map its channel, or that "
+            "of the angle whose rate it is."
         ])  # fmt: skip
     first, last = _part(recording, edges, sections, start_s, n_periods)
     own = _fitted(edges, first, last)
@@ -101,8 +103,9 @@ def _part(
             if a <= first < b and b - a >= _LEAST:
                 return first, min(b, first + n_periods)
     raise SpecError([
-        f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} periods "
-        f"of one frequency after it; its edges lie from {edges.rising[0]:.3f} to {edges.rising[-1]:.3f} s."
+        f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} "
+        f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
+        f"{edges.rising[-1]:.3f} s."
     ])  # fmt: skip
 
 

@@ -12,9 +12,12 @@ from pipeline.layout.vocabulary import model_of
 from pipeline.products.product import Table
 from pipeline.rig.measured.windows import CONFIDENT, words_for
 
+FAR = 5.0
+"""Noise floors beyond which an attractor is not the rig's."""
+
 
 def steps_table(measured: xr.Dataset) -> Table:
-    """Table of the steps: frequency, jitter, duty cycle, period and how sure it is; compared ones have more."""
+    """Table of the steps: frequency, jitter, duty cycle, period, how sure it is; compared ones have more."""
     rows = [_row(measured, i) for i in range(measured.sizes["step"])]
     return Table(rows, [f"{len(rows)} steps", *aligned([_words(r) for r in rows])])
 
@@ -117,12 +120,18 @@ def summary_lines(compared: xr.Dataset) -> list[str]:
     sure = covered & (compared["confidence"].values >= CONFIDENT)
     d = compared["distance_in_noise"].values[covered]
     lines = [
-        f"{int(covered.sum())} of {covered.size} steps lie on the run's axis; distance from the nearest attractor: "
-        f"median {np.median(d):.2f}, 90 % below {np.quantile(d, 0.9):.2f} noise floors"
+        f"{int(covered.sum())} of {covered.size} steps lie on the run's axis; distance from the nearest "
+        f"attractor: median {np.median(d):.2f}, 90 % below {np.quantile(d, 0.9):.2f} noise floors"
     ]
     for name, what in (("same_period", "periods"), ("same_side", "sides")):
         known = sure & (compared[name].values >= 0)
         if known.any():
             share = compared[name].values[known].mean()
             lines.append(f"{what} agree at {100 * share:.0f} % of the {int(known.sum())} steps that are sure")
+    far = int((d > FAR).sum())
+    if far:
+        lines.append(
+            f"at {far} steps the nearest attractor is more than {FAR:g} noise floors away: the model is off, "
+            "or the run did not find the attractor, which more initial conditions may"
+        )
     return lines

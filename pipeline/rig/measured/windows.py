@@ -1,4 +1,4 @@
-"""Windows of a sweep: where a motion's regime ends, on the rig and in the model, and how far apart that is."""
+"""Windows of a sweep: where a motion's regime ends on the rig and in the model, and how far apart."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _computed_end(
 def _walk(
     place: int, sign: int, computed: Computed, holds: Callable[[int], bool]
 ) -> tuple[float, float, str]:
-    """Go along the run's axis while something holds; middle of the last that does and the first that does not."""
+    """Go along the run's axis while something holds; middle of the last with it and the first without."""
     f = computed.frequencies
     while 0 <= place + sign < f.size:
         if not holds(place + sign):
