@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.sampling import Drive
 from pipeline.products.reporting import report, track
 from pipeline.rig.identify import directory as store
 from pipeline.rig.identify import identifiability, reports
@@ -32,6 +34,10 @@ Echo = Callable[[str], None]
 
 NEAR_BOUND = 1e-4
 """Distance to a bound, as a share of a parameter's size, at which an estimate lies on it."""
+
+
+SAME_MOTION = 1e-3
+"""Difference of two motions, as a share of the measured spread, that the integration does not make."""
 
 
 class NotConvergedError(ArithmeticError):
@@ -121,6 +127,11 @@ def refuse_invisible(problem: Problem) -> None:
         Naming them all; also if the trajectories diverge at the start.
     """
     first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
+    if _is_driven(problem):
+        raise SpecError([
+            'recordings: drive = "none", but the model is driven with these parameters; set the amplitude of '
+            "its drive to 0 under [parameters]."
+        ])  # fmt: skip
     if first.failed:
         raise SpecError([
             f"identify: at the start, the trajectories of {first.failed} of {len(problem.pieces)} pieces "
@@ -136,6 +147,22 @@ def refuse_invisible(problem: Problem) -> None:
             "[parameters], give others values with which it matters, or add a recording in which it does."
             for name in names
         ])  # fmt: skip
+
+
+def _is_driven(problem: Problem) -> bool:
+    """Whether a motion without a drive depends on the period that it would have."""
+    piece = problem.pieces[0]
+    if piece.drive is not None:
+        return False
+    motions = []
+    for share in (0.37, 0.61):
+        duration = share * float(piece.time[-1])
+        drive = Drive(np.full(math.ceil(1 / share), duration))
+        one = replace(problem, pieces=(replace(piece, drive=drive, follows=-1),), continuity=None)
+        found = evaluate(one, problem.start[None], piece.start[None, None], slopes=False)[0]
+        motions.append(found.residuals[0])
+    spread = np.nanstd(piece.measured, axis=0)
+    return bool((np.nanmax(np.abs(motions[0] - motions[1]), axis=0) > SAME_MOTION * spread).any())
 
 
 def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo) -> reports.Finding:
