@@ -22,7 +22,7 @@ from pipeline.rig.identify.linearise import linearise, loss_scale_of
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import ZERO, Problem
-from pipeline.rig.identify.profiles import Curvature, Profile, profile
+from pipeline.rig.identify.profiles import Curvature, Profile, following, profile
 from pipeline.rig.identify.search import search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
 from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
@@ -262,8 +262,10 @@ def _profiles(
     for i, name in track(list(enumerate(problem.names)), "profiles"):
         kept = outcomes.recall(f"profile-{name}", partial(_unpack_profile, name))
         if kept is None:
+            moves = following(linear.information, i)
+            starts = np.zeros_like(best.starts) if linear.following is None else linear.following @ moves
             error, size = float(covariance.errors[i]), float(scale[i])
-            about = Curvature(error, float(plain[i]), covariance.critical, size)
+            about = Curvature(error, float(plain[i]), covariance.critical, size, moves, starts)
             kept = profile(problem, best, name, about, fit_local)
             interval = np.array(kept.interval)
             outcomes.store(

@@ -64,8 +64,8 @@ def write_ringdowns(path, seed, n_pieces=4, n=150):
     for _ in range(n_pieces):
         t = 0.1 * np.arange(n)
         found = solve_ivp(
-            oscillator, (0.0, t[-1]), [rng.uniform(1.0, 2.0), rng.uniform(-1.0, 1.0)], method="DOP853", t_eval=t,
-            rtol=1e-10, atol=1e-10,
+            oscillator, (0.0, t[-1]), [rng.uniform(1.0, 2.0), rng.uniform(-1.0, 1.0)],
+            method="DOP853", t_eval=t, rtol=1e-10, atol=1e-10,
         )  # fmt: skip
         x = found.y[0] + ZERO + NOISE * rng.normal(size=n)
         rows += [f"{begin + a:.3f},{b:.8f}" for a, b in zip(t, x, strict=True)]
