@@ -145,7 +145,7 @@ def fit_local(
     A robust loss counts residuals in units of their own scale, which a first fit of least squares gives.
     """
     if fixed:
-        return _fit_others(problem, theta0, starts, fixed, free_starts, max_evaluations)
+        return _fit_others(problem, theta0, starts, fixed, free_starts, _Ending(max_evaluations, tolerance))
     ending = _Ending(max_evaluations, tolerance)
     first = problem.starts if starts is None else starts
     plain = replace(problem, loss="linear") if problem.loss != "linear" else problem
@@ -201,13 +201,13 @@ def _outcome(unknowns: _Unknowns, x: Array, ended: bool, message: str) -> Fit:
 
 def _fit_others(
     problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float], free_starts: bool,
-    limit: int,
+    ending: _Ending,
 ) -> Fit:  # fmt: skip
     """Fit with some unknowns held; the outcome speaks of all again."""
     held = np.array([name in fixed for name in problem.names], bool)
     part = fit_local(
         problem.without(fixed), np.asarray(theta0)[~held], starts=starts, free_starts=free_starts,
-        max_evaluations=limit,
+        max_evaluations=ending.max_evaluations, tolerance=ending.tolerance,
     )  # fmt: skip
     theta = np.array([fixed.get(name, 0.0) for name in problem.names])
     theta[~held] = part.theta

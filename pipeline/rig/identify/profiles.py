@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 STEPS = (0.4, 0.8, 1.2, 1.6)
 """Where a profile is taken, on either side, in half widths of the interval of the standard error."""
 
+TOLERANCES = (1e-9, 1e-6)
+"""Least and largest tolerance of the fits, see `pipeline.rig.identify.local.fit_local`."""
+
 UNKNOWN_STEP = 0.1
 """Half width that is tried where the standard error is not known, as a share of the parameter's size."""
 
@@ -101,6 +104,8 @@ def profile(
     known = np.isfinite(about.error) and about.error > 0
     half = about.critical * about.error if known else UNKNOWN_STEP * about.size
     unit = (about.error / about.plain) ** 2 if known else 1.0
+    # the cost to a hundredth of what one standard error makes of it
+    tolerance = float(np.clip(0.05 * unit / max(best.cost, 1e-300), *TOLERANCES))
     found = {estimate: 0.0}
     for side in (-1.0, 1.0):
         theta, starts, at = best.theta, best.starts, estimate
@@ -110,7 +115,7 @@ def profile(
                 break
             theta = theta + (value - at) * about.others
             starts = starts + (value - at) * about.starts
-            fit = fit_local(problem, theta, starts=starts, fixed={name: value})
+            fit = fit_local(problem, theta, starts=starts, fixed={name: value}, tolerance=tolerance)
             found[value] = 2.0 * (fit.cost - best.cost) / unit if fit.converged else np.nan
             theta, starts, at = fit.theta, fit.starts, value
     values = np.array(sorted(found))

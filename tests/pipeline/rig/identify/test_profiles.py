@@ -22,7 +22,7 @@ def problem(lower=-np.inf, upper=np.inf):
 def local(cost):
     """A fit of the second parameter with the first held."""
 
-    def fit_local(_, theta0, *, starts, fixed):
+    def fit_local(_, theta0, *, starts, fixed, tolerance):
         a = fixed["a"]
         found = minimize_scalar(lambda b: cost(np.array([a, b])), bracket=(theta0[1], theta0[1] + 0.1))
         return SimpleNamespace(
