@@ -167,7 +167,7 @@ def drive_problems(
     if {"edges", "recorded"} <= kinds:
         problems.append(
             f'{where}: drive = "edges" cannot stand beside "recorded" in one identification; take one of them '
-            "of them for all driven recordings."
+            "one of them for all driven recordings."
         )
     if "edges" in kinds:
         problems += [
