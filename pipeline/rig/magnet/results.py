@@ -59,11 +59,12 @@ def report_of(outcome: Outcome) -> dict[str, Any]:
 
 def _joint(fit: JointFit) -> dict[str, Any]:
     line = laws.transition(fit.values)
+    by_curve = {n: e if math.isfinite(e) else None for n, e in fit.errors_by_curve.items()}
     return {
         "values": {name: fit.values[name] for name in laws.FITTED},
         "held": [name for name in laws.FITTED if name not in fit.free],
         "standard_errors": fit.errors,
-        "standard_errors_by_curve": {n: e if math.isfinite(e) else None for n, e in fit.errors_by_curve.items()},
+        "standard_errors_by_curve": by_curve,
         "correlation": {"names": list(fit.free), "matrix": fit.correlation.tolist()},
         "transition": {"slope": line.slope, "offset_rad": line.offset},
         "r2": fit.quality.r2, "rms_Nm": fit.quality.rms, "neighbours_correlate": fit.neighbours,
