@@ -56,7 +56,7 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
     table = RecordingTable(file=str(recording), mapping="", drive=tables[like]["drive"])
     ds = read_recording(recording, parse_mapping(info.mappings[like], f"mapping of recording {like}"))
     model = load_model(result["model"])
-    channels = tuple(result["noise"])
+    channels = tuple(result["channels"])
     missing = [name for name in channels if name not in ds]
     problems = [
         f"{recording}: has no channel {name!r}; it must have those that were fitted." for name in missing

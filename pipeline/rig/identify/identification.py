@@ -24,7 +24,7 @@ from pipeline.rig.identify.profiles import Curvature, Profile, profile
 from pipeline.rig.identify.search import search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
 from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
-from pipeline.runs.workflows import find_spec
+from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.files import FIGURES, local_path, writer_lock
 
@@ -69,7 +69,7 @@ def identify(
     """
     path = find_spec(spec)
     parsed = load_identification(path)
-    folder = local_path(out) if out is not None else Path("runs") / path.stem
+    folder = directory_of(spec, out)
     sources = store.sources_of(parsed)
     store.check(folder, store.identity_of(parsed, sources))
     built = build(parsed, read_all(parsed))
@@ -83,15 +83,22 @@ def identify(
         found = find(parsed, built, outcomes, echo)
         if outcomes.recalled:
             echo(f"{outcomes.recalled} outcomes were there before")
-        return _write(folder, parsed, found, sources, info.digest, figures)
+        return _write(folder, parsed, found, sources, info.digest, figures, built.simulated)
+
+
+def directory_of(spec: str | Path, out: str | Path | None) -> Path:
+    """Where an identification goes: `out`, or ``runs/<name>``."""
+    return local_path(out) if out is not None else default_directory(find_spec(spec), False)
 
 
 def _write(
     folder: Path, spec: IdentificationSpec, found: reports.Finding, sources: list[Source], digest: str,
-    figures: bool,
+    figures: bool, simulated: bool,
 ) -> dict[str, Any]:  # fmt: skip
     reports.write_values(folder / store.PRESET, spec, found, sources)
     residuals = reports.residuals_of(spec, found)
+    if simulated:
+        residuals = residuals.assign_attrs(simulated=1)
     residuals.to_netcdf(folder / store.RESIDUALS, engine="scipy", format="NETCDF3_64BIT")
     result = reports.result_of(spec, found, sources, digest)
     files = [store.PRESET, store.RESIDUALS]

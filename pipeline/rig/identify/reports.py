@@ -96,6 +96,8 @@ def result_of(
         "digest": digest,
         "model": spec.model.name,
         "converged": True,
+        "names": list(names),
+        "channels": list(found.problem.channels),
         "estimates": {name: _estimate(found, i) for i, name in enumerate(names)},
         "values": found.values,
         "tied": {name: [factor, other] for name, (factor, other) in spec.tied.items()},
@@ -241,7 +243,8 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
     estimates = result["estimates"]
     width = max(map(len, estimates))
     lines = []
-    for name, e in estimates.items():
+    for name in result["names"]:
+        e = estimates[name]
         low, high = (("-" if v is None else f"{v:.6g}") for v in e["interval"])
         bound = f", at its {e['at_bound']} bound" if e["at_bound"] else ""
         unit = "" if e["unit"] in ("", "1") else f" {e['unit']}"

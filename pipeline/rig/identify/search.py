@@ -2,8 +2,7 @@
 
 Far from the truth a long piece is out of step with its recording and the cost is rugged. Short stretches
 from smoothed states are not, so a guess is first fitted to those, then to longer ones, and to the whole
-pieces
-with free starts at last (multiple shooting: Bezruchko et al., Chaos Solitons Fractals 29, 2006, 82).
+pieces with free starts at last (multiple shooting: Bezruchko et al., Chaos Solitons Fractals 29, 2006, 82).
 """
 
 from __future__ import annotations

@@ -20,10 +20,9 @@ from magpend_core.models.parameters import (
 from magpend_core.models.presets import is_file
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
 from pipeline.spec.files import read_toml
+from pipeline.spec.parsing import IDENTIFICATION
 from pipeline.spec.problems import SpecError, unknown_choice, unknown_key
 from pipeline.spec.tables import Table
-
-KIND = "identification"
 
 
 class SensorsTable(Table):
@@ -118,7 +117,7 @@ class IdentificationSpec:
     def as_dict(self) -> dict[str, Any]:
         """Plain data with all defaults filled in, the title left out; equal for equal identifications."""
         return {
-            "kind": KIND,
+            "kind": IDENTIFICATION,
             "model": self.model.name,
             "values": self.values.as_dict(),
             "identify": {
@@ -172,9 +171,9 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     if kind in ("sweep", "continuation"):
         raise SpecError([f'kind = "{kind}": is a run, not an identification; use magpend run.'])
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
-    if kind != KIND:
-        missing = f'kind: missing; add kind = "{KIND}".'
-        problems.append(missing if kind is None else unknown_choice("kind", kind, [KIND]))
+    if kind != IDENTIFICATION:
+        missing = f'kind: missing; add kind = "{IDENTIFICATION}".'
+        problems.append(missing if kind is None else unknown_choice("kind", kind, [IDENTIFICATION]))
     title, preset = (_text(data, key, problems) for key in ("title", "preset"))
     model = _model(data, problems)
     sensors = _table(data, "sensors", SensorsTable, problems)
