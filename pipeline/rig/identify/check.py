@@ -14,6 +14,7 @@ from pipeline.rig.identify.directory import Info, read_info, read_result
 from pipeline.rig.identify.identification import require_starts
 from pipeline.rig.identify.judging import judge
 from pipeline.rig.identify.problem import Free, Problem
+from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.rig.recordings import parse_mapping, read_recording, smooth
 from pipeline.spec.problems import SpecError
@@ -65,6 +66,7 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
     if problems:
         raise SpecError(problems)
     pieces = pieces_of(model, channels, (ds, smooth(ds)), table, like)
+    pieces = apply_settings(pieces, {like: table.parameters})
     zeros = result["zeros"]
     free = tuple(Free(name, value) for name, value in zeros.items())
     problem = Problem(

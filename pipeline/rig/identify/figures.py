@@ -12,6 +12,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from scipy.interpolate import PchipInterpolator
 
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
@@ -26,6 +27,9 @@ MOST_DOTS = 3000
 
 MILLI = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "rad/s": ("mrad/s", 1e3)}
 """In what residuals are drawn."""
+
+SQUARE = style.Frame(width=131.0)
+"""Of a matrix."""
 
 FITTED, HELD = style.BLUE, style.VERMILLION
 
@@ -65,6 +69,13 @@ def draw_all(folder: Path, residuals: xr.Dataset, result: Mapping[str, Any]) -> 
 def _title(attrs: Mapping[Any, Any], what: str) -> str:
     simulated = "simulated recording" if attrs.get("simulated") else ""
     return style.join([str(attrs.get("title", "")), what, simulated])
+
+
+def _finish(fig: style.DataFigure) -> None:
+    """Say that recordings are simulated where they are, and finish."""
+    if fig.data.attrs.get("simulated"):
+        fig.text(0.012, 0.992, "simulated recording", ha="left", va="top", fontsize=fig.look.legend)
+    style.finish(fig)
 
 
 def _symbol(ds: xr.Dataset, channel: str) -> str:
@@ -109,7 +120,7 @@ def plot_fit(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFi
         unit, _ = _milli(ds, channel)
         own_unit = str(ds[f"{channel}_measured"].attrs.get("units", ""))
         style.label_axes(axes[2 * c][0], y=labels.with_unit(_symbol(ds, channel), own_unit))
-        style.label_axes(axes[2 * c + 1][0], y=f"residual\n[{unit}]")
+        axes[2 * c + 1][0].set_ylabel(f"residual [{unit}]", fontsize=fig.look.tick, labelpad=3.5)
         _share_range(axes[2 * c])
         _share_range(axes[2 * c + 1])
     fig.align_ylabels([row[0] for row in axes])
@@ -121,7 +132,7 @@ def plot_fit(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFi
             Line2D([], [], color=FITTED, linewidth=1.2, label="computed"),
         ],
     )
-    style.finish(fig)
+    _finish(fig)
     return fig
 
 
@@ -187,15 +198,15 @@ def plot_residuals(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
         for ax in column:
             style.style_axes(ax, minor=False)
         unit, factor = _milli(ds, channel)
-        left = f"residual of {_symbol(ds, channel)}"
+        column[0].set_title(f"residuals of {_symbol(ds, channel)}", fontsize=fig.look.label, pad=4.0)
         _draw_autocorrelation(column[0], views, channel)
         _draw_pieces(column[1], ds, channel, factor)
         _draw_against_rate(column[2], ds, views, channel, factor)
         _draw_histogram(column[3], views, channel, factor)
-        style.label_axes(column[0], "lag [s]", f"autocorrelation,\n{left}")
-        style.label_axes(column[1], "piece", f"root mean square\n[{unit}]")
-        style.label_axes(column[2], _rate_label(ds, channel), f"{left}\n[{unit}]")
-        style.label_axes(column[3], f"{left} [{unit}]", f"density [1/{unit}]")
+        style.label_axes(column[0], "lag [s]", "autocorrelation")
+        style.label_axes(column[1], "piece", f"rms [{unit}]")
+        style.label_axes(column[2], _rate_label(ds, channel), f"residual [{unit}]")
+        style.label_axes(column[3], f"residual [{unit}]", f"density [1/{unit}]")
         fig.align_ylabels(column)
     handles = [Patch(color="0.85", label="95 % band of white residuals"), Patch(color=FITTED, label="fitted")]
     if bool((ds["held_out"] == 1).any()):
@@ -205,7 +216,7 @@ def plot_residuals(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
         Line2D([], [], color="black", linestyle="--", linewidth=0.9, label="Gaussian of the same width"),
     ]
     style.legend_above(fig, [*handles, *more], size=fig.look.tick)
-    style.finish(fig)
+    _finish(fig)
     return fig
 
 
@@ -308,7 +319,7 @@ def plot_profiles(
         ],
         size=fig.look.tick,
     )
-    style.finish(fig)
+    _finish(fig)
     return fig
 
 
@@ -324,7 +335,12 @@ def _draw_profile(
         error = float(estimate["error"])
         fine = np.linspace(x[0], x[-1], 200)
         ax.plot(fine * scale, ((fine - centre) / error) ** 2, color="black", linestyle="--", linewidth=0.9)
-    ax.plot(x * scale, growth, color=FITTED, marker="o", markersize=2.6, linewidth=1.0)
+    known = np.isfinite(growth)
+    ax.plot(x * scale, growth, color=FITTED, marker="o", markersize=2.6, linestyle="none")
+    if known.sum() > 1:
+        root = PchipInterpolator(x[known], np.sign(x[known] - centre) * np.sqrt(np.maximum(growth[known], 0)))
+        fine = np.linspace(x[known][0], x[known][-1], 200)
+        ax.plot(fine * scale, root(fine) ** 2, color=FITTED, linewidth=1.0)
     ax.set_ylim(min(0.0, float(np.nanmin(growth))) - 0.03 * top, top)
     style.few_ticks(ax, 3, 4)
     unit = str(estimate["unit"])
@@ -342,7 +358,7 @@ def _engineering(size: float) -> tuple[float, int]:
 
 
 def plot_correlations(
-    attrs: Mapping[Any, Any], result: Mapping[str, Any], *, frame: style.Frame = style.WIDE
+    attrs: Mapping[Any, Any], result: Mapping[str, Any], *, frame: style.Frame = SQUARE
 ) -> style.DataFigure:
     """Draw the correlations of the estimates as a matrix; what is not determined stays empty.
 
@@ -377,12 +393,14 @@ def plot_correlations(
     for i in range(n):
         for j in range(n):
             value = matrix[i, j]
-            text = "–" if np.isnan(value) else f"{value:.2f}" if i != j else "1"
+            shown = f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
+            text = "" if np.isnan(value) else shown if i != j else "1"
             strong = abs(value) > 0.7
             ax.text(j, i, text, ha="center", va="center", fontsize=fig.look.tick - 1.5,
                     color="white" if strong else "black")  # fmt: skip
+    ax.set_title(" ", fontsize=fig.look.legend)
     style.style_bar(fig, fig.colorbar(image, ax=ax, pad=0.02, aspect=28), "correlation of the estimates")
-    style.finish(fig)
+    _finish(fig)
     return fig
 
 

@@ -18,6 +18,7 @@ from magpend_core.models.parameters import (
     near_names,
 )
 from magpend_core.models.presets import is_file
+from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
 from pipeline.spec.files import read_toml
 from pipeline.spec.parsing import IDENTIFICATION
@@ -37,6 +38,7 @@ class RecordingTable(Table):
     file: str
     mapping: str
     drive: Literal["none", "recorded", "edges"] = "none"
+    parameters: dict[str, float] = Field(default_factory=dict)
     piece_s: Annotated[float, Field(gt=0)] | None = None
     window_s: Pair | None = None
     hold_out: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = ()
@@ -183,6 +185,8 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     if model is None:
         raise SpecError(problems)
     problems += _channel_problems(model, sensors, fit)
+    for i, table in enumerate(recordings):
+        problems += setting_problems(model, table.parameters, f"recordings[{i}].parameters")
     own = ParameterTables(data, model, _found(preset, folder), problems)
     if problems:
         raise SpecError(problems)
