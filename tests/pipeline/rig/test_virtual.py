@@ -145,8 +145,8 @@ def test_readings__through_a_file_are_the_recording(tmp_path, parameters, suffix
 def test_record__refuses_all_at_once(parameters):
     with pytest.raises(SpecError) as caught:
         record(
-            parameters, [Step(2.2, 2, {"duty": 0.5}), Step(0.0, 1)], START, TIMES,
-            sensors={"psi_1": Sensor(), "psi1_dot": Sensor("potentiometer"), "psi2": Sensor(noise=-1.0)}, seed=0,
+            parameters, [Step(2.2, 2, {"duty": 0.5}), Step(0.0, 1)], START, TIMES, seed=0,
+            sensors={"psi_1": Sensor(), "psi1_dot": Sensor("potentiometer"), "psi2": Sensor(noise=-1.0)},
         )  # fmt: skip
     text = "\n".join(caught.value.problems)
     assert "unknown state 'psi_1'; did you mean psi1" in text
