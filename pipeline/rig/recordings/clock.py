@@ -270,14 +270,13 @@ def _cut(
     time: np.ndarray, forced: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
     """Cut the samples at gaps and where it is asked for, and make time even within each piece."""
-    missing = _missing(time, step)
-    is_gap = missing > 0
+    is_gap = _missing(time, step) > 0
     piece = np.cumsum(is_gap | np.concatenate([[False], forced[1:]])).astype(np.int64)
     even, own_step, residual = _even(time, piece, step, stated)
     findings = [
         Finding(
             "gap", "", float(time[i - 1]), float(time[i]), "warning",
-            f"{missing[i]} samples are missing; a new piece begins.",
+            f"{round((even[i] - even[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
         )
         for i in np.flatnonzero(is_gap)
     ]  # fmt: skip
