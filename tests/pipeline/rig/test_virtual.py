@@ -78,6 +78,19 @@ def test_record__steps_of_the_drive_carry_the_state_on(parameters):
             begin, state = end, found.y[:, -1]
 
 
+def test_record__drive_signal_follows_the_steps(parameters):
+    """Each step's edges count from its own beginning, which is no whole period of its frequency."""
+    steps = [Step(2.0, 1), Step(3.7, 4, {"duty_cycle": 0.3}), Step(1.0, 1, {"q": 0.0})]
+    times = np.arange(1000) / 500.0
+    sensors = {"psi1": Sensor(), "drive": DriveSensor("signal")}
+    signal = record(parameters, steps, START, times, sensors=sensors, seed=0)["drive"].values
+    wanted = np.where(np.mod(times * 2.0, 1.0) < 0.4927, 1.0, -1.0)
+    second = (times >= 0.5) & (times < 0.5 + 4 / 3.7)
+    wanted[second] = np.where(np.mod((times[second] - 0.5) * 3.7 + 1e-9, 1.0) < 0.3, 1.0, -1.0)
+    wanted[times >= 0.5 + 4 / 3.7] = 0.0
+    np.testing.assert_array_equal(signal, wanted)
+
+
 def test_record__free_swing_of_another_model():
     model = load_model("double-pendulum")
     parameters = model.load(q=0.0)
