@@ -36,10 +36,13 @@ class Built:
     problem : Problem
     held_out : tuple of Piece
         Judged afterwards, their starts alone refitted.
+    simulated : bool
+        Whether any of the recordings is simulated.
     """
 
     problem: Problem
     held_out: tuple[Piece, ...]
+    simulated: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,8 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         continuity=None if spec.fit.continuity == "free" else float(spec.fit.continuity), rtol=spec.fit.rtol,
         recorded=any(t.drive == "recorded" for t in spec.recordings),
     )  # fmt: skip
-    return Built(problem, tuple(replace(p, follows=-1) for p in held))
+    simulated = any(bool(ds.attrs.get("simulated")) for ds in recordings)
+    return Built(problem, tuple(replace(p, follows=-1) for p in held), simulated)
 
 
 def channels_of(

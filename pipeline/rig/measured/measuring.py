@@ -152,8 +152,8 @@ def _check(steps: Sequence[_Step], recordings: Sequence[xr.Dataset]) -> None:
     if not steps:
         names = ", ".join(name_of(r) for r in recordings)
         raise SpecError([
-            f"{names}: no stretch of one frequency holds {LEAST} sections; choose longer recordings, a smaller "
-            "transient, or a window of a slow sweep."
+            f"{names}: no stretch of one frequency holds {LEAST} sections; choose longer recordings, a "
+            "smaller transient, or a window of a slow sweep."
         ])  # fmt: skip
     states = sorted({", ".join(s.state) for s in steps})
     if len(states) > 1:
@@ -193,20 +193,25 @@ def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Datas
             **{k: ("step", np.array(v), {"units": u, "long_name": n}) for k, (v, u, n) in rows.items()},
         },
         coords={
-            "frequency": ("step", [t.frequency_hz for t in timing], {"units": "Hz", "long_name": "drive frequency"}),
+            "frequency": ("step", [t.frequency_hz for t in timing], _about("Hz", "drive frequency")),
             "direction": ("step", [DIRECTIONS[s.stretch.direction] for s in steps]),
             "recording": ("step", [s.recording for s in steps]),
-            "start_s": ("step", [s.stretch.start_s for s in steps], {"units": "s", "long_name": "first edge"}),
-            "end_s": ("step", [s.stretch.end_s for s in steps], {"units": "s", "long_name": "last edge"}),
+            "start_s": ("step", [s.stretch.start_s for s in steps], _about("s", "first edge")),
+            "end_s": ("step", [s.stretch.end_s for s in steps], _about("s", "last edge")),
             "state": list(steps[0].state),
             "state_units": ("state", [model.state(n).unit for n in steps[0].state]),
         },
     )  # fmt: skip
+    files = [{"file": name_of(r), "sha256": str(r.attrs.get("sha256", ""))} for r in recordings]
     simulated = any(int(r.attrs.get("simulated", 0)) for r in recordings)
     return found.assign_attrs(
         title="measured diagram", model=model.name, simulated=int(simulated),
-        recordings=json.dumps([{"file": name_of(r), "sha256": str(r.attrs.get("sha256", ""))} for r in recordings]),
+        recordings=json.dumps(files),
     )  # fmt: skip
+
+
+def _about(units: str, text: str) -> dict[str, str]:
+    return {"units": units, "long_name": text}
 
 
 def with_sides(measured: xr.Dataset, parameters: Parameters) -> xr.Dataset:

@@ -96,8 +96,9 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
     if not kept:
         longest = max(b - a for a, b in spans)
         raise SpecError([
-            f"drive: the longest stretch of one frequency has {longest} periods, and {transient} of transient and "
-            f"{LEAST} of sections are wanted: lower transient, or give window for a drive that is swept slowly."
+            f"drive: the longest stretch of one frequency has {longest} periods, and {transient} of "
+            f"transient and {LEAST} of sections are wanted: lower transient, or give window for a drive that "
+            "is swept slowly."
         ])  # fmt: skip
     return _directed([_constant(edges, a, b, transient) for a, b in kept])
 
@@ -118,7 +119,7 @@ def constant_spans(edges: Edges) -> list[tuple[int, int]]:
 
 
 def _noise(edges: Edges) -> float:
-    """Standard deviation of an edge [s]: from second differences, which steps of the frequency rarely touch."""
+    """Standard deviation of an edge [s]: from second differences, which steps rarely touch."""
     second = np.diff(edges.rising, 2)
     own = 1.4826 * float(np.median(np.abs(second))) / math.sqrt(6) if second.size else 0.0
     period = float(np.median(np.diff(edges.rising)))
