@@ -23,11 +23,11 @@ MOST_DOTS = 6000
 LINES = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE)
 MARKS = {
     "gap": "0.7", "dead-band": style.ORANGE, "saturated": style.VERMILLION, "missing": style.PURPLE,
-    "wrap": "0.25", "start": style.GREEN,
+    "wrap": "0.25", "start": style.GREEN, "leap": style.BLUE,
 }  # fmt: skip
 """Colour by kind of finding; kinds that concern a whole recording are in the caption."""
 
-INSTANTS = ("wrap", "start")
+INSTANTS = ("wrap", "start", "leap")
 """Kinds that happen at an instant: lines, which are seen beside a shaded stretch."""
 
 SHADE = 0.4
