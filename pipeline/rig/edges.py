@@ -121,13 +121,25 @@ class Edges:
         errors = [self._error(t, even, each) for t in (fitted[before], fitted[before] + mean)]
         return mean / period, math.hypot(*errors) / period
 
-    def _error(self, fitted: Floats, weights: Floats, scatter: float) -> float:
+    def common_error(self, fitted: Floats, scatter: float) -> float:
+        """Standard error [s] that all instants on a line through the edges have in common.
+
+        Parameters
+        ----------
+        fitted
+            Instants of the rising edges on the line [s].
+        scatter
+            Root mean square of the edges about it [s].
+        """
+        return self._error(fitted, np.full(fitted.size, 1 / fitted.size), scatter, drifts=1)
+
+    def _error(self, fitted: Floats, weights: Floats, scatter: float, drifts: int = _DRIFTS) -> float:
         """Standard error [s] of a weighted sum of instants.
 
         An instant known to a sample is rounded to its middle: a sawtooth of the instant, which is not
         independent from edge to edge. Its harmonics, of unknown phase, are added up as they are, damped by
         the jitter that blurs them; the rest of the scatter is independent. Since the line itself is known to
-        about a sample only, drifts of up to one over the whole are averaged.
+        about a sample only, `drifts` of up to one over the whole are averaged.
         """
         step = self.resolution_s
         if not step:
@@ -137,7 +149,7 @@ class Edges:
         power = 0.5 * (step / (math.pi * k)) ** 2 * np.exp(-4 * (math.pi * k * blur) ** 2)
         place = (fitted - fitted[0]) / step
         share = np.linspace(-0.5, 0.5, fitted.size)
-        turns = place + share * np.linspace(-1, 1, _DRIFTS)[:, None]
+        turns = place + share * (np.linspace(-1, 1, drifts) if drifts > 1 else np.zeros(1))[:, None]
         sums = np.array([abs(np.exp(2j * np.pi * i * turns) @ weights) ** 2 for i in k]).mean(axis=1)
         rest = max(scatter**2 - float(power.sum()), 0.0)
         return math.sqrt(rest * float(weights @ weights) + float(power @ sums))

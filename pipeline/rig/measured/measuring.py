@@ -80,7 +80,8 @@ def measure(
     Dataset
         Dims ``step``, ``period_index`` (NaN beyond a step's own), ``state``. ``section`` and
         ``section_noise`` (step, period_index, state), angles not wrapped; by step ``frequency_error_hz``,
-        ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``n_sections``, ``orbit_period`` (0: closes at no
+        ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``instant_error_s`` (of all its sections in common:
+        it moves angles by their rates and is no part of ``section_noise``), ``n_sections``, ``orbit_period`` (0: closes at no
         period that was looked at), ``confidence``, ``closure``, ``margin`` (`regimes.Regime`), ``side``
         (codes of the model's classifier; absent without one or without parameters). Coordinates of ``step``:
         ``frequency`` [Hz], ``direction`` (up, down, none), ``recording``, ``start_s``, ``end_s``.
@@ -122,7 +123,7 @@ def _steps(recording: xr.Dataset, number: int, way: Way, model: Model) -> list[_
             continue
         inner = slice(own.start + int(kept[0]), own.start + int(kept[-1]) + 1)
         points = section[inner]
-        blur = _with_instants(points, noise[inner], names, model, stretch.instant_error_s)
+        blur = _with_instants(points, noise[inner], names, model, stretch.instant_scatter_s)
         regime = find_period(points / scale, blur / scale, limit=way.limit, max_period=way.max_period)
         found.append(_Step(stretch, number, names, points, blur, regime))
     return found
@@ -136,14 +137,14 @@ def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
 
 
 def _with_instants(
-    points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, error_s: float
+    points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, scatter_s: float
 ) -> np.ndarray:
-    """Noise of sections, that of their instants included where the rate is known."""
+    """Noise of sections, the scatter of their instants included where the rate is known."""
     both = noise.copy()
     for i, name in enumerate(names):
         rate = model.state(name).rate
         if rate in names:
-            both[:, i] = np.hypot(noise[:, i], points[:, names.index(rate)] * error_s)
+            both[:, i] = np.hypot(noise[:, i], points[:, names.index(rate)] * scatter_s)
     return both
 
 
@@ -180,6 +181,11 @@ def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Datas
         "jitter_s": ([t.jitter_s for t in timing], "s", "scatter of the rising edges"),
         "duty_cycle": ([t.duty_cycle for t in timing], "1", "share of the period in the high state"),
         "duty_cycle_error": ([t.duty_cycle_error for t in timing], "1", "standard error of the duty cycle"),
+        "instant_error_s": (
+            [s.stretch.instant_error_s for s in steps],
+            "s",
+            "error that the instants of all sections share",
+        ),
         "n_sections": ([len(s.section) for s in steps], "1", "sections"),
         "orbit_period": ([r.orbit_period for r in regime], "1", "period in drive periods, 0: unclosed"),
         "confidence": ([r.confidence for r in regime], "1", "share of resamples with this period"),

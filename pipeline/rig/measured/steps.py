@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -34,8 +34,9 @@ class Stretch:
         Of all edges of the stretch.
     start_s, end_s : float
         Its first and last edge [s], the transient included.
-    instant_error_s : float
-        Standard error of a rising edge [s].
+    instant_scatter_s, instant_error_s : float
+        Standard error of a rising edge [s]: what differs from edge to edge, and what all have in common,
+        which is up to half a sample where edges fall on the same place between two samples.
     direction : int
         1 if the frequency rose to this stretch, -1 if it fell, 0 if there is no other.
     """
@@ -44,6 +45,7 @@ class Stretch:
     timing: Timing
     start_s: float
     end_s: float
+    instant_scatter_s: float
     instant_error_s: float
     direction: int
 
@@ -204,9 +206,10 @@ def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
     sampled = own.resolution_s / math.sqrt(12)
     by_sampling = timing.jitter_s < 1.5 * sampled
     instants = line if by_sampling else rising
-    error = timing.jitter_s * math.sqrt(2 / rising.size) if by_sampling else sampled
+    scatter = timing.jitter_s * math.sqrt(2 / rising.size) if by_sampling else sampled
+    common = own.common_error(line - curve, timing.jitter_s)
     kept = Edges(instants[transient:], own.falling[own.falling > instants[transient]], own.resolution_s)
-    return Stretch(kept, timing, float(rising[0]), float(rising[-1]), error, 0)
+    return Stretch(kept, timing, float(rising[0]), float(rising[-1]), scatter, common, 0)
 
 
 def _line(rising: Floats) -> Floats:
@@ -228,7 +231,4 @@ def _directed(stretches: list[Stretch]) -> list[Stretch]:
         signs[i] = int(np.sign(change)) if abs(change) > slack else signs[i - 1]
     known = next((s for s in signs if s), 0)
     signs = [s or known for s in signs]
-    return [
-        Stretch(s.edges, s.timing, s.start_s, s.end_s, s.instant_error_s, sign)
-        for s, sign in zip(stretches, signs, strict=True)
-    ]
+    return [replace(s, direction=sign) for s, sign in zip(stretches, signs, strict=True)]
