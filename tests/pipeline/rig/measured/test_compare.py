@@ -36,8 +36,8 @@ def truth(pendulum, start, frequencies):
     """Periods along a sweep without noise, from other code: the engine's closure test on stepped walks."""
     packed = np.broadcast_to(pendulum.pack(), (1, len(frequencies), len(pendulum.names)))
     found = run_branches(
-        packed, np.array(frequencies)[None], np.array([start]), n_transient=600, n_keep=16, rtol=1e-8, atol=1e-8,
-        stop_when_closed=True, closure_tolerance=1e-5, system=pendulum.model.system,
+        packed, np.array(frequencies)[None], np.array([start]), n_transient=600, n_keep=16, rtol=1e-8,
+        atol=1e-8, stop_when_closed=True, closure_tolerance=1e-5, system=pendulum.model.system,
     )  # fmt: skip
     return found.orbit_period[0]
 
@@ -115,7 +115,7 @@ def test_compare__window_edges_lie_within_the_step(compared, swept, pendulum):
 def test_compare__a_model_that_is_off_is_far_and_its_windows_shift(
     measured, compared, run_directory, tmp_path
 ):
-    """With 10 % more inertia of a link the doublings lie 30 mHz lower, and the distances stand far above the noise."""
+    """With 10 % more inertia of a link the doublings lie 30 mHz lower, and distances far above the noise."""
     from pipeline.runs.run import run
 
     text = (run_directory / ".." / "spec.toml").resolve().read_text(

@@ -77,7 +77,7 @@ def test_find_period__a_split_of_the_size_of_noise_is_not_sure():
 
 
 def test_find_period__where_it_is_sure_it_is_right():
-    """Over splits from none to ten deviations: sure at both ends, unsure between, and never sure of the wrong."""
+    """Over splits from none to ten deviations: sure at both ends, unsure between, never sure of the wrong."""
     rng, sure = np.random.default_rng(7), []
     for seed in range(200):
         split = rng.uniform(0, 10e-3)
