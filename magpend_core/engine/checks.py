@@ -108,7 +108,7 @@ def check_system(
     subject = system if system.tangents_of is None else system.tangents_of
     if subject.recorded_for is not None:  # a recording has no period; all else is the system's own
         subject = subject.recorded_for
-        parameters = parameters[..., : len(subject.parameter_names)]
+    parameters = parameters[..., : len(subject.parameter_names)]
     key = (subject, jacobian or system.tangents_of is not None)
     if not frequency_hz.size or not len(states):
         return

@@ -1,5 +1,7 @@
 """Tangent vectors beside a trajectory: the system extended by its variational equations.
 
+`with_tangents` is for changes of the start, `with_parameter_tangent` for those of the parameters, too.
+
 The engine integrates the extended system like any other: the states of the system, then the tangent
 vectors one after the other, each driven by the analytic Jacobian along the trajectory. Only the
 system's own states enter the error control, so that the trajectory is, step by step, the one that it
@@ -106,3 +108,79 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> S
         quantities=None,
         tangents_of=system,
     )
+
+
+PLUS, MINUS, PER_STEP = "_plus", "_minus", "per_step"
+"""Endings of the names of parameters a step to either side, and the name of 1/(their difference)."""
+
+
+@cache
+def with_parameter_tangent(system: System) -> System:
+    """Return `system` extended by one tangent vector that also feels a change of the parameters.
+
+    The vector v obeys v' = J v + (f(c_plus) - f(c_minus)) per_step: the Jacobian J is analytic, the direct
+    effect of the parameters on the right-hand side f, and on the forcing, a central difference at each stage.
+    For a change of the start alone, all three sets of parameters are the same and the vector begins as that
+    change.
+
+    Parameters
+    ----------
+    system
+        What is linearised; needs its `jacobian`.
+
+    Returns
+    -------
+    System
+        With 2 n_states states, and three sets of parameters followed by ``per_step``: the system's own, then
+        those ending on ``_plus`` and ``_minus``.
+    """
+    n, m, nc = system.n_states, len(system.parameter_names), system.n_constants
+    bindings = {
+        "_rhs": system.rhs, "_jacobian": system.jacobian, "_layers": system.layers, "_edges": system.edges,
+        "_forcing": system.forcing, "_constants": system.constants,
+    }  # fmt: skip
+    home = system.rhs
+
+    def compiled(head: str, *lines: str) -> Any:
+        return _compile(
+            f"def function({head}):\n    " + "\n    ".join(lines) + "\n", "function", home, bindings
+        )
+
+    blocks = [
+        f"_constants(frequency, p[{k * m}:{(k + 1) * m}], out[{k * nc}:{(k + 1) * nc}])" for k in range(3)
+    ]
+    sets = [f"c{k} = c[{k * nc}:{(k + 1) * nc}]" for k in range(3)]
+    changes = ", ".join(
+        " + ".join(f"jacobian[{i * n + j}] * y[{n + j}]" for j in range(n))
+        + f" + (f1[{i}] - f2[{i}]) * c[{3 * nc}]"
+        for i in range(n)
+    )
+    own = ", ".join(f"f0[{i}]" for i in range(n))
+    return dataclasses.replace(
+        system,
+        name=f"{system.name}_parameter_tangent",
+        state_names=(*system.state_names, *(f"d{s}" for s in system.state_names)),
+        parameter_names=(
+            *(f"{name}{end}" for end in ("", PLUS, MINUS) for name in system.parameter_names), PER_STEP,
+        ),
+        n_constants=3 * nc + 1,
+        is_angle=(*system.is_angle, *[False] * n),
+        scales=(*system.scales, *[1.0] * n),
+        escape=(*system.escape, *[math.inf] * n),
+        n_controlled=system.controlled,
+        constants=compiled("frequency, p, out", *blocks, f"out[{3 * nc}] = p[{3 * m}]"),
+        # the time itself: each set of parameters has a forcing of its own
+        forcing=compiled("t, c", "return 1.0 * t"),
+        rhs=compiled(
+            "y, t, c", *sets, f"base = ({_first(n)},)",
+            *(f"u{k} = _forcing(t, c{k})" for k in range(3)),
+            *(f"f{k} = _rhs(base, u{k}, c{k})" for k in range(3)),
+            "jacobian = _jacobian(base, u0, c0)", f"return ({own}, {changes})",
+        ),
+        layers=compiled("y, dy, c", f"return _layers(y[:{n}], dy[:{n}], c[:{nc}])"),
+        edges=compiled("frequency, p, at, widths, jumps", f"_edges(frequency, p[:{m}], at, widths, jumps)"),
+        jacobian=None,
+        quantity_names=(),
+        quantities=None,
+        tangents_of=system,
+    )  # fmt: skip

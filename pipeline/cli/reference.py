@@ -129,14 +129,13 @@ def _text(text: str) -> str:
 
 def workflows() -> str:
     """Specifications that ship."""
-    from pipeline.runs.workflows import shipped_workflows
+    from pipeline.runs.workflows import shipped_identifications, shipped_workflows
 
     def title(path: Path) -> str:
         return str(tomllib.loads(path.read_text("utf-8")).get("title", ""))
 
-    return table(
-        ("workflow", "what it computes"), ((f"`{n}`", title(p)) for n, p in shipped_workflows().items())
-    )
+    shipped = {**shipped_workflows(), **shipped_identifications()}
+    return table(("workflow", "what it computes"), ((f"`{n}`", title(p)) for n, p in shipped.items()))
 
 
 # ---- specification -----------------------------------------------------------------------------

@@ -37,6 +37,8 @@ from pipeline.spec.tables import (
 )
 
 KINDS = ("sweep", "continuation")
+IDENTIFICATION = "identification"
+"""Kind of the specifications that `pipeline.rig.identify` reads."""
 MAX_TILE_BYTES = 256_000_000
 """Largest sections of the smallest tile that a refined grid can be cut into [bytes]."""
 
@@ -166,6 +168,8 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path = ".") -> Spec:
     SpecError
         With all problems at once.
     """
+    if data.get("kind") == IDENTIFICATION:
+        raise SpecError([f'kind = "{IDENTIFICATION}": is no run; use magpend identify SPEC --out DIR.'])
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
     data = _with_preset(data, folder, problems)
     kind, title, model = _kind(data, problems), _title(data, problems), _model(data, problems)

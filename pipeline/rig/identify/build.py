@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
 from magpend_core.sampling import Drive
 from pipeline.rig.edges import find_edges
 from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
@@ -37,10 +36,13 @@ class Built:
     problem : Problem
     held_out : tuple of Piece
         Judged afterwards, their starts alone refitted.
+    simulated : bool
+        Whether any of the recordings is simulated.
     """
 
     problem: Problem
     held_out: tuple[Piece, ...]
+    simulated: bool = False
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
     """
     problems: list[str] = []
     channels = channels_of(spec.model, spec.fit.channels, recordings, problems)
-    problems += _drive_problems(spec, recordings)
+    problems += drive_problems(spec.model, spec.recordings, recordings, "recordings")
     if problems:
         raise SpecError(problems)
     smoothed = [smooth(ds) for ds in recordings]
@@ -105,34 +107,13 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         raise SpecError(["recordings: all pieces are held out; leave some to be fitted."])
     problem = Problem(
         model=spec.model, fixed=spec.values, free=free_of(spec, channels, len(recordings)), channels=channels,
-        pieces=tuple(kept), noise=noise_of(channels, smoothed), tied=spec.tied, loss=spec.fit.loss,
+        pieces=tuple(kept), tied=spec.tied, loss=spec.fit.loss,
+        noise=noise_of(spec.model, channels, smoothed, spec.fit.noise),
         continuity=None if spec.fit.continuity == "free" else float(spec.fit.continuity), rtol=spec.fit.rtol,
         recorded=any(t.drive == "recorded" for t in spec.recordings),
     )  # fmt: skip
-    return Built(problem, tuple(replace(p, follows=-1) for p in held))
-
-
-def judging_problem(
-    problem: Problem, values: Parameters, zeros: dict[str, float], pieces: Sequence[Piece]
-) -> Problem:
-    """Return the problem in which all but the starts of some pieces is known.
-
-    Parameters
-    ----------
-    problem
-        What was fitted.
-    values
-        All parameters.
-    zeros
-        Sensors' zeros by the names of their unknowns.
-    pieces
-        To be judged.
-    """
-    free = tuple(f for f in problem.free if f.name in zeros)
-    own = replace(
-        problem, fixed=values, free=free, tied={}, pieces=tuple(pieces), loss="linear", continuity=None
-    )
-    return own.without(zeros)
+    simulated = any(bool(ds.attrs.get("simulated")) for ds in recordings)
+    return Built(problem, tuple(replace(p, follows=-1) for p in held), simulated)
 
 
 def channels_of(
@@ -146,8 +127,8 @@ def channels_of(
     measured = [[n for n in model.state_names if n in ds.data_vars] for ds in recordings]
     if wanted:
         problems += [
-            f"fit.channels: recordings[{i}] has no channel {name!r} (it has {', '.join(there) or 'none'}); map "
-            "it, or leave it out."
+            f"fit.channels: recordings[{i}] has no channel {name!r} (it has {', '.join(there) or 'none'}); "
+            "map it, or leave it out."
             for i, there in enumerate(measured)
             for name in wanted
             if name not in there
@@ -163,29 +144,31 @@ def channels_of(
     return chosen
 
 
-def _drive_problems(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> list[str]:
-    problems = [
-        f"recordings[{i}].drive = {table.drive!r}: its mapping names no drive channel; add [drive] there, "
-        'or set drive = "none".'
-        for i, (table, ds) in enumerate(zip(spec.recordings, recordings, strict=True))
-        if table.drive != "none" and DRIVE not in ds
-    ]
-    problems += [
-        f'recordings[{i}].drive = "recorded": its mapping calls the drive a signal, not a torque; use '
-        '"edges", or map a torque (kind = "torque").'
-        for i, (table, ds) in enumerate(zip(spec.recordings, recordings, strict=True))
-        if table.drive == "recorded" and DRIVE in ds and ds[DRIVE].attrs.get("kind") == "signal"
-    ]
-    kinds = {table.drive for table in spec.recordings}
+def drive_problems(
+    model: Model, tables: Sequence[RecordingTable], recordings: Sequence[xr.Dataset], where: str
+) -> list[str]:
+    """Say what is wrong with the drives of recordings: not there, of another kind, or not of one kind."""
+    problems = []
+    for i, (table, ds) in enumerate(zip(tables, recordings, strict=True)):
+        path = f"{where}[{i}].drive = {table.drive!r}"
+        if table.drive != "none" and DRIVE not in ds:
+            problems.append(
+                f'{path}: the mapping names no drive channel; add [drive] there, or set drive = "none".'
+            )
+        elif table.drive == "recorded" and ds[DRIVE].attrs.get("kind") == "signal":
+            problems.append(
+                f'{path}: the mapping calls the drive a signal, not a torque; use "edges", or map a torque '
+                '(kind = "torque").'
+            )
+    kinds = {table.drive for table in tables}
     if "edges" in kinds and len(kinds) > 1:
         problems.append(
-            'recordings: drive = "edges" cannot stand beside others in one identification; give all '
-            'recordings "edges", or none.'
+            f'{where}: drive = "edges" cannot stand beside others in one identification; give all recordings '
+            '"edges", or none.'
         )
-    if "edges" in kinds and DUTY not in spec.model.parameter_names:
+    if "edges" in kinds and DUTY not in model.parameter_names:
         problems.append(
-            f'recordings: drive = "edges" asks for a model with a parameter {DUTY}; {spec.model.name} has '
-            "none."
+            f'{where}: drive = "edges" asks for a model with a parameter {DUTY}; {model.name} has none.'
         )
     return problems
 
@@ -214,14 +197,25 @@ def free_of(spec: IdentificationSpec, channels: Sequence[str], n_recordings: int
     return tuple(found)
 
 
-def noise_of(channels: Sequence[str], smoothed: Sequence[xr.Dataset]) -> np.ndarray:
-    """Return the noise of each channel: the root mean square of that of the recordings [SI]."""
+def noise_of(
+    model: Model, channels: Sequence[str], smoothed: Sequence[xr.Dataset], stated: Mapping[str, float]
+) -> np.ndarray:
+    """Return the noise that channels are weighted with [SI].
+
+    It is that of the specification, else of the recordings, the same for all channels of one unit: what the
+    model lacks outweighs the sensors' noise in most rigs, and does not go by it.
+    """
+    noise = {}
+    for name in channels:
+        own = [float(ds[name].attrs.get("noise", math.nan)) for ds in smoothed]
+        spread = max(float(np.nanstd(ds[name].values)) for ds in smoothed)
+        rms = math.sqrt(float(np.nanmean(np.square(own)))) if np.isfinite(own).any() else 0.0
+        noise[name] = max(rms, LEAST_NOISE * spread) or LEAST_NOISE
     found = []
     for name in channels:
-        noise = [float(ds[name].attrs.get("noise", math.nan)) for ds in smoothed]
-        spread = [float(np.nanstd(ds[name].values)) for ds in smoothed]
-        rms = math.sqrt(float(np.nanmean(np.square(noise)))) if np.isfinite(noise).any() else 0.0
-        found.append(max(rms, LEAST_NOISE * max(spread)) or LEAST_NOISE)
+        unit = model.state(name).unit
+        alike = [noise[other] ** 2 for other in channels if model.state(other).unit == unit]
+        found.append(stated.get(name, math.sqrt(sum(alike) / len(alike))))
     return np.array(found)
 
 

@@ -49,7 +49,7 @@ IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES = (
 )  # fmt: skip
 _OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK})
 _ROOM = Path(__file__).parent
-_NOT_NUMBERS = ("figures.py", "directory.py", "reports.py")
+_NOT_NUMBERS = ("check.py", "directory.py", "figures.py", "reports.py", "residuals.py")
 """Modules that decide no number."""
 
 
@@ -257,40 +257,24 @@ class Outcomes:
         self._folder = folder
         self.recalled = 0
 
-    def keep(
-        self,
-        name: str,
-        compute: Callable[[], T],
-        pack: Callable[[T], Mapping[str, np.ndarray]],
-        unpack: Callable[[Mapping[str, np.ndarray]], T],
-    ) -> T:
-        """Return an outcome: the one that is there, else what `compute` gives, once it is on the disk.
-
-        Parameters
-        ----------
-        name
-            Of the outcome's file.
-        compute
-            Called if it is not there, or not whole.
-        pack, unpack
-            To arrays and back.
-        """
+    def recall(self, name: str, unpack: Callable[[Mapping[str, np.ndarray]], T]) -> T | None:
+        """Return an outcome if it is there, and whole."""
         path = self._folder / f"{name}.npz"
-        if is_there(path):
-            try:
-                with unreadable(path), np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as data:
-                    found = unpack({key: data[key] for key in data.files})
-            except (ValueError, KeyError, EOFError, BadZipFile):
-                pass
-            else:
-                self.recalled += 1
-                return found
-        result = compute()
+        if not is_there(path):
+            return None
+        try:
+            with unreadable(path), np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as data:
+                found = unpack({key: data[key] for key in data.files})
+        except (ValueError, KeyError, EOFError, BadZipFile):
+            return None
+        self.recalled += 1
+        return found
+
+    def store(self, name: str, packed: Mapping[str, np.ndarray]) -> None:
+        """Write an outcome whole."""
         buffer = io.BytesIO()
-        np.savez(buffer, **pack(result))  # type: ignore[arg-type]
-        write_atomically(path, buffer.getvalue())
-        # from the file, so that an identification that was stopped goes on with the very same numbers
-        return unpack(pack(result))
+        np.savez(buffer, **packed)  # type: ignore[arg-type]
+        write_atomically(self._folder / f"{name}.npz", buffer.getvalue())
 
 
 def write_result(directory: Path, result: Mapping[str, Any], files: Sequence[str]) -> None:

@@ -21,7 +21,7 @@ ALIKE = 0.99
 BY_PRIOR = 0.9
 """Share of a prior's standard deviation above which an estimate is its prior's."""
 
-NEVER = 1e-7
+NEVER = 1e-6
 """Share of the largest singular value below which one is zero to rounding."""
 
 

@@ -26,29 +26,35 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
 
     The fit's own slopes are compressed piece by piece; what is autocorrelated needs them along time.
     """
-    n_free = len(problem.free)
+    n_free, n_states = len(problem.free), len(problem.model.states)
     scale = loss_scale_of(problem, fit)
-    _, following = eliminate_starts(fit.jacobian, n_free)
     full = sample_slopes(problem, fit)
-    n_states = len(problem.model.states)
-    slopes = []
+    joined = problem.continuity is not None
+    follow = eliminate_starts(fit.jacobian, n_free)[1] if joined else None
+    slopes, following = [], []
     for k, own in enumerate(full):
-        follow = following[k * n_states : (k + 1) * n_states]
-        slopes.append(own[..., :n_free] - own[..., n_free:] @ follow)
+        flat = own.reshape(-1, own.shape[-1])
+        # pieces with free starts each have their own; the fit's one-sided differences would blur what is null
+        moves = (
+            eliminate_starts(flat, n_free)[1] if follow is None else follow[k * n_states : (k + 1) * n_states]
+        )
+        slopes.append(own[..., :n_free] - own[..., n_free:] @ moves)
+        following.append(-moves)
     prior = np.array([f.prior_sd**-2 if f.has_prior else 0.0 for f in problem.free])
     residuals = tuple(r / problem.noise for r in fit.residuals)
     information = _information(problem, fit, slopes, residuals, prior, scale)
     return Linearised(
-        information, prior, residuals, tuple(slopes), groups_of(problem), fit.starts.size, problem.loss, scale
-    )
+        information, prior, residuals, tuple(slopes), groups_of(problem), fit.starts.size, problem.loss,
+        scale, np.array(following),
+    )  # fmt: skip
 
 
 def _information(
     problem: Problem, fit: Fit, slopes: list[np.ndarray], residuals: tuple[np.ndarray, ...],
     prior: np.ndarray, scale: float,
 ) -> np.ndarray:  # fmt: skip
-    """Information of everything: of a robust loss with the curvature that it has, else that of the fit."""
-    if problem.loss == "linear":
+    """Information of everything: of the samples with the curvature of the loss, else that of the fit."""
+    if problem.continuity is not None:
         return eliminate_starts(fit.jacobian, len(problem.free))[0]
     total = np.diag(prior)
     for r, own in zip(residuals, slopes, strict=True):
@@ -60,7 +66,7 @@ def _information(
 
 
 def loss_scale_of(problem: Problem, fit: Fit) -> float:
-    """Scale of the residuals from which on the loss of a fit grows slower than the square; see `fit_local`."""
+    """Residual from which on the loss of a fit grows slower than the square; see `fit_local`."""
     if problem.loss == "linear":
         return 1.0
     z = np.concatenate(fit.residuals) / problem.noise

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magpend_core.sampling import sample
+from magpend_core.engine.system import System
+from magpend_core.engine.variational import MINUS, PLUS, with_parameter_tangent
+from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
 
 STEP = 1e-5
-"""Step of the differences, in units of an unknown's size: measured against the variational equations."""
+"""Step of the differences, in units of an unknown's size; slopes are good to 1e-5 to 1e-3 of the largest."""
+
+VARIATIONAL = "variational"
+"""The other choice of `Problem.slopes`."""
 
 SLOPES_RTOL = 1e-9
 """Largest tolerance where differences are taken."""
@@ -52,12 +57,12 @@ class Evaluation:
         return float(0.5 * self.rows @ self.rows)
 
 
-class _Lanes(NamedTuple):
-    """Which trajectory is what: of each member, its pieces, each as it is and with one thing changed."""
+class _Motions(NamedTuple):
+    """What the engine says of a population; `columns` are the states that were written."""
 
-    theta: Array  # (member, change, n_free)
-    start: Array  # (member, change, n_piece, n_states)
-    steps: Array  # (member, change): 0 for the first, which changes nothing
+    states: Array  # (member, piece, time, column)
+    slopes: Array  # (member, change, piece, time, column): by the moving unknowns, then by the own start
+    failed: NDArray[np.bool_]  # (member, piece)
 
 
 def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) -> list[Evaluation]:
@@ -71,67 +76,123 @@ def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) ->
     starts
         Starts of the pieces, shape (n, n_piece, n_states) [SI].
     slopes
-        Whether slopes are wanted; they are differences between lanes, one-sided.
+        Whether slopes are wanted; `Problem.slopes` says how they are taken.
 
     Returns
     -------
     list of Evaluation
     """
-    lanes = _lanes(problem, thetas, starts, slopes)
-    states, failed = _integrate(problem, lanes)
+    if not slopes:
+        motions = _without_slopes(problem, thetas, starts)
+    elif problem.slopes == VARIATIONAL:
+        motions = _by_tangents(problem, thetas, starts)
+    else:
+        motions = _by_differences(problem, thetas, starts)
     found = []
     for i in range(len(thetas)):
-        blocks = [
-            _block(problem, k, lanes, i, states[i, :, k], bool(failed[i, :, k].any()), slopes)
-            for k in range(len(problem.pieces))
-        ]
-        blocks += _gaps(problem, lanes, i, states[i], failed[i], slopes)
+        member = _Motions(motions.states[i], motions.slopes[i], motions.failed[i])
+        blocks = [_block(problem, k, thetas[i], member, slopes) for k in range(len(problem.pieces))]
+        blocks += _gaps(problem, starts[i], member, slopes)
         residuals = tuple(
-            p.measured - _read(problem, k, states[i, 0, k], thetas[i]) for k, p in enumerate(problem.pieces)
+            p.measured - _read(problem, k, member.states[k]) - problem.zeros[p.recording] @ thetas[i]
+            for k, p in enumerate(problem.pieces)
         )
         rows, jacobian = _with_priors(problem, thetas[i], blocks, slopes)
-        found.append(Evaluation(residuals, rows, jacobian, int(failed[i, 0].sum())))
+        found.append(Evaluation(residuals, rows, jacobian, int(member.failed.sum())))
     return found
 
 
-def _lanes(problem: Problem, thetas: Array, starts: Array, slopes: bool) -> _Lanes:
-    """Set the unknowns and starts of all trajectories; steps stay within the bounds."""
-    n, n_states = len(thetas), len(problem.model.states)
-    changes = [*problem.moving, *range(len(problem.free), len(problem.free) + n_states)] if slopes else []
-    theta = np.repeat(thetas[:, None], 1 + len(changes), axis=1)
-    start = np.repeat(starts[:, None], 1 + len(changes), axis=1)
-    steps = np.zeros((n, 1 + len(changes)))
-    for j, change in enumerate(changes, 1):
-        if change < len(problem.free):
-            f = problem.free[change]
-            h = STEP * np.maximum(np.abs(thetas[:, change]), f.size)
-            h = np.where(thetas[:, change] + h > f.upper, -h, h)
-            theta[:, j, change] += h
-            steps[:, j] = theta[:, j, change] - thetas[:, change]
-        else:
-            s = change - len(problem.free)
-            h = STEP * problem.model.scales[s]
-            start[:, j, :, s] += h
-            steps[:, j] = h
-    return _Lanes(theta, start, steps)
+def _without_slopes(problem: Problem, thetas: Array, starts: Array) -> _Motions:
+    states, failed = _integrate(problem, problem.pack(thetas)[:, None], starts[:, None], problem.rtol)
+    return _Motions(states[:, 0], np.zeros((len(thetas), 0)), failed[:, 0])
 
 
-def _integrate(problem: Problem, lanes: _Lanes) -> tuple[Array, NDArray[np.bool_]]:
-    """States (member, change, piece, time, n_states), and which trajectories failed."""
-    shape = lanes.start.shape[:3]
+def _steps(problem: Problem, thetas: Array) -> Array:
+    """Changes of the moving unknowns for differences, (member, change); they stay within the bounds."""
+    found = np.zeros((len(thetas), len(problem.moving)))
+    for j, i in enumerate(problem.moving):
+        f, values = problem.free[i], thetas[:, i]
+        h = STEP * np.maximum(np.abs(values), f.size)
+        h = np.where(values + h > f.upper, -h, h)
+        found[:, j] = (values + h) - values
+    return found
+
+
+def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
+    """Packed parameters (member, change, n_parameters), one moving unknown changed in each."""
+    members = []
+    for theta, own in zip(thetas, steps, strict=True):
+        rows = np.tile(theta, (len(own), 1))
+        rows[np.arange(len(own)), list(problem.moving)] += own
+        members.append(problem.pack(rows))
+    return np.stack(members)
+
+
+def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
+    """Slopes as one-sided differences between lanes: each has one unknown or state of its start changed."""
+    steps, n = _steps(problem, thetas), len(problem.model.states)
+    moves = STEP * np.diag(problem.model.scales)
+    packed = problem.pack(thetas)[:, None]
+    n_moving = len(problem.moving)
+    parameters = np.concatenate(
+        [packed, _changed(problem, thetas, steps), np.repeat(packed, n, axis=1)], axis=1
+    )
+    start = np.repeat(starts[:, None], 1 + n_moving + n, axis=1)
+    start[:, 1 + n_moving :] += moves[:, None, :]
+    tolerance = min(problem.rtol, SLOPES_RTOL)
+    states, failed = _integrate(problem, parameters, start, tolerance)
+    sizes = np.concatenate([steps, np.tile(np.diag(moves), (len(thetas), 1))], axis=1)
+    slopes = (states[:, 1:] - states[:, :1]) / sizes[:, :, None, None, None]
+    return _Motions(states[:, 0], slopes, np.asarray(failed.any(axis=1)))
+
+
+def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
+    """Slopes by the variational equations: a tangent vector for each unknown and each state of the starts."""
+    system, steps = with_parameter_tangent(problem.system), _steps(problem, thetas)
+    n, n_moving = len(problem.model.states), len(problem.moving)
+    same = np.repeat(problem.pack(thetas)[:, None], n_moving + n, axis=1)
+    plus, minus = same.copy(), same.copy()
+    plus[:, :n_moving] = _changed(problem, thetas, steps)
+    minus[:, :n_moving] = _changed(problem, thetas, -steps)
+    per_step = np.zeros((*same.shape[:2], 1))
+    per_step[:, :n_moving, 0] = 0.5 / steps
+    parameters = np.concatenate([same, plus, minus, per_step], axis=2)
+    start = np.zeros((len(thetas), n_moving + n, len(problem.pieces), 2 * n))
+    start[..., :n] = starts[:, None]
+    start[:, n_moving:, :, n:] = np.eye(n)[:, None]
+    states, failed = _integrate(problem, parameters, start, problem.rtol, system)
+    half = states.shape[-1] // 2
+    return _Motions(states[:, 0, ..., :half], states[..., half:], np.asarray(failed.any(axis=1)))
+
+
+def _integrate(
+    problem: Problem, parameters: Array, starts: Array, tolerance: float, system: System | None = None
+) -> tuple[Array, NDArray[np.bool_]]:
+    """States (member, change, piece, time, column) and which trajectories failed (member, change, piece)."""
+    shape, n = starts.shape[:3], len(problem.model.states)
     n_pieces = shape[2]
-    packed = problem.pack(lanes.theta.reshape(shape[0] * shape[1], len(problem.free)))
-    piece = np.tile(np.arange(n_pieces), shape[0] * shape[1])
-    grids = [_grid(problem, k) for k in range(n_pieces)]
-    drives = [p.drive for p in problem.pieces]
-    tolerance = min(problem.rtol, SLOPES_RTOL) if shape[1] > 1 else problem.rtol
+    columns = list(problem.columns) if problem.continuity is None else list(range(n))
+    if system is not None:
+        columns += [n + c for c in columns]
+    drives = [p.drive if system is None else _thrice(p.drive) for p in problem.pieces]
     found = sample(
-        problem.system, np.repeat(packed, n_pieces, axis=0), lanes.start.reshape(len(piece), -1), grids,
-        piece=piece, drives=drives if any(d is not None for d in drives) else None,
-        columns=None if problem.continuity is not None else problem.columns, rtol=tolerance, atol=tolerance,
+        problem.system if system is None else system,
+        np.repeat(parameters.reshape(-1, parameters.shape[-1]), n_pieces, axis=0),
+        starts.reshape(-1, starts.shape[-1]), [_grid(problem, k) for k in range(n_pieces)],
+        piece=np.tile(np.arange(n_pieces), shape[0] * shape[1]),
+        drives=drives if any(d is not None for d in drives) else None,
+        columns=columns, rtol=tolerance, atol=tolerance,
     )  # fmt: skip
     states = found.states.reshape(*shape, *found.states.shape[1:])
     return states, (found.status != int(Status.BOUNDED)).reshape(shape)
+
+
+def _thrice(drive: Drive | None) -> Drive | None:
+    """The drive for all three sets of parameters of `with_parameter_tangent`."""
+    if drive is None or not drive.names:
+        return drive
+    names = tuple(f"{name}{end}" for end in ("", PLUS, MINUS) for name in drive.names)
+    return replace(drive, names=names, values=np.tile(drive.values, 3))
 
 
 def _grid(problem: Problem, k: int) -> Array:
@@ -142,38 +203,36 @@ def _grid(problem: Problem, k: int) -> Array:
     return np.append(time, 2 * time[-1] - time[-2])
 
 
-def _read(problem: Problem, k: int, states: Array, theta: Array) -> Array:
-    """What the sensors read of computed states, (..., n, n_channels)."""
+def _read(problem: Problem, k: int, states: Array) -> Array:
+    """Channels among computed states at a piece's instants, (..., n, n_channels)."""
     n = len(problem.pieces[k].time)
-    offset = problem.zeros[problem.pieces[k].recording] @ theta
     read = states if problem.continuity is None else states[..., list(problem.columns)]
-    return np.asarray(read[..., :n, :] + offset)
+    return np.asarray(read[..., :n, :])
 
 
 def _block(
-    problem: Problem, k: int, lanes: _Lanes, i: int, states: Array, failed: bool, slopes: bool
+    problem: Problem, k: int, theta: Array, member: _Motions, slopes: bool
 ) -> tuple[int, Array, Array]:
     """A piece's number, rows and slopes by the unknowns and its own start, compressed."""
     piece, n_free = problem.pieces[k], len(problem.free)
     n_own = n_free + len(problem.model.states)
     given = np.isfinite(piece.measured)
-    base = _read(problem, k, states[0], lanes.theta[i, 0])
-    z = ((piece.measured - base) / problem.noise)[given]
-    if failed:
-        rows = np.full(given.sum(), LOST)
-        return k, (rows[: n_own + 1] if slopes else rows), np.zeros((min(len(rows), n_own + 1), n_own))
+    if member.failed[k]:
+        rows = np.full(min(int(given.sum()), n_own + 1) if slopes else int(given.sum()), LOST)
+        return k, rows, np.zeros((len(rows), n_own))
+    offset = problem.zeros[piece.recording] @ theta
+    z = ((piece.measured - _read(problem, k, member.states[k]) - offset) / problem.noise)[given]
     rows, factor = _robust(z, problem)
     if not slopes:
         return k, rows, np.zeros((len(rows), n_own))
     jacobian = np.zeros((len(rows), n_own))
-    order = [*problem.moving, *range(n_free, n_own)]
-    for j, column in enumerate(order, 1):
-        moved = _read(problem, k, states[j], lanes.theta[i, 0])
-        jacobian[:, column] = ((base - moved) / problem.noise)[given] / lanes.steps[i, j] * factor
     zero = -problem.zeros[piece.recording] / problem.noise[:, None]
-    jacobian[:, :n_free] += np.broadcast_to(zero, (*given.shape, n_free))[given] * factor[:, None]
+    jacobian[:, :n_free] = np.broadcast_to(zero, (*given.shape, n_free))[given]
+    moved = -_read(problem, k, member.slopes[:, k]) / problem.noise
+    jacobian[:, [*problem.moving, *range(n_free, n_own)]] += moved[:, given].T
     # an orthogonal transformation changes neither the cost nor the normal equations
-    triangle: Array = np.linalg.qr(np.column_stack([jacobian, rows]), mode="r")  # type: ignore[assignment]
+    whole = np.column_stack([jacobian * factor[:, None], rows])
+    triangle: Array = np.linalg.qr(whole, mode="r")  # type: ignore[assignment]
     return k, triangle[:, -1], triangle[:, :-1]
 
 
@@ -196,9 +255,7 @@ def _robust(z: Array, problem: Problem) -> tuple[Array, Array]:
     return rows, np.where(rows == 0.0, 1.0, slope * z / safe)
 
 
-def _gaps(
-    problem: Problem, lanes: _Lanes, i: int, states: Array, failed: NDArray[np.bool_], slopes: bool
-) -> list[tuple[int, Array, Array]]:
+def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> list[tuple[int, Array, Array]]:
     """Rows of the gaps between stretches and their successors; slopes by the unknowns and by both starts."""
     if problem.continuity is None:
         return []
@@ -209,13 +266,12 @@ def _gaps(
         j = piece.follows
         if j < 0:
             continue
-        end = states[:, j, len(problem.pieces[j].time)]
-        rows = np.full(n_states, LOST) if failed[:, j].any() else (end[0] - lanes.start[i, 0, k]) * weight
+        at, lost = len(problem.pieces[j].time), member.failed[j]
+        rows = np.full(n_states, LOST) if lost else (member.states[j, at] - starts[k]) * weight
         jacobian = np.zeros((n_states, n_free + 2 * n_states))
-        if slopes and not failed[:, j].any():
-            order = [*problem.moving, *range(n_free, n_free + n_states)]
-            for change, column in enumerate(order, 1):
-                jacobian[:, column] = (end[change] - end[0]) * weight / lanes.steps[i, change]
+        if slopes and not lost:
+            columns = [*problem.moving, *range(n_free, n_free + n_states)]
+            jacobian[:, columns] = (member.slopes[:, j, at] * weight).T
             jacobian[:, n_free + n_states :] = -np.diag(weight)
         found.append((-1 - k, rows, jacobian))
     return found

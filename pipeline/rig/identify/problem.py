@@ -109,6 +109,8 @@ class Problem:
         Weight of the gap between a stretch's end and the next one's start; None leaves the starts free.
     rtol : float
         Tolerance of the integration, relative and absolute.
+    slopes : str
+        How slopes are taken: ``differences`` between lanes or ``variational`` equations.
     recorded : bool
         Whether the pieces' drives are measured torques instead of the model's own drive.
     """
@@ -124,6 +126,7 @@ class Problem:
     loss_scale: float = 1.0
     continuity: float | None = None
     rtol: float = 1e-8
+    slopes: str = "differences"
     recorded: bool = False
 
     @cached_property

@@ -2,8 +2,7 @@
 
 Far from the truth a long piece is out of step with its recording and the cost is rugged. Short stretches
 from smoothed states are not, so a guess is first fitted to those, then to longer ones, and to the whole
-pieces
-with free starts at last (multiple shooting: Bezruchko et al., Chaos Solitons Fractals 29, 2006, 82).
+pieces with free starts at last (multiple shooting: Bezruchko et al., Chaos Solitons Fractals 29, 2006, 82).
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ Array = NDArray[np.float64]
 STRETCHES = (0.35, 0.8, 1.8)
 """Lengths of stretches in periods of the slowest oscillation of the recordings, before whole pieces."""
 
-STAGE_EVALUATIONS = 25
+STAGE_EVALUATIONS, STAGE_TOLERANCE = 25, 1e-4
 STAGE_SAMPLES = 40
 """Samples of a stretch that are looked at before whole pieces."""
 
@@ -115,6 +114,8 @@ def guess(
     problem: Problem, n_starts: int, seed: int, spread: float, method: str, n_samples: int, shortest: Problem
 ) -> list[Array]:
     """Return first guesses, the problem's own first."""
+    if n_starts == 1:
+        return [problem.start]
     if method == "cma":
         return [
             problem.start,
@@ -173,7 +174,9 @@ def refine(
 ) -> Fit:
     """Fit from one first guess: short stretches, longer ones, whole pieces with free starts."""
     for stage in _stages(problem) if stages is None else stages:
-        fit = fit_local(stage, theta, free_starts=False, max_evaluations=STAGE_EVALUATIONS)
+        fit = fit_local(
+            stage, theta, free_starts=False, max_evaluations=STAGE_EVALUATIONS, tolerance=STAGE_TOLERANCE
+        )
         if np.isfinite(fit.cost):
             theta = fit.theta
     return fit_local(problem, theta, echo=echo)

@@ -17,12 +17,12 @@ from magpend_core.models.parameters import (
     Parameters,
     near_names,
 )
+from magpend_core.models.presets import is_file
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
 from pipeline.spec.files import read_toml
+from pipeline.spec.parsing import IDENTIFICATION
 from pipeline.spec.problems import SpecError, unknown_choice, unknown_key
 from pipeline.spec.tables import Table
-
-KIND = "identification"
 
 
 class SensorsTable(Table):
@@ -48,6 +48,7 @@ class FitTable(Table):
     channels: Annotated[tuple[str, ...], Field(strict=False)] = ()
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
     continuity: Literal["free"] | Annotated[float, Field(gt=0, strict=False)] = "free"
+    noise: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
     decimate: Annotated[int, Field(ge=1)] = 1
     rtol: Annotated[float, Field(gt=0, le=1e-3)] = 1e-8
 
@@ -99,6 +100,11 @@ class IdentificationSpec:
     search: SearchTable
     folder: Path
 
+    @property
+    def preset_found(self) -> str | Path | None:
+        """The preset as `Model.preset` takes it."""
+        return _found(self.preset, self.folder)
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the identified parameters."""
@@ -111,7 +117,7 @@ class IdentificationSpec:
     def as_dict(self) -> dict[str, Any]:
         """Plain data with all defaults filled in, the title left out; equal for equal identifications."""
         return {
-            "kind": KIND,
+            "kind": IDENTIFICATION,
             "model": self.model.name,
             "values": self.values.as_dict(),
             "identify": {
@@ -165,9 +171,9 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     if kind in ("sweep", "continuation"):
         raise SpecError([f'kind = "{kind}": is a run, not an identification; use magpend run.'])
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
-    if kind != KIND:
-        missing = f'kind: missing; add kind = "{KIND}".'
-        problems.append(missing if kind is None else unknown_choice("kind", kind, [KIND]))
+    if kind != IDENTIFICATION:
+        missing = f'kind: missing; add kind = "{IDENTIFICATION}".'
+        problems.append(missing if kind is None else unknown_choice("kind", kind, [IDENTIFICATION]))
     title, preset = (_text(data, key, problems) for key in ("title", "preset"))
     model = _model(data, problems)
     sensors = _table(data, "sensors", SensorsTable, problems)
@@ -177,7 +183,7 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     if model is None:
         raise SpecError(problems)
     problems += _channel_problems(model, sensors, fit)
-    own = ParameterTables(data, model, preset, problems)
+    own = ParameterTables(data, model, _found(preset, folder), problems)
     if problems:
         raise SpecError(problems)
     assert own.values is not None
@@ -193,6 +199,11 @@ def _text(data: Mapping[str, Any], key: str, problems: list[str]) -> str | None:
         problems.append(f"{key} = {value!r}: must be a text in quotes.")
         return None
     return value
+
+
+def _found(preset: str | None, folder: Path) -> str | Path | None:
+    """A preset's name, or the path of its file."""
+    return folder / preset if preset is not None and is_file(preset) else preset
 
 
 def _model(data: Mapping[str, Any], problems: list[str]) -> Model | None:
@@ -249,6 +260,7 @@ def _channel_problems(model: Model, sensors: SensorsTable | None, fit: FitTable 
     named = {
         "sensors.zero": sensors.zero if sensors is not None else (),
         "fit.channels": fit.channels if fit is not None else (),
+        "fit.noise": tuple(fit.noise) if fit is not None else (),
     }
     known = model.state_names
     problems = [

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, ValidationError
@@ -90,7 +91,7 @@ class ParameterTables:
     """Values, unknowns and ties, checked against the model and each other."""
 
     def __init__(
-        self, data: Mapping[str, Any], model: Model, preset: str | None, problems: list[str]
+        self, data: Mapping[str, Any], model: Model, preset: str | Path | None, problems: list[str]
     ) -> None:
         self._model, self._problems = model, problems
         identified = table_at(data, "identify", problems)
@@ -110,7 +111,7 @@ class ParameterTables:
         if self.values is not None and not problems:
             self._check_together()
 
-    def _values(self, preset: str | None) -> Parameters | None:
+    def _values(self, preset: str | Path | None) -> Parameters | None:
         try:
             self._model.load(preset)
         except ParameterError as error:

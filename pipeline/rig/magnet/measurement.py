@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,7 +24,7 @@ from magpend_core.models.parameters import ParameterError, Parameters
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.presets import find_preset
 from pipeline.spec.files import read_toml
-from pipeline.spec.problems import SpecError, unknown_choice, validated
+from pipeline.spec.problems import SpecError, unknown_choice, unknown_name, validated
 from pipeline.spec.tables import Table
 
 MIN_READINGS = 5
@@ -85,10 +86,10 @@ class SideColumn(Table):
 
 
 class Tie(Table):
-    """What hangs on link 1 of the tie that holds it."""
+    """What hangs on the upper link of the tie that holds it."""
 
     mass_kg: float = Field(ge=0, description="Mass that hangs on the link [kg].")
-    lever_m: float = Field(ge=0, description="From joint 1 along link 1 to where it hangs [m].")
+    lever_m: float = Field(ge=0, description="From the upper joint along the link to where it hangs [m].")
 
 
 class Correction(Table):
@@ -106,7 +107,7 @@ class Correction(Table):
     def _once(self) -> Correction:
         if self.without is not None and (self.weights or self.tie is not None):
             raise ValueError(
-                "readings without the magnets have the weights already; set weights = false, no tie."
+                "readings without the magnets have the weights already; set weights = false and drop tie."
             )
         return self
 
@@ -140,7 +141,7 @@ class Header(Table):
     synthesis: dict[str, Any] = Field({}, description="How synthetic readings were made; for people.")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Curve:
     """The readings of one locked angle on one side.
 
@@ -213,12 +214,36 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
         rows = np.flatnonzero(side == code)
         rows = rows[np.argsort(locked[rows], kind="stable")]
         breaks = np.flatnonzero(np.diff(locked[rows]) > SAME_ANGLE) + 1
-        found += [Curve(code, float(locked[r].mean()), np.sort(r)) for r in np.split(rows, breaks) if len(r)]
+        found += [
+            Curve(code, float(np.median(locked[r])), np.sort(r)) for r in np.split(rows, breaks) if len(r)
+        ]
     return tuple(found)
+
+
+def find_measurement(name: str | Path) -> Path:
+    """Return the path of a header: a file, or the bare name of a measurement that ships.
+
+    Raises
+    ------
+    SpecError
+        If there is neither.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    shipped = {p.stem: p for p in sorted(Path(str(resources.files("workflows"))).glob("magnet/*.toml"))}
+    if str(name) in shipped:
+        return shipped[str(name)]
+    raise SpecError([f"{name}: no such file; {unknown_name('measurement', str(name), shipped)}"])
 
 
 def read_measurement(path: str | Path) -> Measurement:
     """Read a header and its table.
+
+    Parameters
+    ----------
+    path
+        Of the header; see `find_measurement`.
 
     Raises
     ------

@@ -141,8 +141,9 @@ def step_of(channel: Channel) -> float:
     if usual > 0.0 and np.mean(steps == 0.0) < REPEATING:
         return usual
     # stamps coarser than the sampling repeat: their mean, without the gaps
-    mean = (channel.time[-1] - channel.time[0]) / len(steps)
-    short = steps[steps <= GAP_STEPS * mean + steps[steps > 0.0].min(initial=mean)]
+    mean = float(steps.mean())
+    grain = float(steps[steps > 0.0].min(initial=np.inf))
+    short = steps[steps <= GAP_STEPS * mean + grain]
     return float(short.mean()) if short.size else mean
 
 

@@ -92,6 +92,11 @@ def smooth(
     return result.assign_attrs(smoothing=f"local polynomials of order {order}")
 
 
+def _least(order: int) -> int:
+    """Samples of the shortest window: odd, and more than a polynomial takes."""
+    return order + 2 + (order + 1) % 2
+
+
 def _checked(window_s: float | None, order: int, step: float) -> int | None:
     """Return the samples of a window that is asked for, an odd number."""
     problems = []
@@ -101,7 +106,7 @@ def _checked(window_s: float | None, order: int, step: float) -> int | None:
     if width is not None and width < order + 2:
         problems.append(
             f"window_s = {window_s!r}: holds {max(width, 0)} samples; polynomials of order {order} need at "
-            f"least {order + 2 + order % 2}, which is {(order + 2 + order % 2) * step:.6g} s."
+            f"least {_least(order)}, which is {_least(order) * step:.6g} s."
         )
     if problems:
         raise SpecError(problems)
@@ -181,7 +186,7 @@ def _fit(values: np.ndarray, parts: np.ndarray, width: int | None, order: int, s
 
 def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
     """Window with the least error of prediction."""
-    first = order + 2 + order % 2
+    first = _least(order)
     lengths = np.diff(parts, axis=1).ravel()
     used = parts[np.concatenate([[0], np.cumsum(lengths)[:-1]]) < MOST_SAMPLES] if len(parts) else parts
     longest = int(lengths.max(initial=first))

@@ -84,30 +84,27 @@ def test_read_info__damaged(begun):
         d.read_info(begun.directory)
 
 
-def same(x):
-    return x
+def test_outcomes__come_back_bit_by_bit(tmp_path):
+    outcomes = d.Outcomes(tmp_path)
+    value = {"theta": np.array([0.1, 1 / 3]), "message": np.array("ended")}
+    assert outcomes.recall("start-0", dict) is None
+    outcomes.store("start-0", value)
+    found = outcomes.recall("start-0", dict)
+    assert found is not None
+    np.testing.assert_array_equal(found["theta"], value["theta"])
+    assert str(found["message"]) == "ended"
+    assert outcomes.recalled == 1
 
 
-def test_outcomes__are_computed_once(tmp_path):
+def test_outcomes__one_that_is_not_whole_is_not_there(tmp_path):
     outcomes = d.Outcomes(tmp_path)
     value = {"theta": np.array([0.1, 1 / 3])}
-    first = outcomes.keep("start-0", lambda: value, same, same)
+    outcomes.store("start-0", value)
     data = (tmp_path / "start-0.npz").read_bytes()
-    again = outcomes.keep("start-0", lambda: pytest.fail("computed twice"), same, same)
-    np.testing.assert_array_equal(first["theta"], again["theta"])
-    assert outcomes.recalled == 1
     (tmp_path / "start-0.npz").write_bytes(data[:-30])
-    assert outcomes.keep("start-0", lambda: value, same, same)["theta"][1] == 1 / 3
+    assert outcomes.recall("start-0", dict) is None
+    outcomes.store("start-0", value)
     assert (tmp_path / "start-0.npz").read_bytes() == data
-
-
-def test_outcomes__leave_nothing_of_one_that_failed(tmp_path):
-    def fail():
-        raise ArithmeticError
-
-    with pytest.raises(ArithmeticError):
-        d.Outcomes(tmp_path).keep("start-0", fail, same, same)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_is_complete__looks_at_every_file(begun):

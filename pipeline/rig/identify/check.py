@@ -1,0 +1,87 @@
+"""Judge an identification on another recording: the starts of its pieces alone are refitted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magpend_core.models import load_model
+from magpend_core.models.parameters import Parameters
+from pipeline.rig.identify.build import drive_problems, pieces_of
+from pipeline.rig.identify.directory import Info, read_info, read_result
+from pipeline.rig.identify.identification import require_starts
+from pipeline.rig.identify.judging import judge
+from pipeline.rig.identify.problem import Free, Problem
+from pipeline.rig.identify.specification import RecordingTable
+from pipeline.rig.recordings import parse_mapping, read_recording, smooth
+from pipeline.spec.problems import SpecError
+
+
+def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dict[str, Any]:
+    """Judge an identification on another recording.
+
+    Pieces are as they are in the file, whole, each with a free start; every sample counts, and the criterion
+    is that of least squares whatever the loss of the fit. Sensors' zeros stay as identified.
+
+    Parameters
+    ----------
+    directory
+        Of a finished identification.
+    recording
+        A file with the channels of a recording that was fitted.
+    like
+        Number of that recording: its mapping, drive and zeros are taken.
+
+    Returns
+    -------
+    dict
+        ``rms`` and ``correlation`` by channel [SI], ``pieces`` with the rms of each, ``units`` by channel,
+        ``file``, ``sha256`` and ``directory``.
+
+    Raises
+    ------
+    SpecError
+        If the recording cannot be read through the mapping, or its pieces are too short.
+    RefusedError
+        If the identification is not finished.
+    NotConvergedError
+        If the starts could not be fitted.
+    """
+    info, result = read_info(directory), read_result(directory)
+    tables = info.identity["spec"]["recordings"]
+    if not 0 <= like < len(tables):
+        raise SpecError([f"like = {like}: there are recordings 0 to {len(tables) - 1}."])
+    table = RecordingTable(file=str(recording), mapping="", drive=tables[like]["drive"])
+    ds = read_recording(recording, parse_mapping(info.mappings[like], f"mapping of recording {like}"))
+    model = load_model(result["model"])
+    channels = tuple(result["channels"])
+    missing = [name for name in channels if name not in ds]
+    problems = [
+        f"{recording}: has no channel {name!r}; it must have those that were fitted." for name in missing
+    ]
+    problems += drive_problems(model, [table], [ds], str(recording))
+    if problems:
+        raise SpecError(problems)
+    pieces = pieces_of(model, channels, (ds, smooth(ds)), table, like)
+    zeros = result["zeros"]
+    free = tuple(Free(name, value) for name, value in zeros.items())
+    problem = Problem(
+        model=model, fixed=Parameters(model, result["values"]), free=free,
+        channels=channels, pieces=tuple(pieces), noise=np.array([result["noise"][c] for c in channels]),
+        rtol=_rtol(info), recorded=table.drive == "recorded",
+    )  # fmt: skip
+    judgement, fit = judge(problem, result["values"], zeros, pieces)
+    require_starts(fit, f"pieces of {recording}")
+    return {
+        "directory": str(directory),
+        "file": Path(recording).name,
+        "sha256": ds.attrs["sha256"],
+        "units": {c: model.state(c).unit for c in channels},
+        **judgement.as_dict(),
+    }
+
+
+def _rtol(info: Info) -> float:
+    return float(info.identity["spec"]["fit"]["rtol"])

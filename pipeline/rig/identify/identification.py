@@ -1,0 +1,336 @@
+"""From a specification's file to a finished identification, or what is missing of one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magpend_core.sampling import Drive
+from pipeline.products.reporting import report, track
+from pipeline.rig.identify import directory as store
+from pipeline.rig.identify import identifiability, reports
+from pipeline.rig.identify.build import Built, build, read_all
+from pipeline.rig.identify.directory import Outcomes, Source
+from pipeline.rig.identify.judging import judge, judge_fit
+from pipeline.rig.identify.linearise import linearise, loss_scale_of
+from pipeline.rig.identify.local import Fit, fit_local
+from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.problem import ZERO, Problem
+from pipeline.rig.identify.profiles import Curvature, Profile, following, profile
+from pipeline.rig.identify.search import search
+from pipeline.rig.identify.specification import IdentificationSpec, load_identification
+from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
+from pipeline.runs.workflows import default_directory, find_spec
+from pipeline.spec.problems import SpecError
+from pipeline.store.files import FIGURES, local_path, writer_lock
+
+Echo = Callable[[str], None]
+
+NEAR_BOUND = 1e-4
+"""Distance to a bound, as a share of a parameter's size, at which an estimate lies on it."""
+
+
+SAME_MOTION = 1e-3
+"""Difference of two motions, as a share of the measured spread, that the integration does not make."""
+
+
+class NotConvergedError(ArithmeticError):
+    """No start converged: there is no result."""
+
+
+def identify(
+    spec: str | Path, out: str | Path | None = None, *, figures: bool = True, echo: Echo = print
+) -> dict[str, Any]:
+    """Identify what a specification asks for, or what is missing of it.
+
+    Parameters
+    ----------
+    spec
+        Path of a TOML file, or the name of a shipped workflow.
+    out
+        Directory; by default ``runs/<name>``.
+    figures
+        Whether to draw.
+    echo
+        Prints a line.
+
+    Returns
+    -------
+    dict
+        What ``result.json`` holds.
+
+    Raises
+    ------
+    SpecError, RefusedError, LockedError
+        Before anything is computed; `SpecError` also after the first evaluation, for a parameter that the
+        data cannot see.
+    NotConvergedError
+        If no start converged. The outcomes stay, a result is not written.
+    """
+    path = find_spec(spec)
+    parsed = load_identification(path)
+    folder = directory_of(spec, out)
+    sources = store.sources_of(parsed)
+    store.check(folder, store.identity_of(parsed, sources))
+    built = build(parsed, read_all(parsed))
+    refuse_invisible(built.problem)
+    with writer_lock(folder):
+        info = store.establish(folder, parsed, sources, path.read_text("utf-8"))
+        if store.is_complete(folder):
+            echo(f"{folder} is complete; nothing to do.")
+            return store.read_result(folder)
+        outcomes = Outcomes(folder / store.OUTCOMES)
+        found = find(parsed, built, outcomes, echo)
+        if outcomes.recalled:
+            echo(f"{outcomes.recalled} outcomes were there before")
+        return _write(folder, parsed, found, sources, info.digest, figures, built.simulated)
+
+
+def directory_of(spec: str | Path, out: str | Path | None) -> Path:
+    """Where an identification goes: `out`, or ``runs/<name>``."""
+    return local_path(out) if out is not None else default_directory(find_spec(spec), False)
+
+
+def _write(
+    folder: Path, spec: IdentificationSpec, found: reports.Finding, sources: list[Source], digest: str,
+    figures: bool, simulated: bool,
+) -> dict[str, Any]:  # fmt: skip
+    reports.write_values(folder / store.PRESET, spec, found, sources)
+    residuals = reports.residuals_of(spec, found)
+    if simulated:
+        residuals = residuals.assign_attrs(simulated=1)
+    residuals.to_netcdf(folder / store.RESIDUALS, engine="scipy", format="NETCDF3_64BIT")
+    result = reports.result_of(spec, found, sources, digest)
+    files = [store.PRESET, store.RESIDUALS]
+    if figures:
+        from pipeline.rig.identify.figures import draw_all
+
+        report("drawing", 0, 0)
+        (folder / FIGURES).mkdir(exist_ok=True)
+        files += [f"{FIGURES}/{name}" for name in draw_all(folder / FIGURES, residuals, result)]
+    store.write_result(folder, result, files)
+    return store.read_result(folder)
+
+
+def refuse_invisible(problem: Problem) -> None:
+    """Refuse unknowns on which no residual depends, by a first evaluation.
+
+    Raises
+    ------
+    SpecError
+        Naming them all; also if the trajectories diverge at the start.
+    """
+    first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
+    if _is_driven(problem):
+        raise SpecError([
+            'recordings: drive = "none", but the model is driven with these parameters; set the amplitude of '
+            "its drive to 0 under [parameters]."
+        ])  # fmt: skip
+    if first.failed:
+        raise SpecError([
+            f"identify: at the start, the trajectories of {first.failed} of {len(problem.pieces)} pieces "
+            "diverge; give starts that are nearer."
+        ])  # fmt: skip
+    columns = first.jacobian[:, : len(problem.free)]
+    n_priors = sum(f.has_prior for f in problem.free)
+    data = columns[: len(columns) - n_priors]
+    names = identifiability.invisible(data.T @ data, problem.names)
+    if names:
+        raise SpecError([
+            f"identify.{name}: the recordings do not depend on it at all, at the start; fix it under "
+            "[parameters], give others values with which it matters, or add a recording in which it does."
+            for name in names
+        ])  # fmt: skip
+
+
+def _is_driven(problem: Problem) -> bool:
+    """Whether a motion without a drive depends on the period that it would have."""
+    piece = problem.pieces[0]
+    if piece.drive is not None:
+        return False
+    motions = []
+    for share in (0.37, 0.61):
+        duration = share * float(piece.time[-1])
+        drive = Drive(np.full(math.ceil(1 / share), duration))
+        one = replace(problem, pieces=(replace(piece, drive=drive, follows=-1),), continuity=None)
+        found = evaluate(one, problem.start[None], piece.start[None, None], slopes=False)[0]
+        motions.append(found.residuals[0])
+    spread = np.nanstd(piece.measured, axis=0)
+    return bool((np.nanmax(np.abs(motions[0] - motions[1]), axis=0) > SAME_MOTION * spread).any())
+
+
+def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo) -> reports.Finding:
+    """Search, judge, and say how sure it is.
+
+    Raises
+    ------
+    NotConvergedError
+        If no start converged.
+    """
+    problem, table = built.problem, spec.search
+    keep = Kept(outcomes)
+    fits = search(
+        problem, n_starts=table.n_starts, seed=table.seed, spread=table.spread, method=table.method,
+        n_samples=table.n_samples, keep=keep, tell=echo,
+    )  # fmt: skip
+    best = fits[0]
+    if not best.converged:
+        raise NotConvergedError(
+            f"none of {len(fits)} starts converged (the best: {best.message}, cost {best.cost:.6g}), "
+            "so there is no result. Give starts that are nearer, shorter pieces (piece_s), more starts "
+            "(search.n_starts) or narrower bounds."
+        )
+    report("how sure it is", 0, 0)
+    linear = linearise(problem, best)
+    scale = _sizes(problem, best)
+    covariance = covariance_of(linear, scale)
+    directions = identifiability.directions_of(
+        linear.information - np.diag(linear.prior), scale, covariance.inflation
+    )
+    held = None
+    if built.held_out:
+        held, fit = judge(
+            problem, problem.values(best.theta), reports.zeros_of(problem, best), built.held_out
+        )
+        require_starts(fit, "held-out pieces")
+    at_bound = _at_bound(problem, best, scale)
+    found = reports.Finding(
+        problem, keep.fits, best, covariance, directions, judge_fit(problem, best), held,
+        dict(zip(problem.channels, n_effective(linear.residuals), strict=True)), at_bound,
+    )  # fmt: skip
+    profiles = _profiles(found, linear, scale, outcomes) if table.profiles else {}
+    return replace(found, profiles=profiles, warnings=_warnings(found, profiles))
+
+
+def require_starts(fit: Fit, what: str) -> None:
+    """Refuse to judge by starts that were not found; raises `NotConvergedError`."""
+    if not fit.converged:
+        raise NotConvergedError(
+            f"the starts of the {what} did not converge ({fit.message}), so there is nothing to judge by."
+        )
+
+
+def _sizes(problem: Problem, best: Fit) -> np.ndarray:
+    measured = np.concatenate([p.measured for p in problem.pieces])
+    spread = dict(zip(problem.channels, np.nanstd(measured, axis=0), strict=True))
+    sensed = [spread[f.name.split(".")[1]] if f.name.startswith(f"{ZERO}.") else np.nan for f in problem.free]
+    return identifiability.sizes_of(best.theta, problem.start, problem.lower, problem.upper, np.array(sensed))
+
+
+def _at_bound(problem: Problem, best: Fit, scale: np.ndarray) -> list[str]:
+    found = []
+    for value, low, high, size in zip(best.theta, problem.lower, problem.upper, scale, strict=True):
+        near = NEAR_BOUND * size
+        found.append("lower" if value - low <= near else "upper" if high - value <= near else "")
+    return found
+
+
+def _warnings(found: reports.Finding, profiles: Mapping[str, Profile]) -> list[str]:
+    problem = found.problem
+    sd = np.array([f.prior_sd for f in problem.free])
+    lines = identifiability.warnings_of(problem.names, found.directions, found.covariance, sd, found.at_bound)
+    lines += [
+        f"the profile of {name} passes a better fit than the best; raise search.n_starts."
+        for name, p in profiles.items()
+        if p.lowest < -0.1
+    ]
+    if found.n_same < len(found.starts) / 2:
+        lines.append(
+            f"only {found.n_same} of {len(found.starts)} starts reached the best optimum: there may be a "
+            "better one; raise search.n_starts, or cut pieces (piece_s)."
+        )
+    return lines
+
+
+def _profiles(
+    found: reports.Finding, linear: Linearised, scale: np.ndarray, outcomes: Outcomes
+) -> dict[str, Profile]:
+    problem, best = found.problem, found.best
+    if problem.loss != "linear":
+        problem = replace(problem, loss_scale=loss_scale_of(problem, best))
+        again = evaluate(problem, best.theta[None], best.starts[None], slopes=False)[0]
+        best = replace(best, cost=again.cost)
+    plain = _plain_errors(linear, scale)
+    covariance: Covariance = found.covariance
+    profiles = {}
+    for i, name in track(list(enumerate(problem.names)), "profiles"):
+        kept = outcomes.recall(f"profile-{name}", partial(_unpack_profile, name))
+        if kept is None:
+            moves = following(linear.information, i)
+            starts = np.zeros_like(best.starts) if linear.following is None else linear.following @ moves
+            error, size = float(covariance.errors[i]), float(scale[i])
+            about = Curvature(error, float(plain[i]), covariance.critical, size, moves, starts)
+            kept = profile(problem, best, name, about, fit_local)
+            interval = np.array(kept.interval)
+            outcomes.store(
+                f"profile-{name}", {"values": kept.values, "growth": kept.growth, "interval": interval}
+            )
+        profiles[name] = kept
+    return profiles
+
+
+def _unpack_profile(name: str, data: Mapping[str, np.ndarray]) -> Profile:
+    low, high = (float(v) for v in data["interval"])
+    return Profile(name, data["values"], data["growth"], (low, high))
+
+
+def _plain_errors(linear: Linearised, scale: np.ndarray) -> np.ndarray:
+    """Standard errors of independent residuals as large as the noise."""
+    inverse = np.linalg.pinv(linear.information * np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    return np.asarray(np.sqrt(np.diag(inverse)) * scale)
+
+
+class Kept:
+    """Outcomes of starts by number; what `pipeline.rig.identify.search.search` asks for.
+
+    Parameters
+    ----------
+    outcomes
+        Where they are kept.
+    """
+
+    def __init__(self, outcomes: Outcomes) -> None:
+        self._outcomes = outcomes
+        self.fits: dict[int, Fit] = {}
+
+    def recall(self, number: int) -> Fit | None:
+        """Return the outcome if it is stored."""
+        fit = self._outcomes.recall(_name(number), unpack_fit)
+        if fit is not None:
+            self.fits[number] = fit
+        return fit
+
+    def store(self, number: int, fit: Fit) -> None:
+        """Store it."""
+        self._outcomes.store(_name(number), pack_fit(fit))
+        self.fits[number] = fit
+
+
+def _name(number: int) -> str:
+    return f"start-{number:04d}"
+
+
+def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
+    """A fit as arrays."""
+    lengths = np.array([len(r) for r in fit.residuals], np.int64)
+    return {
+        "theta": fit.theta, "starts": fit.starts, "rows": fit.rows, "jacobian": fit.jacobian,
+        "residuals": np.concatenate(fit.residuals), "lengths": lengths,
+        "cost": np.array(fit.cost), "converged": np.array(fit.converged), "message": np.array(fit.message),
+        "n_evaluations": np.array(fit.n_evaluations),
+    }  # fmt: skip
+
+
+def unpack_fit(data: Mapping[str, np.ndarray]) -> Fit:
+    """The fit of `pack_fit`."""
+    residuals = np.split(data["residuals"], np.cumsum(data["lengths"])[:-1])
+    return Fit(
+        data["theta"], data["starts"], float(data["cost"]), bool(data["converged"]), str(data["message"]),
+        int(data["n_evaluations"]), tuple(residuals), data["rows"], data["jacobian"],
+    )  # fmt: skip

@@ -1,0 +1,134 @@
+"""How well computed motions fit measured ones: root mean squares, correlation, pieces judged afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.rig.identify.local import Fit, fit_local
+from pipeline.rig.identify.problem import Piece, Problem
+
+SHARES = (0.25, 0.5)
+"""Shares of a piece over which its start is fitted before the whole: a long piece forgives no bad guess."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Measured against computed, piece by piece.
+
+    Attributes
+    ----------
+    channels : tuple of str
+    pieces : tuple of Piece
+    residuals : tuple of ndarray (n, n_channels)
+        Measured less computed [SI]; NaN where nothing was measured.
+    """
+
+    channels: tuple[str, ...]
+    pieces: tuple[Piece, ...]
+    residuals: tuple[np.ndarray, ...]
+
+    @property
+    def rms(self) -> dict[str, float]:
+        """Root mean square of the residuals of each channel [SI]."""
+        return self._rms(self.residuals)
+
+    def rms_of(self, k: int) -> dict[str, float]:
+        """Root mean square of the residuals of one piece [SI]."""
+        return self._rms([self.residuals[k]])
+
+    def _rms(self, residuals: Sequence[np.ndarray]) -> dict[str, float]:
+        mean = np.nanmean(np.concatenate(residuals) ** 2, axis=0)
+        return dict(zip(self.channels, np.sqrt(mean).tolist(), strict=True))
+
+    @property
+    def correlation(self) -> dict[str, float]:
+        """Pearson's correlation coefficient of measured and computed values of each channel."""
+        measured = np.concatenate([p.measured for p in self.pieces])
+        computed = measured - np.concatenate(self.residuals)
+        return {name: _pearson(measured[:, c], computed[:, c]) for c, name in enumerate(self.channels)}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data: both criteria, and the root mean squares of each piece."""
+        return {
+            "rms": self.rms,
+            "correlation": self.correlation,
+            "pieces": [
+                {"recording": p.recording, "piece": p.number, "rms": self.rms_of(k)}
+                for k, p in enumerate(self.pieces)
+            ],
+        }
+
+
+def _pearson(x: np.ndarray, y: np.ndarray) -> float:
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = x[known] - x[known].mean(), y[known] - y[known].mean()
+    size = float(np.sqrt((x @ x) * (y @ y)))
+    return float(x @ y / size) if size > 0 else float("nan")
+
+
+def judge_fit(problem: Problem, fit: Fit) -> Judgement:
+    """Judge a fit on the pieces that it was made of."""
+    return Judgement(problem.channels, problem.pieces, fit.residuals)
+
+
+def known_problem(
+    problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
+) -> Problem:
+    """Return the problem in which all but the starts of some pieces is known.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    values
+        All parameters by name.
+    zeros
+        Sensors' zeros by the names of their unknowns.
+    pieces
+        To be judged.
+    """
+    free = tuple(f for f in problem.free if f.name in zeros)
+    known = replace(
+        problem, fixed=problem.fixed.replace(**values), free=free, tied={}, pieces=tuple(pieces),
+        loss="linear", continuity=None,
+    )  # fmt: skip
+    return known.without(zeros)
+
+
+def judge(
+    problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
+) -> tuple[Judgement, Fit]:
+    """Judge known parameters on pieces that they were not fitted to: their starts alone are refitted.
+
+    Parameters
+    ----------
+    problem, values, zeros, pieces
+        See `known_problem`.
+
+    Returns
+    -------
+    Judgement
+    Fit
+        Of the starts; whether it converged counts.
+    """
+    known = known_problem(problem, values, zeros, pieces)
+    starts = known.starts
+    for share in SHARES:
+        fit = fit_local(_beginning(known, share), np.zeros(0), starts=starts)
+        starts = np.where(np.isfinite(fit.starts), fit.starts, starts)
+    fit = fit_local(known, np.zeros(0), starts=starts)
+    return Judgement(problem.channels, tuple(pieces), fit.residuals), fit
+
+
+def _beginning(problem: Problem, share: float) -> Problem:
+    """The problem over the first part of each piece."""
+    fewest = 4 * len(problem.model.states)
+    pieces = []
+    for p in problem.pieces:
+        n = min(len(p.time), max(fewest, int(share * len(p.time))))
+        pieces.append(replace(p, time=p.time[:n], measured=p.measured[:n]))
+    return replace(problem, pieces=tuple(pieces))

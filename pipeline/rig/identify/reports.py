@@ -1,0 +1,266 @@
+"""What is said of a finished identification: ``result.json``, the preset, the residuals, lines for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.presets import write_preset
+from pipeline.rig.identify.directory import Source
+from pipeline.rig.identify.identifiability import Direction
+from pipeline.rig.identify.judging import Judgement
+from pipeline.rig.identify.local import Fit
+from pipeline.rig.identify.problem import ZERO, Problem
+from pipeline.rig.identify.profiles import Profile
+from pipeline.rig.identify.specification import IdentificationSpec
+from pipeline.rig.identify.statistics import Covariance
+from pipeline.store.provenance import versions
+
+SAME = 1e-3
+"""Share by which the cost of a start that reached the same optimum may exceed the least."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Everything that was found, before it is written.
+
+    Attributes
+    ----------
+    problem : Problem
+    starts : dict of Fit
+        Outcome of each start by its number.
+    best : Fit
+    covariance : Covariance
+    directions : list of Direction
+    profiles : dict of Profile
+    fitted, held_out : Judgement
+        Of the pieces that were fitted, and of those that were not, if there are any.
+    n_effective : dict
+        Independent residuals by channel.
+    at_bound : list of str
+        For each unknown ``lower``, ``upper`` or nothing: at which of its bounds its estimate lies.
+    warnings : list of str
+    """
+
+    problem: Problem
+    starts: Mapping[int, Fit]
+    best: Fit
+    covariance: Covariance
+    directions: Sequence[Direction]
+    fitted: Judgement
+    held_out: Judgement | None
+    n_effective: Mapping[str, float]
+    at_bound: Sequence[str]
+    profiles: Mapping[str, Profile] = field(default_factory=dict)
+    warnings: Sequence[str] = ()
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameters of the model by name."""
+        return self.problem.values(self.best.theta)
+
+    @property
+    def zeros(self) -> dict[str, float]:
+        """Sensors' zeros by the names of their unknowns."""
+        return zeros_of(self.problem, self.best)
+
+    @property
+    def n_same(self) -> int:
+        """Number of starts that reached the best optimum."""
+        return sum(self.is_same(fit) for fit in self.starts.values())
+
+    def is_same(self, fit: Fit) -> bool:
+        """Whether a start reached the best optimum."""
+        return fit.converged and fit.cost <= (1 + SAME) * self.best.cost
+
+
+def zeros_of(problem: Problem, fit: Fit) -> dict[str, float]:
+    """Sensors' zeros of a fit by the names of their unknowns."""
+    named = zip(problem.names, fit.theta, strict=True)
+    return {name: float(value) for name, value in named if name.startswith(f"{ZERO}.")}
+
+
+def result_of(
+    spec: IdentificationSpec, found: Finding, sources: Sequence[Source], digest: str
+) -> dict[str, Any]:
+    """Return ``result.json`` as plain data; nothing in it depends on when or how fast it was found."""
+    names = found.problem.names
+    return {
+        "title": spec.title,
+        "digest": digest,
+        "model": spec.model.name,
+        "converged": True,
+        "names": list(names),
+        "channels": list(found.problem.channels),
+        "estimates": {name: _estimate(found, i) for i, name in enumerate(names)},
+        "values": found.values,
+        "tied": {name: [factor, other] for name, (factor, other) in spec.tied.items()},
+        "zeros": found.zeros,
+        "cost": found.best.cost,
+        "noise": dict(zip(found.problem.channels, found.problem.noise.tolist(), strict=True)),
+        "units": {c: spec.model.state(c).unit for c in found.problem.channels},
+        **found.fitted.as_dict(),
+        "held_out": None if found.held_out is None else found.held_out.as_dict(),
+        "covariance": {
+            "estimator": found.covariance.estimator,
+            "why": found.covariance.why,
+            "critical": found.covariance.critical,
+            "degrees_of_freedom": found.covariance.degrees,
+            "inflation": found.covariance.inflation,
+            "n_samples": int(sum(np.isfinite(r).sum() for r in found.best.residuals)),
+            "n_effective": dict(found.n_effective),
+            "matrix": _plain(found.covariance.matrix),
+        },
+        "correlations": {
+            name: dict(zip(names, row, strict=True))
+            for name, row in zip(names, _plain(found.covariance.correlations), strict=True)
+        },
+        "singular_values": [
+            {
+                "value": d.singular_value,
+                "error": _number(d.error),
+                "vector": dict(zip(names, d.vector.tolist(), strict=True)),
+            }
+            for d in found.directions
+        ],
+        "profiles": {
+            name: {"values": _plain(p.values), "growth": _plain(p.growth), "interval": _plain(p.interval)}
+            for name, p in found.profiles.items()
+        },
+        "starts": [
+            {
+                "number": k,
+                "cost": _number(fit.cost),
+                "converged": fit.converged,
+                "best": found.is_same(fit),
+                "message": fit.message,
+                "n_evaluations": fit.n_evaluations,
+            }
+            for k, fit in sorted(found.starts.items())
+        ],
+        "warnings": list(found.warnings),
+        "recordings": [{"file": s.file, "sha256": s.sha256} for s in sources],
+        "versions": versions(),
+    }
+
+
+def _estimate(found: Finding, i: int) -> dict[str, Any]:
+    free, value = found.problem.free[i], float(found.best.theta[i])
+    error = float(found.covariance.errors[i])
+    low, high = interval_of(found, i)
+    entry: dict[str, Any] = {
+        "value": value,
+        "unit": free.unit,
+        "meaning": free.meaning,
+        "error": _number(error),
+        "interval": [_number(low), _number(high)],
+        "start": free.start,
+        "bounds": [_number(free.lower), _number(free.upper)],
+        "at_bound": found.at_bound[i],
+    }
+    if free.has_prior:
+        entry["prior"] = {"mean": free.prior_mean, "sd": free.prior_sd}
+    if free.name in found.profiles:
+        entry["profile_interval"] = _plain(found.profiles[free.name].interval)
+    return entry
+
+
+def interval_of(found: Finding, i: int) -> tuple[float, float]:
+    """95 % interval of an estimate by its standard error, within the bounds."""
+    free, value = found.problem.free[i], float(found.best.theta[i])
+    half = found.covariance.critical * float(found.covariance.errors[i])
+    return max(value - half, free.lower), min(value + half, free.upper)
+
+
+def _number(value: float) -> float | None:
+    """A number as JSON has it."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _plain(values: Any) -> Any:
+    """Nested lists of numbers as JSON has them."""
+    if isinstance(values, np.ndarray | list | tuple):
+        return [_plain(v) for v in values]
+    return _number(float(values))
+
+
+def write_values(path: Path, spec: IdentificationSpec, found: Finding, sources: Sequence[Source]) -> None:
+    """Write the preset: all parameters, each with where it comes from."""
+    files = ", ".join(f"{s.file} (sha256 {s.sha256[:12]})" for s in sources)
+    phrases = {}
+    for i, free in enumerate(found.problem.free):
+        low, high = interval_of(found, i)
+        phrases[free.name] = f"identified from {files}; 95 % interval {low:.6g} to {high:.6g}"
+    for name, (factor, other) in spec.tied.items():
+        phrases[name] = f"tied: {factor:g} times {other}" if factor != 1 else f"tied to {other}"
+    base = spec.model.preset(spec.preset_found)
+    for name in spec.values:
+        if name not in phrases:
+            own = "stated in the specification of the identification" if name in spec.parameters else ""
+            phrases[name] = own or base.provenance.get(name, "")
+    title = spec.title or f"identified parameters of {spec.model.name}"
+    write_preset(path, spec.model.name, found.values, phrases, title)
+
+
+def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
+    """Return measured values, computed ones and residuals of all pieces, one after the other."""
+    parts = [(found.fitted, 0)] + ([(found.held_out, 1)] if found.held_out is not None else [])
+    columns: dict[str, list[np.ndarray]] = {}
+
+    def add(name: str, values: np.ndarray) -> None:
+        columns.setdefault(name, []).append(values)
+
+    for judgement, is_held in parts:
+        for piece, residuals in zip(judgement.pieces, judgement.residuals, strict=True):
+            n = len(piece.time)
+            for name, number in (
+                ("recording", piece.recording), ("piece", piece.number), ("held_out", is_held)
+            ):  # fmt: skip
+                add(name, np.full(n, number, np.int32))
+            add("time", piece.time)
+            for c, channel in enumerate(judgement.channels):
+                add(f"{channel}_measured", piece.measured[:, c])
+                add(f"{channel}_residual", residuals[:, c])
+    ds = xr.Dataset({name: ("sample", np.concatenate(values)) for name, values in columns.items()})
+    for channel in found.problem.channels:
+        unit = spec.model.state(channel).unit
+        ds[f"{channel}_measured"].attrs = {"units": unit, "long_name": f"{channel}, measured"}
+        ds[f"{channel}_residual"].attrs = {"units": unit, "long_name": f"{channel}, measured less computed"}
+    ds["time"].attrs = {"units": "s", "long_name": "time since the piece's start"}
+    ds["held_out"].attrs = {"long_name": "1 in pieces that were not fitted"}
+    attrs = {"model": spec.model.name, "title": spec.title, "channels": " ".join(found.problem.channels)}
+    return ds.set_coords(["recording", "piece", "held_out", "time"]).assign_attrs(attrs)
+
+
+def lines_of(result: Mapping[str, Any]) -> list[str]:
+    """Say a result to people."""
+    estimates = result["estimates"]
+    width = max(map(len, estimates))
+    lines = []
+    for name in result["names"]:
+        e = estimates[name]
+        low, high = (("-" if v is None else f"{v:.6g}") for v in e["interval"])
+        bound = f", at its {e['at_bound']} bound" if e["at_bound"] else ""
+        unit = "" if e["unit"] in ("", "1") else f" {e['unit']}"
+        lines.append(f"{name:{width}} = {e['value']:.6g}{unit}   95 %: {low} to {high}{bound}")
+    lines += judgement_lines(result, result["units"])
+    if result["held_out"] is not None:
+        lines += [f"held out: {line}" for line in judgement_lines(result["held_out"], result["units"])]
+    same = sum(s["best"] for s in result["starts"])
+    lines.append(f"{same} of {len(result['starts'])} starts reached this optimum")
+    lines.append(f"intervals: {result['covariance']['why']}")
+    return lines + [f"warning: {w}" for w in result["warnings"]]
+
+
+def judgement_lines(judged: Mapping[str, Any], units: Mapping[str, str]) -> list[str]:
+    """Both criteria, a line for each channel."""
+    return [
+        f"{name}: root mean square {rms:.4g} {units[name]}, correlation {judged['correlation'][name]:.6f}"
+        for name, rms in judged["rms"].items()
+    ]
