@@ -51,7 +51,7 @@ def test_measured_compare__writes_figures_tables_and_numbers(main, files, run_di
     code, out, err = main(*words, "--out", tmp_path / "out")
     assert code == 0, err
     assert "sides agree at 100 % of the 4 steps that are sure" in out
-    assert "1 edges of windows" in out
+    assert "1 window edge" in out
     names = {p.name for p in (tmp_path / "out").iterdir()}
     assert names == {f"{n}.{s}" for n in ("comparison", "beside", "over") for s in ("png", "nc")} | {
         "steps.csv", "edges.csv",
