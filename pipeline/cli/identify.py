@@ -21,10 +21,12 @@ RUN = "spec"
 class IdentifyGroup(TyperGroup):
     """``magpend identify SPEC`` beside ``magpend identify check`` and ``compare``."""
 
+    default = RUN
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the command that is meant before what is no command's name."""
         known = (*self.list_commands(ctx), "--help", "-h", "--install-completion", "--show-completion")
-        meant = [RUN, *args] if args and args[0] not in known else args
+        meant = [self.default, *args] if args and args[0] not in known else args
         return list(super().parse_args(ctx, meant))
 
 
