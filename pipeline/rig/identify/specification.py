@@ -18,6 +18,7 @@ from magpend_core.models.parameters import (
     near_names,
 )
 from magpend_core.models.presets import is_file
+from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
 from pipeline.spec.files import read_toml
 from pipeline.spec.parsing import IDENTIFICATION
@@ -42,6 +43,10 @@ class RecordingTable(Table):
         "none",
         description="`none`: the drive was off; `recorded`: the torque is what was measured; `edges`: the "
         "instants of switching are what was measured, shape and size are the model's",
+    )
+    parameters: dict[str, float] = Field(
+        default_factory=dict,
+        description="Values of parameters in this recording alone, such as a drive's amplitude of 0",
     )
     piece_s: Annotated[float, Field(gt=0)] | None = Field(
         None, description="Cut pieces into equal stretches of about this length [s], each with a free start"
@@ -214,6 +219,8 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     if model is None:
         raise SpecError(problems)
     problems += _channel_problems(model, sensors, fit)
+    for i, table in enumerate(recordings):
+        problems += setting_problems(model, table.parameters, f"recordings[{i}].parameters")
     own = ParameterTables(data, model, _found(preset, folder), problems)
     if problems:
         raise SpecError(problems)
