@@ -29,6 +29,8 @@ PENDULUM = {
 KNOWS_A_PART = {
     "pipeline/rig/__init__.py": ("its magnets", "says that the measurement of their torque is here"),
     "pipeline/rig/magnet": ("its magnets", "the paper's measurement of their torque, named for it"),
+    "pipeline/cli/main.py": ("its magnets", "lists the command of that measurement"),
+    "pipeline/cli/magnet.py": ("its magnets", "is the command of that measurement"),
 }
 """Files, or folders of them, that may name one part of one model, and why."""
 

@@ -165,7 +165,9 @@ def completed(preset: Preset, model: Model) -> Preset:
             base = owner.preset(preset.base)
         except ParameterError as error:
             problems += [f"base: {p}" for p in error.problems]
-    problems += value_problems(owner, preset.values, preset.provenance)
+    # a preset that was completed before has those of its base, which other models of the room may own
+    own = {name: value for name, value in preset.values.items() if base.values.get(name) != value}
+    problems += value_problems(owner, own, preset.provenance)
     values, origin = {**base.values, **preset.values}, {**base.provenance, **preset.provenance}
     absent = [n for n in model.parameter_names if n not in values]
     if absent and not problems:

@@ -18,6 +18,9 @@ ANGLE = "psi1"
 LOCKED = "psi_rel"
 """The angle that is locked."""
 
+SYMBOLS = {ANGLE: r"\psi_1", LOCKED: r"\psi_\mathrm{rel}", "torque": r"M_\mathrm{M}"}
+"""LaTeX without dollar signs."""
+
 SIDES = ("right", "left")
 """Where the pendulum is, seen from the fixed magnet: that of f_1 and that of f_2 (Eq. 18)."""
 
@@ -152,3 +155,8 @@ def dipole_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
     dy = p["h"] - p["l1"] * np.cos(psi1) - p["l2"] * np.cos(psi2)
     strength = _VACUUM_PERMEABILITY * p["pole1"] * p["pole2"] / (4.0 * np.pi)
     return np.asarray(strength * p["h"] * dx / (dx * dx + dy * dy) ** 1.5)
+
+
+def reach(p: Mapping[str, float]) -> float:
+    """Distance of the moving magnet from joint 1, both links in line [m]."""
+    return float(p["l1"] + p["l2"])

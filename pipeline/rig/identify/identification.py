@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.sampling import Drive
 from pipeline.products.reporting import report, track
 from pipeline.rig.identify import directory as store
 from pipeline.rig.identify import identifiability, reports
@@ -20,7 +22,7 @@ from pipeline.rig.identify.linearise import linearise, loss_scale_of
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import ZERO, Problem
-from pipeline.rig.identify.profiles import Curvature, Profile, profile
+from pipeline.rig.identify.profiles import Curvature, Profile, following, profile
 from pipeline.rig.identify.search import search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
 from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
@@ -32,6 +34,10 @@ Echo = Callable[[str], None]
 
 NEAR_BOUND = 1e-4
 """Distance to a bound, as a share of a parameter's size, at which an estimate lies on it."""
+
+
+SAME_MOTION = 1e-3
+"""Difference of two motions, as a share of the measured spread, that the integration does not make."""
 
 
 class NotConvergedError(ArithmeticError):
@@ -83,7 +89,7 @@ def identify(
         found = find(parsed, built, outcomes, echo)
         if outcomes.recalled:
             echo(f"{outcomes.recalled} outcomes were there before")
-        return _write(folder, parsed, found, sources, info.digest, figures)
+        return _write(folder, parsed, found, sources, info.digest, figures, built.simulated)
 
 
 def directory_of(spec: str | Path, out: str | Path | None) -> Path:
@@ -93,10 +99,12 @@ def directory_of(spec: str | Path, out: str | Path | None) -> Path:
 
 def _write(
     folder: Path, spec: IdentificationSpec, found: reports.Finding, sources: list[Source], digest: str,
-    figures: bool,
+    figures: bool, simulated: bool,
 ) -> dict[str, Any]:  # fmt: skip
     reports.write_values(folder / store.PRESET, spec, found, sources)
     residuals = reports.residuals_of(spec, found)
+    if simulated:
+        residuals = residuals.assign_attrs(simulated=1)
     residuals.to_netcdf(folder / store.RESIDUALS, engine="scipy", format="NETCDF3_64BIT")
     result = reports.result_of(spec, found, sources, digest)
     files = [store.PRESET, store.RESIDUALS]
@@ -119,6 +127,11 @@ def refuse_invisible(problem: Problem) -> None:
         Naming them all; also if the trajectories diverge at the start.
     """
     first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
+    if _is_driven(problem):
+        raise SpecError([
+            'recordings: drive = "none", but the model is driven with these parameters; set the amplitude of '
+            "its drive to 0 under [parameters]."
+        ])  # fmt: skip
     if first.failed:
         raise SpecError([
             f"identify: at the start, the trajectories of {first.failed} of {len(problem.pieces)} pieces "
@@ -134,6 +147,22 @@ def refuse_invisible(problem: Problem) -> None:
             "[parameters], give others values with which it matters, or add a recording in which it does."
             for name in names
         ])  # fmt: skip
+
+
+def _is_driven(problem: Problem) -> bool:
+    """Whether a motion without a drive depends on the period that it would have."""
+    piece = problem.pieces[0]
+    if piece.drive is not None:
+        return False
+    motions = []
+    for share in (0.37, 0.61):
+        duration = share * float(piece.time[-1])
+        drive = Drive(np.full(math.ceil(1 / share), duration))
+        one = replace(problem, pieces=(replace(piece, drive=drive, follows=-1),), continuity=None)
+        found = evaluate(one, problem.start[None], piece.start[None, None], slopes=False)[0]
+        motions.append(found.residuals[0])
+    spread = np.nanstd(piece.measured, axis=0)
+    return bool((np.nanmax(np.abs(motions[0] - motions[1]), axis=0) > SAME_MOTION * spread).any())
 
 
 def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo) -> reports.Finding:
@@ -233,8 +262,10 @@ def _profiles(
     for i, name in track(list(enumerate(problem.names)), "profiles"):
         kept = outcomes.recall(f"profile-{name}", partial(_unpack_profile, name))
         if kept is None:
+            moves = following(linear.information, i)
+            starts = np.zeros_like(best.starts) if linear.following is None else linear.following @ moves
             error, size = float(covariance.errors[i]), float(scale[i])
-            about = Curvature(error, float(plain[i]), covariance.critical, size)
+            about = Curvature(error, float(plain[i]), covariance.critical, size, moves, starts)
             kept = profile(problem, best, name, about, fit_local)
             interval = np.array(kept.interval)
             outcomes.store(

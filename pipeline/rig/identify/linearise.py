@@ -31,7 +31,7 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
     full = sample_slopes(problem, fit)
     joined = problem.continuity is not None
     follow = eliminate_starts(fit.jacobian, n_free)[1] if joined else None
-    slopes = []
+    slopes, following = [], []
     for k, own in enumerate(full):
         flat = own.reshape(-1, own.shape[-1])
         # pieces with free starts each have their own; the fit's one-sided differences would blur what is null
@@ -39,12 +39,14 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
             eliminate_starts(flat, n_free)[1] if follow is None else follow[k * n_states : (k + 1) * n_states]
         )
         slopes.append(own[..., :n_free] - own[..., n_free:] @ moves)
+        following.append(-moves)
     prior = np.array([f.prior_sd**-2 if f.has_prior else 0.0 for f in problem.free])
     residuals = tuple(r / problem.noise for r in fit.residuals)
     information = _information(problem, fit, slopes, residuals, prior, scale)
     return Linearised(
-        information, prior, residuals, tuple(slopes), groups_of(problem), fit.starts.size, problem.loss, scale
-    )
+        information, prior, residuals, tuple(slopes), groups_of(problem), fit.starts.size, problem.loss,
+        scale, np.array(following),
+    )  # fmt: skip
 
 
 def _information(

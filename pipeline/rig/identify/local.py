@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,9 @@ from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
 
-XTOL, FTOL = 1e-9, 1e-10
+TOLERANCE = 1e-9
+"""Relative change of the unknowns, and a tenth of that of the cost, at which a fit has converged."""
+
 MAX_EVALUATIONS = 100
 
 DENSE_COLUMNS = 600
@@ -97,6 +100,11 @@ class _Unknowns:
 Echo = Callable[[Array, float], None]
 
 
+class _Ending(NamedTuple):
+    max_evaluations: int
+    tolerance: float
+
+
 def fit_local(
     problem: Problem,
     theta0: Array,
@@ -105,6 +113,7 @@ def fit_local(
     fixed: Mapping[str, float] | None = None,
     free_starts: bool = True,
     max_evaluations: int = MAX_EVALUATIONS,
+    tolerance: float = TOLERANCE,
     echo: Echo | None = None,
 ) -> Fit:
     """Least squares from a first guess (`scipy.optimize.least_squares`, trust region with bounds).
@@ -122,6 +131,8 @@ def fit_local(
         Whether the starts are fitted, too.
     max_evaluations
         Limit; beyond it a fit has not converged.
+    tolerance
+        Relative change of the unknowns, and a tenth of that of the cost, at which it has.
     echo
         Called with the unknowns and the cost whenever the cost has become less.
 
@@ -134,24 +145,26 @@ def fit_local(
     A robust loss counts residuals in units of their own scale, which a first fit of least squares gives.
     """
     if fixed:
-        return _fit_others(problem, theta0, starts, fixed, free_starts, max_evaluations)
+        return _fit_others(problem, theta0, starts, fixed, free_starts, _Ending(max_evaluations, tolerance))
+    ending = _Ending(max_evaluations, tolerance)
     first = problem.starts if starts is None else starts
     plain = replace(problem, loss="linear") if problem.loss != "linear" else problem
-    fit = _solve(plain, theta0, first, free_starts, max_evaluations, echo)
+    fit = _solve(plain, theta0, first, free_starts, ending, echo)
     if problem.loss == "linear":
         return fit
     z = np.concatenate(fit.residuals) / problem.noise
     scale = 1.4826 * float(np.nanmedian(np.abs(z)))
     scaled = replace(problem, loss_scale=max(scale, 1.0))
-    robust = _solve(scaled, fit.theta, fit.starts, free_starts, max_evaluations, echo)
+    robust = _solve(scaled, fit.theta, fit.starts, free_starts, ending, echo)
     return replace(robust, n_evaluations=fit.n_evaluations + robust.n_evaluations)
 
 
 def _solve(
-    problem: Problem, theta0: Array, starts: Array, free_starts: bool, limit: int, echo: Echo | None
+    problem: Problem, theta0: Array, starts: Array, free_starts: bool, ending: _Ending, echo: Echo | None
 ) -> Fit:
     from scipy.optimize import least_squares
     from scipy.sparse import csr_array
+    from threadpoolctl import threadpool_limits
 
     unknowns = _Unknowns(problem, starts, free_starts, echo)
     sizes, n_free = unknowns.sizes, len(problem.free)
@@ -162,12 +175,15 @@ def _solve(
     if not len(sizes):
         return _outcome(unknowns, full, True, "nothing to fit")
     sparse = len(sizes) > DENSE_COLUMNS
-    found = least_squares(
-        unknowns.rows, full / sizes,
-        jac=(lambda x: csr_array(unknowns.jacobian(x))) if sparse else unknowns.jacobian,
-        bounds=(lower / sizes, upper / sizes), method="trf", x_scale="jac", xtol=XTOL, ftol=FTOL, gtol=None,
-        tr_solver="lsmr" if sparse else "exact", max_nfev=limit,
-    )  # fmt: skip
+    # the matrices are small: more threads would wait for each other
+    with threadpool_limits(1):
+        found = least_squares(
+            unknowns.rows, full / sizes,
+            jac=(lambda x: csr_array(unknowns.jacobian(x))) if sparse else unknowns.jacobian,
+            bounds=(lower / sizes, upper / sizes), method="trf", x_scale="jac", xtol=ending.tolerance,
+            ftol=0.1 * ending.tolerance, gtol=None,
+            tr_solver="lsmr" if sparse else "exact", max_nfev=ending.max_evaluations,
+        )  # fmt: skip
     return _outcome(unknowns, found.x, found.status > 0, found.message)
 
 
@@ -185,13 +201,13 @@ def _outcome(unknowns: _Unknowns, x: Array, ended: bool, message: str) -> Fit:
 
 def _fit_others(
     problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float], free_starts: bool,
-    limit: int,
+    ending: _Ending,
 ) -> Fit:  # fmt: skip
     """Fit with some unknowns held; the outcome speaks of all again."""
     held = np.array([name in fixed for name in problem.names], bool)
     part = fit_local(
         problem.without(fixed), np.asarray(theta0)[~held], starts=starts, free_starts=free_starts,
-        max_evaluations=limit,
+        max_evaluations=ending.max_evaluations, tolerance=ending.tolerance,
     )  # fmt: skip
     theta = np.array([fixed.get(name, 0.0) for name in problem.names])
     theta[~held] = part.theta

@@ -125,7 +125,7 @@ def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
         rows = np.tile(theta, (len(own), 1))
         rows[np.arange(len(own)), list(problem.moving)] += own
         members.append(problem.pack(rows))
-    return np.array(members).reshape(len(thetas), steps.shape[1], -1)
+    return np.stack(members)
 
 
 def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:

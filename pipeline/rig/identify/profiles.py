@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 STEPS = (0.4, 0.8, 1.2, 1.6)
 """Where a profile is taken, on either side, in half widths of the interval of the standard error."""
 
+TOLERANCES = (1e-9, 1e-6)
+"""Least and largest tolerance of the fits, see `pipeline.rig.identify.local.fit_local`."""
+
 UNKNOWN_STEP = 0.1
 """Half width that is tried where the standard error is not known, as a share of the parameter's size."""
 
@@ -65,12 +68,18 @@ class Curvature:
         Half width of the interval in standard errors.
     size : float
         Of the parameter.
+    others : ndarray (n_free,)
+        By how much the optimum of all parameters moves with this one.
+    starts : ndarray (n_piece, n_states)
+        By how much that of the starts does.
     """
 
     error: float
     plain: float
     critical: float
     size: float
+    others: np.ndarray
+    starts: np.ndarray
 
 
 def profile(
@@ -95,25 +104,35 @@ def profile(
     known = np.isfinite(about.error) and about.error > 0
     half = about.critical * about.error if known else UNKNOWN_STEP * about.size
     unit = (about.error / about.plain) ** 2 if known else 1.0
+    # the cost to a hundredth of what one standard error makes of it
+    tolerance = float(np.clip(0.05 * unit / max(best.cost, 1e-300), *TOLERANCES))
     found = {estimate: 0.0}
     for side in (-1.0, 1.0):
-        theta, starts = best.theta, best.starts
+        theta, starts, at = best.theta, best.starts, estimate
         for step in STEPS:
             value = float(np.clip(estimate + side * step * half, free.lower, free.upper))
             if value in found:
                 break
-            fit = fit_local(problem, _moved(theta, index, value), starts=starts, fixed={name: value})
+            theta = theta + (value - at) * about.others
+            starts = starts + (value - at) * about.starts
+            fit = fit_local(problem, theta, starts=starts, fixed={name: value}, tolerance=tolerance)
             found[value] = 2.0 * (fit.cost - best.cost) / unit if fit.converged else np.nan
-            theta, starts = fit.theta, fit.starts
+            theta, starts, at = fit.theta, fit.starts, value
     values = np.array(sorted(found))
     growth = np.array([found[float(v)] for v in values])
     return Profile(name, values, growth, interval_of(values, growth, estimate, about.critical))
 
 
-def _moved(theta: np.ndarray, index: int, value: float) -> np.ndarray:
-    moved = theta.copy()
-    moved[index] = value
-    return moved
+def following(information: np.ndarray, index: int) -> np.ndarray:
+    """By how much the optimum of all parameters moves with one of them, (n_free,)."""
+    others = np.delete(np.arange(len(information)), index)
+    moves = np.ones(len(information))
+    both = information[np.ix_(others, others)]
+    # scaled, so that what is singular is told from what is small
+    size = np.sqrt(np.maximum(np.diag(both), 1e-300))
+    inverse = np.linalg.pinv(both / np.outer(size, size), rcond=1e-10, hermitian=True)
+    moves[others] = -(inverse @ (information[others, index] / size)) / size
+    return moves
 
 
 def interval_of(

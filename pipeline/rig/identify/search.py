@@ -19,13 +19,14 @@ from pipeline.products.reporting import report
 from pipeline.rig.identify.local import Echo, Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
+from pipeline.rig.identify.starts import fit_starts
 
 Array = NDArray[np.float64]
 
 STRETCHES = (0.35, 0.8, 1.8)
 """Lengths of stretches in periods of the slowest oscillation of the recordings, before whole pieces."""
 
-STAGE_EVALUATIONS = 25
+STAGE_EVALUATIONS, STAGE_TOLERANCE = 25, 1e-4
 STAGE_SAMPLES = 40
 """Samples of a stretch that are looked at before whole pieces."""
 
@@ -114,6 +115,8 @@ def guess(
     problem: Problem, n_starts: int, seed: int, spread: float, method: str, n_samples: int, shortest: Problem
 ) -> list[Array]:
     """Return first guesses, the problem's own first."""
+    if n_starts == 1:
+        return [problem.start]
     if method == "cma":
         return [
             problem.start,
@@ -172,10 +175,12 @@ def refine(
 ) -> Fit:
     """Fit from one first guess: short stretches, longer ones, whole pieces with free starts."""
     for stage in _stages(problem) if stages is None else stages:
-        fit = fit_local(stage, theta, free_starts=False, max_evaluations=STAGE_EVALUATIONS)
+        fit = fit_local(
+            stage, theta, free_starts=False, max_evaluations=STAGE_EVALUATIONS, tolerance=STAGE_TOLERANCE
+        )
         if np.isfinite(fit.cost):
             theta = fit.theta
-    return fit_local(problem, theta, echo=echo)
+    return fit_local(problem, theta, starts=fit_starts(problem, theta, problem.starts), echo=echo)
 
 
 def _stages(problem: Problem) -> list[Problem]:

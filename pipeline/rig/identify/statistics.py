@@ -62,6 +62,8 @@ class Linearised:
         As `scipy.optimize.least_squares` names it.
     loss_scale : float
         Residual from which on a robust loss grows slower than the square.
+    following : ndarray (n_piece, n_states, n_free), optional
+        By how much the optimum of the starts moves with the parameters.
     """
 
     information: np.ndarray
@@ -72,6 +74,7 @@ class Linearised:
     n_starts: int
     loss: str = "linear"
     loss_scale: float = 1.0
+    following: np.ndarray | None = None
 
     @property
     def n_samples(self) -> int:
@@ -246,9 +249,9 @@ def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.nda
     Returns
     -------
     weight : ndarray
-        psi(r)/r.
+        The derivative of half the loss, over the residual.
     slope : ndarray
-        psi'(r), at least 0.
+        Of that derivative, at least 0.
     """
     z = residuals**2
     if loss == "linear":

@@ -2,25 +2,25 @@
 
 Wojna et al., J. Sound Vib. 430 (2018), section 3, Eq. 16-19. Standard errors come from the residuals'
 variance. Where the law and not noise is what is missing, residuals of neighbouring readings are alike, and
-such errors are too small; so the joint fit also has errors from the scatter of whole curves (a sandwich
-estimate with each curve as a cluster), which hold whatever the residuals within a curve are like.
+such errors are too small; so the joint fit also has errors from the scatter of whole curves (a jackknife over
+them), which hold whatever the residuals within a curve are like.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares, minimize_scalar
+from scipy.optimize import minimize_scalar
 
 from magpend_core.models.pendulum import magnet_torque as laws
 from pipeline.rig.magnet.measurement import Curve, Measurement
+from pipeline.rig.magnet.solving import Quality, Solution, errors_by_cluster, solve
 
-_EPS = np.finfo(np.float64).eps
-MAX_EVALUATIONS = 4000
 STEEPNESS = (30.0, 10.0, 100.0, 300.0)
 """Where the joint fit begins to look for the steepness of the change between the bumps [1/rad]."""
 
@@ -29,61 +29,6 @@ LARGE_ERROR = 0.5
 
 FARTHEST_DIPOLES = 3.0
 """Farthest fixed dipole that is looked for, in lengths of the stretched pendulum."""
-
-
-@dataclass(frozen=True)
-class Solution:
-    """A converged fit by least squares.
-
-    Attributes
-    ----------
-    x : ndarray
-    errors : ndarray
-        Standard errors.
-    jacobian : ndarray
-        Of the residuals, (n, n_free).
-    residuals : ndarray
-        Measured minus computed (n,).
-    """
-
-    x: np.ndarray
-    errors: np.ndarray
-    jacobian: np.ndarray
-    residuals: np.ndarray
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """Covariance from the residuals' variance."""
-        variance = float(self.residuals @ self.residuals) / max(self.freedom, 1)
-        return _inverse(self.jacobian) * variance
-
-    @property
-    def freedom(self) -> int:
-        """Readings less free numbers."""
-        return len(self.residuals) - len(self.x)
-
-
-@dataclass(frozen=True)
-class Quality:
-    """How well a fit meets the readings.
-
-    Attributes
-    ----------
-    r2 : float
-        1 - residual over total sum of squares about the mean.
-    rms : float
-        Of the residuals [N m].
-    """
-
-    r2: float
-    rms: float
-
-    @classmethod
-    def of(cls, measured: np.ndarray, residuals: np.ndarray) -> Quality:
-        """Compare residuals with what was measured."""
-        total = float(((measured - measured.mean()) ** 2).sum())
-        left = float(residuals @ residuals)
-        return cls(1.0 - left / total if total > 0.0 else math.nan, math.sqrt(left / len(residuals)))
 
 
 @dataclass(frozen=True)
@@ -132,7 +77,8 @@ class JointFit:
     values : dict
         All of `laws.FITTED`.
     errors, errors_by_curve : dict
-        Standard errors of `free`: from the residuals' variance, and from the scatter of whole curves.
+        Standard errors of `free`: from the residuals' variance, and from the scatter of whole curves; the
+        latter are NaN if one curve alone determines a parameter.
     correlation : ndarray
         Of `free`.
     quality : Quality
@@ -173,57 +119,6 @@ class DipoleFit:
     residuals: np.ndarray
 
 
-def solve(
-    residuals: Callable[[np.ndarray], np.ndarray],
-    slopes: Callable[[np.ndarray], np.ndarray],
-    start: Sequence[float],
-    what: str,
-) -> Solution:
-    """Least squares by Levenberg and Marquardt, to rounding.
-
-    Parameters
-    ----------
-    residuals, slopes
-        Measured minus computed (n,), and its derivatives (n, n_free).
-    start
-        First guess.
-    what
-        Name of the fit, for its error.
-
-    Raises
-    ------
-    ArithmeticError
-        If it did not converge, or the readings do not determine all that is free.
-    """
-    with np.errstate(all="ignore"):
-        found = least_squares(
-            residuals, start, slopes, method="lm", x_scale="jac", ftol=4 * _EPS, xtol=4 * _EPS, gtol=4 * _EPS,
-            max_nfev=MAX_EVALUATIONS,
-        )  # fmt: skip
-        finite = bool(np.isfinite(found.x).all() and np.isfinite(found.fun).all())
-        if found.status < 1 or not finite:
-            raise ArithmeticError(f"{what}: the fit did not converge ({found.message}); it is no result.")
-        jacobian = slopes(found.x)
-        variance = found.fun @ found.fun / max(len(found.fun) - len(found.x), 1)
-        try:
-            errors = np.sqrt(np.diag(_inverse(jacobian)) * variance)
-        except np.linalg.LinAlgError:
-            errors = np.full(len(found.x), np.nan)
-    if not np.isfinite(errors).all():
-        raise ArithmeticError(f"{what}: the readings do not determine all that is fitted; it is no result.")
-    return Solution(found.x, errors, jacobian, found.fun)
-
-
-def _inverse(jacobian: np.ndarray) -> np.ndarray:
-    """Inverse of the normal matrix, with columns of one size on the way."""
-    size = np.linalg.norm(jacobian, axis=0)
-    _, s, right = np.linalg.svd(jacobian / size, full_matrices=False)
-    if not s[-1] > len(jacobian) * _EPS * s[0]:
-        raise np.linalg.LinAlgError
-    half = right.T / s / size[:, None]
-    return np.asarray(half @ half.T)
-
-
 # ---- one curve -----------------------------------------------------------------------------------
 
 
@@ -252,7 +147,7 @@ def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
         lambda x: torque - laws.bump(angle, *x), lambda x: -laws.bump_slopes(angle, *x), start, what
     )
     height, position, width = found.x[0], found.x[1], abs(found.x[2])
-    within = angle.min() - width <= -position <= angle.max() + width
+    within = angle.min() <= -position <= angle.max()
     if not within or (height > 0.0) != (curve.side == 0):
         raise ArithmeticError(
             f"{what}: the fit finds no peak of the expected sign among the readings; check side and sign, "
@@ -331,8 +226,8 @@ def _gaussian(x: np.ndarray, y: np.ndarray, weight: np.ndarray, what: str) -> La
     top = int(np.abs(y).argmax())
     start = (y[top], -x[top], max(np.ptp(x), 1e-3))
     found = solve(
-        lambda v: weight * (y - laws.bump(x, *v)), lambda v: -weight[:, None] * laws.bump_slopes(x, *v), start,
-        what,
+        lambda v: weight * (y - laws.bump(x, *v)), lambda v: -weight[:, None] * laws.bump_slopes(x, *v),
+        start, what,
     )  # fmt: skip
     return found, laws.bump(x, *found.x)
 
@@ -382,10 +277,11 @@ def fit_jointly(
         return {**held, **dict(zip(free, map(float, x), strict=True))}
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        return measured.torque - laws.magnet_moment(measured.angle, measured.locked, named(x))
+        left: np.ndarray = measured.torque - laws.magnet_moment(measured.angle, measured.locked, named(x))
+        return left
 
     def slopes(x: np.ndarray) -> np.ndarray:
-        return -laws.moment_slopes(measured.angle, measured.locked, named(x))[:, columns]
+        return np.asarray(-laws.moment_slopes(measured.angle, measured.locked, named(x))[:, columns])
 
     best: Solution | None = None
     problem = ArithmeticError()
@@ -418,11 +314,10 @@ def _judged(
     measured: Measurement, found: Solution, free: tuple[str, ...], values: dict[str, float]
 ) -> JointFit:
     errors = dict(zip(free, map(float, found.errors), strict=True))
-    spread = found.errors[:, None] * found.errors
-    correlation = found.covariance / np.where(spread > 0.0, spread, 1.0)
+    correlation = found.correlation
     clusters = [curve.rows for curve in measured.curves]
     by_curve = dict(zip(free, map(float, errors_by_cluster(found, clusters)), strict=True))
-    doubtful = [n for n in free if max(errors[n], by_curve[n]) > LARGE_ERROR * _scale(n, values)]
+    doubtful = [n for n in free if np.fmax(errors[n], by_curve[n]) > LARGE_ERROR * _scale(n, values)]
     off = np.abs(correlation) * [name not in doubtful for name in free]
     return JointFit(
         free, values, errors, by_curve, correlation, Quality.of(measured.torque, found.residuals),
@@ -438,19 +333,6 @@ def _scale(name: str, values: Mapping[str, float]) -> float:
     kind, i = name[:-1], name[-1]
     gamma, c = values[f"gamma{i}"], values[f"c{i}"]
     return {"alpha": abs(values[name]), "beta": gamma, "gamma": gamma, "p": c / gamma, "r": c, "c": c}[kind]
-
-
-def errors_by_cluster(found: Solution, clusters: Sequence[np.ndarray]) -> np.ndarray:
-    """Standard errors that allow for any likeness of residuals within a cluster.
-
-    The sandwich estimate with the usual factor for few clusters: Cameron & Miller, J. Human Resources 50
-    (2015) 317-372, Eq. 7 and 12.
-    """
-    inverse = _inverse(found.jacobian)
-    scores = np.array([found.jacobian[rows].T @ found.residuals[rows] for rows in clusters])
-    n, k, g = len(found.residuals), len(found.x), len(clusters)
-    factor = g / (g - 1) * (n - 1) / (n - k)
-    return np.asarray(np.sqrt(np.diag(inverse @ (scores.T @ scores) @ inverse) * factor))
 
 
 def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
@@ -485,15 +367,68 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
 
     h = float(p["h"])
     if place:
-        reach = p["l1"] + p["l2"]
+        reach = laws.reach(p)
         # the sum of squares has several valleys over the place: survey, then descend
         grid = reach * np.geomspace(1.001, FARTHEST_DIPOLES, 400)
         best = int(np.argmin([(r := at(float(g))[1]) @ r for g in grid]))
         low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-        h = float(minimize_scalar(lambda g: (r := at(g)[1]) @ r, bounds=(low, high), method="bounded").x)
+        found = minimize_scalar(
+            lambda g: (r := at(g)[1]) @ r, bounds=(low, high), method="bounded",
+            options={"xatol": 1e-9 * reach},
+        )  # fmt: skip
+        h = float(found.x)
     strength, residuals = at(h)
     if not (np.isfinite(residuals).all() and strength > 0.0):
         raise ArithmeticError("point dipoles: no strength of repelling dipoles fits the readings.")
     pole = math.sqrt(strength)
     values = {"pole1": pole, "pole2": pole, "h": h}
     return DipoleFit(values, Quality.of(measured.torque, residuals), residuals)
+
+
+# ---- everything ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that is fitted to a measurement.
+
+    Attributes
+    ----------
+    measured : Measurement
+    curves : tuple of CurveFit
+    laws : Laws
+    joint : JointFit
+        With what the header holds.
+    unheld : JointFit or None
+        With nothing held, where something was; None also if that is no result.
+    dipoles, placed_dipoles : DipoleFit
+        With the fixed dipole where the fixed magnet is, and where it fits best.
+    """
+
+    measured: Measurement
+    curves: tuple[CurveFit, ...]
+    laws: Laws
+    joint: JointFit
+    unheld: JointFit | None
+    dipoles: DipoleFit
+    placed_dipoles: DipoleFit
+
+
+def fit_measurement(measured: Measurement) -> Outcome:
+    """Fit curves one by one, their numbers over the locked angle, all readings at once, and point dipoles.
+
+    Raises
+    ------
+    ArithmeticError
+        If a fit is no result.
+    """
+    curves = fit_curves(measured)
+    over = fit_laws(curves)
+    hold = {name: measured.parameters[name] for name in measured.header.hold}
+    joint = fit_jointly(measured, over.values, hold)
+    unheld = None
+    if hold:
+        with contextlib.suppress(ArithmeticError):  # a fit beside the one that was asked for
+            unheld = fit_jointly(measured, over.values)
+    dipoles, placed = fit_dipoles(measured), fit_dipoles(measured, place=True)
+    return Outcome(measured, curves, over, joint, unheld, dipoles, placed)

@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,7 +24,7 @@ from magpend_core.models.parameters import ParameterError, Parameters
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.presets import find_preset
 from pipeline.spec.files import read_toml
-from pipeline.spec.problems import SpecError, unknown_choice, validated
+from pipeline.spec.problems import SpecError, unknown_choice, unknown_name, validated
 from pipeline.spec.tables import Table
 
 MIN_READINGS = 5
@@ -85,10 +86,10 @@ class SideColumn(Table):
 
 
 class Tie(Table):
-    """What hangs on link 1 of the tie that holds it."""
+    """What hangs on the upper link of the tie that holds it."""
 
     mass_kg: float = Field(ge=0, description="Mass that hangs on the link [kg].")
-    lever_m: float = Field(ge=0, description="From joint 1 along link 1 to where it hangs [m].")
+    lever_m: float = Field(ge=0, description="From the upper joint along the link to where it hangs [m].")
 
 
 class Correction(Table):
@@ -106,7 +107,7 @@ class Correction(Table):
     def _once(self) -> Correction:
         if self.without is not None and (self.weights or self.tie is not None):
             raise ValueError(
-                "readings without the magnets have the weights already; set weights = false, no tie."
+                "readings without the magnets have the weights already; set weights = false and drop tie."
             )
         return self
 
@@ -126,6 +127,10 @@ class Header(Table):
     title: str = Field(description="What was measured, in a line.")
     synthetic: bool = Field(False, description="Whether the readings were computed; all results say so.")
     file: str = Field(description="The table, CSV with names in its first row, seen from the header.")
+    delimiter: Literal[",", ";", "\t"] = Field(
+        ",", description="What stands between two fields of the table."
+    )
+    decimal: Literal[".", ","] = Field(".", description="Decimal sign of the table.")
     model: str = Field(laws.MODEL, description="Model whose torque is fitted.")
     preset: str | None = Field(None, description="Preset, or a file of one, with what is not fitted.")
     columns: Columns = Field(description="Where what stands in the table.")
@@ -139,8 +144,14 @@ class Header(Table):
     )
     synthesis: dict[str, Any] = Field({}, description="How synthetic readings were made; for people.")
 
+    @model_validator(mode="after")
+    def _signs(self) -> Header:
+        if self.delimiter == self.decimal:
+            raise ValueError('delimiter and decimal are both ","; say which of them is something else.')
+        return self
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Curve:
     """The readings of one locked angle on one side.
 
@@ -213,12 +224,36 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
         rows = np.flatnonzero(side == code)
         rows = rows[np.argsort(locked[rows], kind="stable")]
         breaks = np.flatnonzero(np.diff(locked[rows]) > SAME_ANGLE) + 1
-        found += [Curve(code, float(locked[r].mean()), np.sort(r)) for r in np.split(rows, breaks) if len(r)]
+        found += [
+            Curve(code, float(np.median(locked[r])), np.sort(r)) for r in np.split(rows, breaks) if len(r)
+        ]
     return tuple(found)
+
+
+def find_measurement(name: str | Path) -> Path:
+    """Return the path of a header: a file, or the bare name of a measurement that ships.
+
+    Raises
+    ------
+    SpecError
+        If there is neither.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    shipped = {p.stem: p for p in sorted(Path(str(resources.files("workflows"))).glob("magnet/*.toml"))}
+    if str(name) in shipped:
+        return shipped[str(name)]
+    raise SpecError([f"{name}: no such file; {unknown_name('measurement', str(name), shipped)}"])
 
 
 def read_measurement(path: str | Path) -> Measurement:
     """Read a header and its table.
+
+    Parameters
+    ----------
+    path
+        Of the header; see `find_measurement`.
 
     Raises
     ------
@@ -296,7 +331,7 @@ def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, lis
         return {}, b"", [f"file = {header.file!r}: cannot be read ({error.strerror or error})."]
     except UnicodeDecodeError:
         return {}, b"", [f"file = {header.file!r}: is not text in UTF-8; write the table as CSV."]
-    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    rows = list(csv.reader((line for line in lines if not line.startswith("#")), delimiter=header.delimiter))
     if len(rows) < 2:
         return (
             {},
@@ -332,7 +367,7 @@ def _numbers(header: Header, table: Mapping[str, list[str]], problems: list[str]
     before, found = len(problems), {}
     where = header.file
     for key in (name for name in table if name != "side"):
-        found[key] = values = np.array([_number(text) for text in table[key]])
+        found[key] = values = np.array([_number(text, header.decimal) for text in table[key]])
         bad = np.flatnonzero(~np.isfinite(values)) + 1
         if bad.size:
             problems.append(f"{where}: {key}: {_places(bad)}: no finite number; mend it or drop the row.")
@@ -357,9 +392,9 @@ def _numbers(header: Header, table: Mapping[str, list[str]], problems: list[str]
     return found if len(problems) == before else {}
 
 
-def _number(text: str) -> float:
+def _number(text: str, decimal: str) -> float:
     try:
-        return float(text)
+        return float(text.replace(decimal, "."))
     except ValueError:
         return math.nan
 

@@ -1,11 +1,11 @@
 """Periods of measured motions: which one, among noise and what is left of a transient, and how sure that is.
 
-A motion of period k repeats every k sections. What differs after k sections is noise, and the rest of a transient;
-a second difference at lag k, x[n + 2k] - 2 x[n + k] + x[n], keeps of a decay by a factor m per k sections the
-share (1 - m)^2 alone, where a first difference keeps 1 - m. In units of the sections' own noise its root mean
-square is 1 for a motion of period k, and as large as the motion for any other. The least k with a small one is the
-period; how sure that is, is the share of resampled sections, and of limits between half and twice the chosen one,
-that give the same answer.
+A motion of period k repeats every k sections. What differs after k sections is noise, and the rest of a
+transient; a second difference at lag k, x[n + 2k] - 2 x[n + k] + x[n], keeps of a decay by a factor m per k
+sections the share (1 - m)^2 alone, where a first difference keeps 1 - m. In units of the sections' own noise
+its root mean square is 1 for a motion of period k, and as large as the motion for any other. The least k with
+a small one is the period; how sure that is, is the share of resampled sections, and of limits between half
+and twice the chosen one, that give the same answer.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 
-LIMIT = 3.0
+LIMIT = 2.5
 """Second differences below so many units of noise are a closed motion's."""
 MAX_PERIOD = 16
 _LEAST = 6
@@ -102,7 +102,7 @@ def _second(points: Floats, noise: Floats, k: int) -> Floats:
 
 
 def _closure(squares: Floats) -> Floats:
-    """Root mean square by lag, of all sections or of the later half, whichever is less: a motion may settle."""
+    """Root mean square by lag, of all sections or of the later half if that is less: a motion may settle."""
     known = np.isfinite(squares)
     values = np.where(known, squares, 0.0)
     later = np.zeros(squares.shape[1], bool)

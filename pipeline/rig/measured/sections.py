@@ -1,9 +1,10 @@
 """Sections of a recording: the states, and their rates, at the instants at which the drive rises.
 
-A recording has noisy angles at a sampling rate that knows nothing of the drive. Around each edge a polynomial is
-fitted on either side; what the edge cannot change joins both. A torque that jumps bends an angle's rate, but the
-angle and its rate go on: both sides share them, and differ from the curvature on. A rate that was measured itself
-shares its value alone. So the fit is as good as one across the edge, without the bias of one that knows of no edge.
+A recording has noisy angles at a sampling rate that knows nothing of the drive. Around each edge a polynomial
+is fitted on either side; what the edge cannot change joins both. A torque that jumps bends an angle's rate,
+but the angle and its rate go on: both sides share them, and differ from the curvature on. A rate that was
+measured itself shares its value alone. So the fit is as good as one across the edge, without the bias of one
+that knows of no edge.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from pipeline.spec.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 
-WINDOW_S = 0.1
+WINDOW_S = 0.08
 """Width of the window about an edge [s]."""
 ORDER = 3
 _LEAST_SPARE = 3
@@ -68,8 +69,8 @@ def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
     found = [channel(i, s) for i, s in enumerate(model.states) if s.name in recording]
     if not found:
         raise SpecError([
-            f"{name_of(recording)}: none of the states of {model.name} ({', '.join(names)}) is measured: name "
-            "at least one under [channels] of the mapping."
+            f"{name_of(recording)}: none of the states of {model.name} ({', '.join(names)}) is measured: "
+            "name at least one under [channels] of the mapping."
         ])  # fmt: skip
     return found
 
@@ -99,9 +100,10 @@ def find_sections(
     -------
     Dataset
         Dims ``edge``, ``state`` (those that are known). ``section`` (edge, state): in the units of the model,
-        angles not wrapped; ``section_noise`` (edge, state): standard deviation that the channels' noise leaves
-        in it. Coordinates ``time`` (edge) [s]. An edge with too few samples on a side (a gap, an end) is left
-        out. The attribute ``noise`` tells the noise of a sample by channel, from the residuals, as JSON.
+        angles not wrapped; ``section_noise`` (edge, state): standard deviation that the channels' noise
+        leaves in it. Coordinates ``time`` (edge) [s]. An edge with too few samples on a side (a gap, an end)
+        is left out. The attribute ``noise`` tells the noise of a sample by channel, from the residuals, as
+        JSON.
 
     Raises
     ------
@@ -162,7 +164,7 @@ def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
 def _fits(
     recording: xr.Dataset, edges: Edges, channels: list[Channel], window_s: float, order: int
 ) -> list[tuple[int, Floats, Floats, Floats]]:
-    """For each edge with enough samples: its number, values, their spread per unit noise, residual variance."""
+    """For edges with enough samples: number, values, their spread per unit noise, residual variance."""
     time = recording["time"].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
     data = np.stack([recording[c.name].values for c in channels], axis=1)

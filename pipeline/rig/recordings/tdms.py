@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,6 +17,12 @@ from pipeline.spec.problems import SpecError
 
 SIMULATED = "simulated"
 """Property of the file that says that nobody measured it."""
+
+LEAD_IN = 28
+"""Length of what a segment begins with [bytes]."""
+
+BIG_ENDIAN = 1 << 6
+"""In the first byte of a segment's table of contents."""
 
 _UNITS = ("unit_string", "NI_UnitDescription", "unit")
 
@@ -54,7 +60,7 @@ def read_tdms(path: Path) -> Raw:
                 name = f"{group.name}/{channel.name}"
                 found[name] = _channel(name, values, channel.properties, zero)
     is_simulated = bool(file.properties.get(SIMULATED, 0))
-    findings = tuple(_truncations(file, warnings))
+    findings = tuple(_truncations(path, file, warnings))
     return Raw(path, "tdms", digest(path), (found,), findings, simulated=is_simulated)
 
 
@@ -89,21 +95,40 @@ def _seconds(stamp: Any, zero: int) -> float:
     return float(int(stamp.seconds) - zero) + float(stamp.second_fractions) * 2.0**-64
 
 
-def _truncations(file: Any, warnings: list[str]) -> list[Finding]:
+def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
     """Say what npTDMS warned of, with the numbers of samples where it knows them."""
     status = file.file_status
     remedy = "copy the file again, or take care that the writing program closes it"
     if status.channel_statuses:
         return [
             Finding(
-                "truncated", path.replace("'", "").strip("/"), math.nan, math.nan, "warning",
+                "truncated", name.replace("'", "").strip("/"), math.nan, math.nan, "warning",
                 f"the last segment holds {s.read_length} of the {s.expected_length} samples that it "
                 f"states; {remedy}.",
             )
-            for path, s in status.channel_statuses.items()
+            for name, s in status.channel_statuses.items()
             if s.read_length < s.expected_length
         ] or [_truncated(f"the last segment was not closed; {remedy}.")]  # fmt: skip
-    return [_truncated(f"{text[:1].lower()}{text[1:]}; {remedy}.") for text in warnings]
+    if warnings:
+        return [_truncated(f"{text[:1].lower()}{text[1:]}; {remedy}.") for text in warnings]
+    rest = _bytes_after_last_segment(path)
+    return [_truncated(f"the file ends {rest} bytes into a segment; {remedy}.")] if rest else []
+
+
+def _bytes_after_last_segment(path: Path) -> int:
+    """Bytes of a segment whose lead-in is not whole, which npTDMS leaves out without a word.
+
+    The lead-in of a segment has 28 bytes: tag, table of contents, version, and the lengths of what follows
+    (National Instruments, "TDMS File Format Internal Structure").
+    """
+    size, place = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while size - place >= LEAD_IN:
+            file.seek(place)
+            lead = file.read(LEAD_IN)
+            order: Literal["big", "little"] = "big" if lead[4] & BIG_ENDIAN else "little"
+            place += LEAD_IN + int.from_bytes(lead[12:20], order)
+    return max(size - place, 0)
 
 
 def _truncated(text: str) -> Finding:

@@ -50,6 +50,12 @@ def test_load__a_file_serves_all_models_that_share_its_presets(written):
     assert "rig.toml: is of model 'pendulum'" in problem
 
 
+def test_load__takes_what_preset_returned(written):
+    for name in ("pendulum", "pendulum-dipole"):
+        model = load_model(name)
+        assert model.load(model.preset(written)) == model.load(written)
+
+
 def test_write_preset__takes_over_the_values_and_sources_of_a_base_from_a_file(written, tmp_path):
     second = write_preset(
         tmp_path / "second.toml", "pendulum", {"q": 1.5, "c1": 0.07}, {"q": "scale", "c1": "ruler"},

@@ -1,0 +1,70 @@
+"""``magpend fit-magnet``: from measured torque curves to a preset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import Json
+
+
+def fit_magnet(
+    measurement: Annotated[
+        str,
+        typer.Argument(
+            metavar="MEASUREMENT",
+            help="Header of a table of torque readings, a TOML file; or discs, which ships.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where results go; by default a folder named as the header."),
+    ] = None,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Write report and presets alone.")] = False,
+    json: Json = False,
+) -> None:
+    """Fit the magnets' torque to measured curves: a report, figures, and a preset for specifications.
+
+    Each curve by itself, then all at once, with point dipoles beside them. A fit that does not converge is
+    no result: nothing is written then.
+    """
+    import json as formats
+
+    from pipeline.cli import console
+    from pipeline.rig.magnet.fitting import fit_measurement
+    from pipeline.rig.magnet.measurement import find_measurement, read_measurement
+    from pipeline.rig.magnet.results import report_of, summary_of, warnings_of, write_results
+
+    header = find_measurement(measurement)
+    folder = _folder(out or Path(header.stem + "-fit"))
+    outcome = fit_measurement(read_measurement(header))
+    folder.mkdir(exist_ok=True)
+    written = write_results(outcome, folder)
+    if not no_figures:
+        from pipeline.rig.magnet.figures import write_figures
+
+        written += write_figures(outcome, folder)
+    for warning in warnings_of(outcome):
+        console.LOG.warning(warning)
+    if json:
+        console.result(formats.dumps(report_of(outcome), indent=1))
+    else:
+        for line in summary_of(outcome):
+            console.result(line)
+    for path in written:
+        console.note(f"written: {path}")
+    preset = folder / "preset.toml"
+    console.note(f'use it with preset = "{preset}" in a specification, or magpend simulate --preset {preset}')
+
+
+def _folder(path: Path) -> Path:
+    """Refuse a place for results that cannot be, before anything is computed."""
+    from pipeline.spec.problems import SpecError
+
+    if path.exists() and not path.is_dir():
+        raise SpecError([f"--out {path}: is a file; give a folder."])
+    if not path.parent.is_dir():
+        raise SpecError([f"{path.parent}: no such folder; make it first."])
+    return path

@@ -1,0 +1,282 @@
+"""``magpend measured``: diagrams of recordings, alone and held against a run.
+
+These commands are about recordings, several of them, and their mapping; a run is what they are held against.
+So they are no analyses or figures of a run, which know nothing but its cells.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipeline.cli.common import EXIT_HELP, Csv, Directory, Json, check_csv, read_pairs, tell
+from pipeline.cli.groups import SETTINGS
+from pipeline.cli.options import speaking
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magpend_core.models.parameters import Parameters
+    from pipeline.rig.measured.measuring import Way
+
+measured_app = typer.Typer(
+    help="Diagrams of recorded sweeps, beside and over computed ones.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    context_settings=SETTINGS,
+)
+
+Recordings = Annotated[
+    list[Path], typer.Argument(metavar="RECORDING...", help="Recordings of sweeps of the drive's frequency.")
+]
+Mappings = Annotated[
+    list[Path],
+    typer.Option("--mapping", metavar="MAP", help="Mapping file, one for all recordings or one for each."),
+]
+Transient = Annotated[int, typer.Option(help="Drive periods dropped after each step of the frequency.")]
+Window = Annotated[
+    int | None,
+    typer.Option(help="Drive periods of a window of a slow sweep; by default found out, 0 for steps only."),
+]
+WindowS = Annotated[float, typer.Option(help="Width of the polynomials' window about an edge [s].")]
+Hysteresis = Annotated[
+    float | None, typer.Option(help="Band about the drive's middle that an edge must cross, in its unit.")
+]
+MaxPeriod = Annotated[int, typer.Option(help="Longest period looked for [drive periods].")]
+State = Annotated[str, typer.Option(help="State that is drawn; by default the first that is measured.")]
+Degrees = Annotated[bool, typer.Option("--degrees", help="Degrees instead of radians.")]
+Width = Annotated[float, typer.Option(help="Width of the figure [mm]; 85 is a journal's column.")]
+At = Annotated[
+    list[str] | None, typer.Option("--at", metavar="NAME=VALUE", help="Value of another axis of the run.")
+]
+Preset = Annotated[str | None, typer.Option(help="Parameters; by default the model's first preset.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")]
+
+
+def _read(paths: list[Path], mappings: list[Path]) -> list[xr.Dataset]:
+    """Read recordings through their mappings, and say what was found in them."""
+    from pipeline.cli import console
+    from pipeline.rig.recordings import findings_of, load_mapping, read_recording
+    from pipeline.spec.problems import SpecError
+
+    if len(mappings) not in (1, len(paths)):
+        raise SpecError([
+            f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each."
+        ])  # fmt: skip
+    loaded = [load_mapping(m) for m in mappings] * (len(paths) if len(mappings) == 1 else 1)
+    found = [read_recording(p, m) for p, m in zip(paths, loaded, strict=True)]
+    for path, recording in zip(paths, found, strict=True):
+        for finding in findings_of(recording):
+            if finding.severity != "note":
+                console.note(f"{finding.severity}: {path.name}: {finding.text}")
+    return found
+
+
+def _way(
+    transient: int, window: int | None, window_s: float, hysteresis: float | None, max_period: int
+) -> Way:
+    from pipeline.rig.measured.measuring import Way
+    from pipeline.spec.problems import SpecError
+
+    if max_period < 1:
+        raise SpecError([f"--max-period {max_period}: must be at least 1."])
+    return Way(transient, window, window_s, hysteresis=hysteresis, max_period=max_period)
+
+
+def _loaded(model: str, preset: str | None, settings: list[str] | None) -> Parameters:
+    from magpend_core.models import load_model
+
+    return load_model(model).load(preset, **read_pairs("--set", settings or [], "q=1.5"))
+
+
+def _check_targets(out: Path | None, csv: str | None = None) -> None:
+    from pipeline.cli.plot import check_figure_path
+
+    check_csv(csv)
+    if out is not None:
+        check_figure_path(out)
+
+
+def _save(figure: Any, target: Path) -> None:
+    from pipeline.cli import console
+    from pipeline.plots import save_data, save_figure
+
+    console.result(f"figure: {save_figure(figure, target)}")
+    console.result(f"data: {save_data(figure, target)}")
+
+
+@measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
+@speaking
+def steps(
+    recordings: Recordings,
+    mapping: Mappings,
+    transient: Transient = 20,
+    window: Window = None,
+    window_s: WindowS = 0.08,
+    hysteresis: Hysteresis = None,
+    max_period: MaxPeriod = 16,
+    preset: Preset = None,
+    settings: Set = None,
+    csv: Csv = None,
+    as_json: Json = False,
+) -> None:
+    """List the steps of a sweep: frequency, jitter, duty cycle, period of the motion and how sure it is.
+
+    Words of the model's classifier, such as the side of a motion, are told for the preset's parameters.
+    """
+    from pipeline.rig.measured.measuring import measure
+    from pipeline.rig.measured.tables import steps_table
+
+    _check_targets(None, csv)
+    way = _way(transient, window, window_s, hysteresis, max_period)
+    found = _read(recordings, mapping)
+    parameters = _loaded(str(found[0].attrs["model"]), preset, settings)
+    tell(steps_table(measure(found, way, parameters=parameters)), csv, as_json)
+
+
+@measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
+@speaking
+def diagram(
+    recordings: Recordings,
+    mapping: Mappings,
+    out: Annotated[Path, typer.Option(help="Figure, .png, .pdf or .svg.")],
+    run: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Run whose diagram is drawn beside or below it.")
+    ] = None,
+    layout: Annotated[str, typer.Option(help="side: beside the computed diagram; over: over it.")] = "side",
+    state: State = "",
+    degrees: Degrees = False,
+    width: Width = 178.0,
+    at: At = None,
+    transient: Transient = 20,
+    window: Window = None,
+    window_s: WindowS = 0.08,
+    hysteresis: Hysteresis = None,
+    max_period: MaxPeriod = 16,
+) -> None:
+    """Draw the measured bifurcation diagram, alone or with that of a run on the same axes."""
+    from pipeline.plots import Frame
+    from pipeline.rig.measured.figures import plot_measured
+    from pipeline.rig.measured.measuring import measure, with_sides
+    from pipeline.runs.derive import refused
+
+    _check_targets(out)
+    way = _way(transient, window, window_s, hysteresis, max_period)
+    found = measure(_read(recordings, mapping), way)
+    cube = None
+    if run is not None:
+        from pipeline.rig.measured.computed import cube_and_parameters
+        from pipeline.runs.derive import AnalysedRun
+
+        opened = AnalysedRun.of(run)
+        pairs = read_pairs("--at", at or [], "q=1.5")
+        cube, parameters = cube_and_parameters(opened, str(found.attrs["model"]), pairs)
+        found = with_sides(found, parameters)
+    with refused(run or out):
+        figure = plot_measured(
+            found, cube, state=state, degrees=degrees, layout=layout, frame=Frame(width)
+        )  # fmt: skip
+    _save(figure, out)
+
+
+@measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
+@speaking
+def compare(
+    directory: Directory,
+    recordings: Recordings,
+    mapping: Mappings,
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="For figures, tables and data; made if absent.")
+    ],
+    state: State = "",
+    degrees: Degrees = False,
+    width: Width = 178.0,
+    at: At = None,
+    transient: Transient = 20,
+    window: Window = None,
+    window_s: WindowS = 0.08,
+    hysteresis: Hysteresis = None,
+    max_period: MaxPeriod = 16,
+    csv: Csv = None,
+    as_json: Json = False,
+) -> None:
+    """Hold a measured sweep against the attractors of a run.
+
+    Per step: which attractor is nearest, how far in units of noise, whether period and side agree. Per end of
+    a window: its shift from the model's [Hz]. FOLDER gets comparison.png, beside.png, over.png, steps.csv,
+    edges.csv and comparison.nc.
+    """
+    from pipeline.cli import console
+    from pipeline.plots import Frame
+    from pipeline.rig.measured.compare import compare_with
+    from pipeline.rig.measured.computed import Computed
+    from pipeline.rig.measured.measuring import measure, with_sides
+    from pipeline.rig.measured.tables import edges_table, steps_table, summary_lines
+    from pipeline.rig.measured.writing import write_comparison
+    from pipeline.runs.derive import AnalysedRun, refused
+
+    _check_targets(None, csv)
+    way = _way(transient, window, window_s, hysteresis, max_period)
+    pairs = read_pairs("--at", at or [], "q=1.5")
+    run = AnalysedRun.of(directory, console.note)
+    found = measure(_read(recordings, mapping), way)
+    computed = Computed.of(run, str(found.attrs["model"]), pairs)
+    compared = compare_with(with_sides(found, computed.parameters), computed)
+    with refused(directory):
+        written = write_comparison(compared, computed, out, state=state, degrees=degrees, frame=Frame(width))
+    steps_of, ends = steps_table(compared), edges_table(compared)
+    if as_json:
+        console.result(json.dumps({"steps": _plain(steps_of.rows), "edges": _plain(ends.rows)}, indent=1))
+        return
+    tell(steps_of, csv, as_json=False)
+    if csv == "-":
+        return
+    for line in (*ends.lines, *summary_lines(compared)):
+        console.result(line)
+    for path in written:
+        console.note(f"written: {path}")
+
+
+def _plain(rows: Any) -> list[dict[str, Any]]:
+    """NaN is no JSON."""
+    return [{k: None if v != v else v for k, v in row.items()} for row in rows]
+
+
+@measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
+@speaking
+def series(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording with a drive.")],
+    mapping: Annotated[Path, typer.Option("--mapping", metavar="MAP", help="Mapping file.")],
+    out: Annotated[Path, typer.Option(help="Figure, .png, .pdf or .svg; the series goes beside it.")],
+    preset: Preset = None,
+    settings: Set = None,
+    start_s: Annotated[
+        float | None, typer.Option(help="The first rising edge from this time on [s] is the start.")
+    ] = None,
+    periods: Annotated[int, typer.Option(help="Drive periods.")] = 10,
+    degrees: Degrees = False,
+    width: Width = 178.0,
+    window_s: WindowS = 0.08,
+    hysteresis: Hysteresis = None,
+) -> None:
+    """Draw a recording and the model from the same state: series over series, portrait over portrait."""
+    from pipeline.cli import console
+    from pipeline.plots import Frame
+    from pipeline.rig.measured.overlays import plot_series
+    from pipeline.rig.measured.series import series_of
+    from pipeline.runs.derive import refused
+
+    _check_targets(out)
+    (found,) = _read([recording], [mapping])
+    parameters = _loaded(str(found.attrs["model"]), preset, settings)
+    ds = series_of(
+        found, parameters, start_s=start_s, n_periods=periods, window_s=window_s, hysteresis=hysteresis
+    )  # fmt: skip
+    with refused(recording):
+        figure = plot_series(ds, degrees=degrees, frame=Frame(width))
+    for name, value in json.loads(str(ds.attrs["rms"])).items():
+        console.result(f"rms of {name}: {value:.4g} {ds[name].attrs['units']}")
+    _save(figure, out)

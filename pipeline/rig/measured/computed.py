@@ -1,0 +1,177 @@
+"""Attractors of a run at the frequencies of a rig: their points, periods and sides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import Parameters
+from pipeline.analysis.selection import choose, select_points, start_dims
+from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import ABSENT, BOUNDED_SET, CLOSED_ORBIT, FREQUENCY_DIM, split_dims
+from pipeline.rig.measured.distances import Candidate
+from pipeline.runs.derive import AnalysedRun, refused
+from pipeline.spec.problems import SpecError
+
+Floats = npt.NDArray[np.float64]
+
+
+def cube_and_parameters(
+    run: AnalysedRun, model_name: str, at: Mapping[str, float] | None = None
+) -> tuple[xr.Dataset, Parameters]:
+    """Return a run's cells over the drive's frequency, and its parameters there.
+
+    Raises
+    ------
+    SpecError
+        If it is of another model, sweeps no frequency, or another axis has more than one value.
+    """
+    where = run.directory
+    if run.model.name != model_name:
+        raise SpecError([
+            f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model_name}: "
+            "give a run of that model, or correct model in the mapping."
+        ])  # fmt: skip
+    cube = run.cube()
+    if FREQUENCY_DIM not in cube["status"].dims:
+        raise SpecError([
+            f"{where}: sweeps no drive frequency, so there is nothing to hold a measured sweep against: run "
+            "a specification with axes.frequency_hz."
+        ])  # fmt: skip
+    with refused(where):
+        part = select_points(cube, at)
+        long = [d for d in split_dims(part["status"])[0] if d != FREQUENCY_DIM and part.sizes[d] > 1]
+        if long:
+            axes = ", ".join(f"{d} ({part.sizes[d]} values)" for d in long)
+            one = float(part[long[0]].values[part.sizes[long[0]] // 2])
+            raise ValueError(f"also sweeps {axes}: choose a value of each, such as --at {long[0]}={one:g}")
+    others = [d for d in split_dims(part["status"])[0] if d != FREQUENCY_DIM]
+    part = part.isel(dict.fromkeys(others, 0))
+    values = {d: float(part[d]) for d in others if d in run.parameters}
+    return part, run.parameters.replace(**values)
+
+
+@dataclass(frozen=True)
+class Computed:
+    """What a run knows along its frequency axis, at one value of every other axis.
+
+    Attributes
+    ----------
+    attractors : Dataset
+        Result of the analysis ``attractors``: dims frequency, cells, attractor, in rising frequency.
+    cube : Dataset
+        Cells of the run, for the points of bounded sets and the diagram.
+    parameters : Parameters
+    title, digest : str
+    """
+
+    attractors: xr.Dataset
+    cube: xr.Dataset
+    parameters: Parameters
+    title: str
+    digest: str
+
+    @classmethod
+    def of(cls, run: AnalysedRun, model_name: str, at: Mapping[str, float] | None = None) -> Computed:
+        """Read a run and find its attractors, kept as every analysis.
+
+        Raises
+        ------
+        SpecError
+            If it is of another model, sweeps no frequency, or another axis has more than one value.
+        """
+        cube, parameters = cube_and_parameters(run, model_name, at)
+        with refused(run.directory):
+            found = run.derive("attractors")
+            keep = (FREQUENCY_DIM, *start_dims(found))
+            found = choose(found, at, keep, "measured sweeps are compared at one value of the other axes")
+        found = found.isel({FREQUENCY_DIM: np.argsort(found[FREQUENCY_DIM].values)})
+        return cls(found, cube, parameters, run.info.title, run.digest)
+
+    @property
+    def model(self) -> Model:
+        """What was integrated."""
+        return self.parameters.model
+
+    @property
+    def frequencies(self) -> Floats:
+        """Rising [Hz]."""
+        return np.asarray(self.attractors[FREQUENCY_DIM].values, np.float64)
+
+    def place(self, frequency_hz: float) -> int:
+        """Place of the nearest frequency; -1 if the axis does not reach within half a step."""
+        f = self.frequencies
+        i = int(np.abs(f - frequency_hz).argmin())
+        near = np.abs(np.delete(f, i) - f[i])
+        reach = 0.51 * float(near.min()) if near.size else 1e-3 * float(f[i])
+        return i if abs(f[i] - frequency_hz) <= reach or f[0] < frequency_hz < f[-1] else -1
+
+    def regime(self, place: int, attractor: int) -> tuple[int, int] | None:
+        """Period (0 for a bounded set) and side of an attractor at a frequency; None if it is not there."""
+        one = self.attractors.isel({FREQUENCY_DIM: place}).sel(attractor=attractor)
+        kind = int(one["kind"])
+        if kind == ABSENT:
+            return None
+        period = int(one["orbit_period"]) if kind == CLOSED_ORBIT else 0
+        return period, int(one["side"]) if "side" in one else 0
+
+    def candidates(self, frequency_hz: float, states: Sequence[str]) -> list[Candidate]:
+        """Attractors at a frequency, with their points in the chosen states.
+
+        Points of a closed orbit are interpolated between neighbouring frequencies at which the id has the
+        same period; else, and for bounded sets, they are those of the nearest frequency.
+        """
+        i = self.place(frequency_hz)
+        if i < 0:
+            return []
+        here = self.attractors.isel({FREQUENCY_DIM: i})
+        found = []
+        for number in here["attractor"].values[here["kind"].values != ABSENT]:
+            regime = self.regime(i, int(number))
+            assert regime is not None
+            if int(here["kind"].sel(attractor=number)) == BOUNDED_SET:
+                points = self._set(i, int(number))
+            else:
+                points = self._orbit(frequency_hz, i, int(number), regime[0])
+            columns = [self.model.state_names.index(s) for s in states]
+            found.append(Candidate(int(number), *regime, points[:, columns]))
+        return found
+
+    def _points(self, place: int, attractor: int) -> Floats:
+        one = self.attractors["attractor_points"].isel({FREQUENCY_DIM: place}).sel(attractor=attractor)
+        points = one.transpose("point", "state").values
+        return np.asarray(points[np.isfinite(points).all(axis=1)], np.float64)
+
+    def _set(self, place: int, attractor: int) -> Floats:
+        """Sections of all cells on a bounded set."""
+        frequency = self.frequencies[place]
+        dims = start_dims(self.attractors)
+        ids = self.attractors["attractor_id"].isel({FREQUENCY_DIM: place}).transpose(*dims).values
+        cells = (
+            self.cube["section"]
+            .sel({FREQUENCY_DIM: frequency})
+            .transpose(*dims, "period_index", "state")
+            .values
+        )
+        points = cells[ids == attractor].reshape(-1, cells.shape[-1])
+        points = points[np.isfinite(points).all(axis=1)]
+        return points if len(points) else self._points(place, attractor)
+
+    def _orbit(self, frequency_hz: float, place: int, attractor: int, period: int) -> Floats:
+        points, f = self._points(place, attractor), self.frequencies
+        other = place + (1 if frequency_hz > f[place] else -1)
+        if not 0 <= other < f.size or self.regime(other, attractor) != self.regime(place, attractor):
+            return points
+        there = self._points(other, attractor)
+        if len(there) != len(points):
+            return points
+        geometry = Geometry.of(self.model)
+        turned = [np.roll(there, k, axis=0) for k in range(period)]
+        best = min(turned, key=lambda t: float(geometry.distance(t, points).mean()))
+        share = (frequency_hz - f[place]) / (f[other] - f[place])
+        return np.asarray(points + share * geometry.difference(best, points) * np.array(self.model.scales))

@@ -1,0 +1,326 @@
+"""Figures of measured diagrams: beside and over computed ones on shared axes, and how far apart they are."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+
+from pipeline.layout.letters import letter
+from pipeline.layout.vocabulary import FREQUENCY_DIM
+from pipeline.plots import labels, palette, pixels, style
+from pipeline.plots.bifurcation import Diagram, with_diagram
+from pipeline.plots.motions import Motions, motions_of
+from pipeline.rig.measured.computed import Computed
+
+LAYOUTS = ("side", "over")
+_MARKERS = {"up": "^", "down": "v", "none": "o"}
+_LOOKS = {"up": (1.9, 0.0), "down": (3.8, pixels.TINT), "none": (1.9, 0.0)}
+SIMULATED = "simulated rig"
+
+
+def plot_measured(
+    measured: xr.Dataset,
+    cube: xr.Dataset | None = None,
+    *,
+    state: str = "",
+    degrees: bool = False,
+    layout: str = "side",
+    frame: style.Frame = style.WIDE,
+) -> style.DataFigure:
+    """Draw measured sections over the drive frequency: alone, beside or over a computed diagram.
+
+    Parameters
+    ----------
+    measured
+        Result of `pipeline.rig.measured.measuring.measure`.
+    cube
+        Of a run of the same model, one value of every axis but the frequency.
+    state
+        Name of the state; by default the first that is measured.
+    degrees
+        Degrees instead of radians.
+    layout
+        ``side``: measured left, computed right. ``over``: measured as open triangles over the computed
+        points, pointing the way of the sweep.
+    frame
+        Width of the figure and ranges of its axes.
+
+    Returns
+    -------
+    DataFigure
+        Both diagrams share their axes. Its `data` hold the measured points (dims ``step``, ``period_index``)
+        and, under names that end in ``_diagram``, the computed ones.
+
+    Raises
+    ------
+    ValueError
+        For an unknown layout, or a state that was not measured.
+    """
+    style.check_choice("layout", layout, LAYOUTS)
+    names = [str(n) for n in measured["state"].values]
+    state = state or names[0]
+    style.check_choice("state", state, names)
+    measure = labels.state_measure(measured, state, degrees)
+    values = measure.shown(measured["section"].sel(state=state).values, wrap=True)
+    ranges = _ranges(measured, values, cube, frame)
+    framed = style.Frame(frame.width, *ranges)
+    diagram = None if cube is None else Diagram.of(cube, state=state, degrees=degrees, frame=framed)
+    fig = style.new_figure(4.3, _data(measured, values, measure), framed)
+    beside = diagram is not None and layout == "side"
+    axes = [fig.add_subplot(1, 2 if beside else 1, 1)]
+    if beside:
+        axes.append(fig.add_subplot(1, 2, 2, sharex=axes[0], sharey=axes[0]))
+    for ax in axes:
+        _dress(ax, measured, measure, ranges)
+    if beside:
+        axes[1].set_ylabel("")
+        axes[1].tick_params(labelleft=False)
+        for ax, text in zip(axes, (_rig(measured), "computed"), strict=True):
+            ax.text(0.045, 0.955, text, transform=ax.transAxes, va="top", fontsize=fig.look.label)
+    over = diagram is not None and layout == "over"
+    _draw_steps(axes[0], measured, values, over)
+    motions = motions_of(measured)
+    style.complete(fig, axes[0], "", _handles(measured, motions, diagram, over))
+    if diagram is not None:
+        drawn = diagram.draw([pixels.Panel(axes[-1], diagram.layers)])
+        fig.data = with_diagram(fig.data, drawn)
+    return fig
+
+
+def _rig(measured: xr.Dataset) -> str:
+    return SIMULATED if int(measured.attrs.get("simulated", 0)) else "measured"
+
+
+def _ranges(
+    measured: xr.Dataset, values: np.ndarray, cube: xr.Dataset | None, frame: style.Frame
+) -> tuple[tuple[float, float], tuple[float, float] | None]:
+    """Ranges that hold both diagrams; heights are left to the computed one where it is alone to know."""
+    own = measured["frequency"].values
+    f = own if cube is None else np.concatenate([own, np.atleast_1d(cube[FREQUENCY_DIM].values)])
+    margin = 0.02 * float(np.ptp(f)) or 0.02 * float(f[0])
+    x = frame.xlim or (float(f.min()) - margin, float(f.max()) + margin)
+    if frame.ylim:
+        return x, frame.ylim
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    return x, None if cube is not None else (low - 0.05 * (high - low), high + 0.05 * (high - low))
+
+
+def _data(measured: xr.Dataset, values: np.ndarray, measure: labels.Measure) -> xr.Dataset:
+    about = {"units": measure.unit, "long_name": f"{measure.name} at the rising edge"}
+    kept = ["orbit_period", "confidence", "side", "frequency_error_hz"]
+    data = measured[[n for n in kept if n in measured]].assign(
+        value=(("step", "period_index"), values, about)
+    )
+    return data.drop_vars(["state", "state_units"], errors="ignore").assign_attrs(title="measured diagram")
+
+
+def _dress(ax: Axes, measured: xr.Dataset, measure: labels.Measure, ranges: Any) -> None:
+    style.style_axes(ax)
+    ax.set_xlim(*ranges[0])
+    if ranges[1]:
+        ax.set_ylim(*ranges[1])
+    style.label_axes(ax, "drive frequency [Hz]", measure.label)
+
+
+def _draw_steps(ax: Axes, measured: xr.Dataset, values: np.ndarray, over: bool) -> None:
+    """Draw the sections of all steps, by direction and motion; upwards above downwards."""
+    motions = motions_of(measured)
+    codes = measured["side"].values if "side" in measured else np.zeros(measured.sizes["step"], int)
+    f, ways = measured["frequency"].values, measured["direction"].values.astype(str)
+    for way in ("down", "none", "up"):
+        for code in np.unique(codes[ways == way]):
+            chosen = (ways == way) & (codes == code)
+            x = np.broadcast_to(f[chosen, None], values[chosen].shape)
+            shown = np.isfinite(values[chosen])
+            size, tint = _LOOKS[way]
+            colour = style.tinted(motions.colours[int(code)], tint)
+            look: dict[str, Any] = {
+                "marker": "o",
+                "markersize": size,
+                "markeredgewidth": 0.0,
+                "color": colour,
+            }
+            if over:
+                look = {"marker": _MARKERS[way], "markersize": 3.4, "markeredgewidth": 0.5,
+                        "markeredgecolor": "black", "markerfacecolor": "none"}  # fmt: skip
+            ax.plot(x[shown], values[chosen][shown], linestyle="none", rasterized=True, zorder=3.0,
+                    gid=f"measured:{way}:{motions.words[int(code)]}", **look)  # fmt: skip
+
+
+def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, over: bool) -> list[Any]:
+    ways = [w for w in ("up", "down") if w in measured["direction"].values]
+    handles: list[Any] = list(diagram.handles(layers=not over)) if diagram is not None else []
+    if diagram is None and "side" in measured:
+        present = set(measured["side"].values.tolist())
+        handles = [style.dot(motions.words[c], motions.colours[c]) for c in motions.drawn if c in present]
+    if over:
+        handles += [
+            style.dot(f"{_rig(measured)}, {w}", "black", 4.0, face="none", marker=_MARKERS[w]) for w in ways
+        ]
+    elif diagram is None:
+        handles += [style.dot(w, style.tinted("black", _LOOKS[w][1]), _LOOKS[w][0] + 1.5) for w in ways]
+        if int(measured.attrs.get("simulated", 0)):
+            handles.append(Line2D([], [], linestyle="none", label=SIMULATED))
+    return handles
+
+
+def plot_comparison(
+    compared: xr.Dataset, computed: Computed, *, state: str = "", degrees: bool = False,
+    frame: style.Frame = style.WIDE,
+) -> style.DataFigure:  # fmt: skip
+    """Draw measured points over the attractors, their distance in units of noise, and both regimes.
+
+    Parameters
+    ----------
+    compared
+        Result of `pipeline.rig.measured.compare.compare`.
+    computed
+        What it was compared with.
+    state
+        Name of the state; by default the first that is measured.
+    degrees
+        Degrees instead of radians.
+    frame
+        Width of the figure and ranges of its axes.
+
+    Returns
+    -------
+    DataFigure
+        Three panels over one axis of frequency: the attractors in their colours with the measured sections as
+        open triangles; the distance from the nearest attractor in units of the noise floor, in its colour and
+        pointing the way of the sweep; strips of the regimes of rig and model, coloured by side, with their
+        periods (a cross: unclosed). Its `data` are `compared`.
+
+    Raises
+    ------
+    ValueError
+        For a state that was not measured.
+    """
+    names = [str(n) for n in compared["state"].values]
+    state = state or names[0]
+    style.check_choice("state", state, names)
+    measure = labels.state_measure(compared, state, degrees)
+    cast = palette.cast_of(computed.attractors)
+    ways = [w for w in ("up", "down", "none") if w in compared["direction"].values]
+    fig = style.new_figure(6.4 + 0.3 * len(ways), compared, frame)
+    grid = fig.add_gridspec(3, 1, height_ratios=[1.0, 0.62, 0.17 * len(ways) + 0.08])
+    top = fig.add_subplot(grid[0])
+    middle, bottom = (fig.add_subplot(grid[k], sharex=top) for k in (1, 2))
+    for ax in (top, middle, bottom):
+        style.style_axes(ax, minor=ax is not bottom)
+        ax.tick_params(labelbottom=ax is bottom)
+    shown = _draw_attractors(top, computed, measure, cast)
+    _draw_steps(top, compared, measure.shown(compared["section"].sel(state=state).values, wrap=True), True)
+    _draw_distances(middle, compared, cast)
+    motions = motions_of(compared)
+    _draw_regimes(bottom, compared, motions, ways)
+    f = np.concatenate([compared["frequency"].values, computed.frequencies])
+    style.limits(top, frame, (float(f.min()) - 0.01 * np.ptp(f), float(f.max()) + 0.01 * np.ptp(f)))
+    labels.angle_ticks(top, measure)
+    style.label_axes(top, y=measure.label)
+    style.label_axes(middle, y="distance / noise floor")
+    style.label_axes(bottom, "drive frequency [Hz]")
+    fig.align_ylabels([top, middle])
+    style.complete(fig, top, "", _comparison_handles(compared, cast, shown, motions, ways))
+    return fig
+
+
+def _draw_attractors(ax: Axes, computed: Computed, measure: labels.Measure, cast: palette.Cast) -> list[int]:
+    """Draw the points of all attractors; return the ids that are there."""
+    found = computed.attractors
+    points = found["attractor_points"].sel(state=measure.name).transpose(FREQUENCY_DIM, "attractor", "point")
+    values = measure.shown(points.values, wrap=True)
+    shown = []
+    for i, number in enumerate(found["attractor"].values.tolist()):
+        x = np.broadcast_to(computed.frequencies[:, None], values[:, i].shape)
+        kept = np.isfinite(values[:, i])
+        if kept.any():
+            shown.append(number)
+            ax.plot(x[kept], values[:, i][kept], linestyle="none", marker="o", markersize=1.6, zorder=2.0,
+                    markeredgewidth=0.0, color=cast.colours[number], rasterized=True,
+                    gid=f"points:{letter(number)}")  # fmt: skip
+    return shown
+
+
+def _draw_distances(ax: Axes, compared: xr.Dataset, cast: palette.Cast) -> None:
+    ax.set_yscale("log")
+    ax.axhline(1.0, color="0.5", linewidth=0.7, zorder=1.0)
+    f, d = compared["frequency"].values, compared["distance_in_noise"].values
+    ways, winners = compared["direction"].values.astype(str), compared["winner"].values
+    for way in np.unique(ways):
+        for number in np.unique(winners[winners >= 0]):
+            chosen = (ways == way) & (winners == number)
+            face = cast.colours[int(number)] if way != "down" else "white"
+            ax.plot(f[chosen], d[chosen], linestyle="none", marker=_MARKERS[way], markersize=4.0, zorder=2.0,
+                    markeredgewidth=0.8, markeredgecolor=cast.colours[int(number)], markerfacecolor=face,
+                    gid=f"distance:{way}:{letter(int(number))}")  # fmt: skip
+    known = d[np.isfinite(d)]
+    if known.size:
+        ax.set_ylim(min(0.5, 0.7 * float(known.min())), max(10.0, 1.6 * float(known.max())))
+
+
+def _draw_regimes(ax: Axes, compared: xr.Dataset, motions: Motions, ways: Sequence[str]) -> None:
+    """Draw strips of the regimes of rig and model, two for each direction."""
+    rows: list[str] = []
+    for way in ways:
+        chosen = np.flatnonzero(compared["direction"].values == way)
+        chosen = chosen[np.argsort(compared["frequency"].values[chosen], kind="stable")]
+        for who, period, side in (
+            ("rig", "orbit_period", "side"),
+            ("model", "computed_period", "computed_side"),
+        ):
+            place = -len(rows)
+            rows.append(f"{who}, {way}" if way != "none" else who)
+            sides = compared[side].values[chosen] if side in compared else np.zeros(chosen.size, int)
+            _draw_strip(ax, compared["frequency"].values[chosen], compared[period].values[chosen], sides,
+                        place, motions)  # fmt: skip
+    ax.set_yticks(-np.arange(len(rows)), rows)
+    ax.tick_params(axis="y", which="both", length=0.0)
+    ax.set_ylim(-len(rows) + 0.4, 0.6)
+
+
+def _draw_strip(
+    ax: Axes, f: np.ndarray, periods: np.ndarray, sides: np.ndarray, place: int, motions: Motions
+) -> None:
+    edges = style.edges(f)
+    size = style.look_of(ax).tick - 1.5
+    whole = float(edges[-1] - edges[0])
+    keys = list(zip(periods.tolist(), sides.tolist(), strict=True))
+    for (period, side), run in itertools.groupby(range(f.size), key=lambda i: keys[i]):
+        if period < 0:
+            continue
+        members = list(run)
+        low, high = edges[members[0]], edges[members[-1] + 1]
+        colour = style.tinted(motions.colours[side] if side else "0.5", 0.0 if period == 0 else 0.45)
+        ax.add_patch(Rectangle((low, place - 0.42), high - low, 0.84, facecolor=colour, edgecolor="white",
+                               linewidth=0.4, gid=f"regime:{period}:{side}"))  # fmt: skip
+        if high - low > 0.012 * whole:
+            text, ink = (str(period), "black") if period else ("×", "white")
+            ax.text(
+                0.5 * (low + high), place - 0.03, text, ha="center", va="center", fontsize=size, color=ink
+            )
+
+
+def _comparison_handles(
+    compared: xr.Dataset, cast: palette.Cast, shown: Sequence[int], motions: Motions, ways: Sequence[str]
+) -> list[Any]:
+    handles: list[Any] = [style.dot(cast.names[i], cast.colours[i]) for i in shown if i in cast.main]
+    handles += [
+        style.dot(f"{_rig(compared)}{', ' + w if w != 'none' else ''}", "black", 4.0, face="none",
+                  marker=_MARKERS[w]) for w in ways
+    ]  # fmt: skip
+    codes = {*compared["computed_side"].values.tolist()}
+    codes |= set(compared["side"].values.tolist()) if "side" in compared else set()
+    handles += [
+        Patch(facecolor=style.tinted(motions.colours[c], 0.45), edgecolor="none", label=motions.words[c])
+        for c in motions.drawn
+        if c in codes and c
+    ]
+    return handles

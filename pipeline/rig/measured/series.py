@@ -1,0 +1,175 @@
+"""Time series over time series: a recording, and the model from the same state at a rising edge on."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.parameters import Parameters
+from pipeline.rig.edges import DRIVE, Edges, edges_of
+from pipeline.rig.measured.phase import section_phase
+from pipeline.rig.measured.sections import ORDER, WINDOW_S, find_sections, name_of
+from pipeline.rig.measured.steps import constant_spans
+from pipeline.spec.problems import SpecError
+
+PERIODS = 10
+RTOL = 1e-9
+_LEAST = 3
+"""Edges by which a frequency is known."""
+
+
+def series_of(
+    recording: xr.Dataset,
+    parameters: Parameters,
+    *,
+    start_s: float | None = None,
+    n_periods: int = PERIODS,
+    window_s: float = WINDOW_S,
+    order: int = ORDER,
+    hysteresis: float | None = None,
+) -> xr.Dataset:
+    """Part of a recording from a rising edge on, and the model's motion from the same state.
+
+    The model starts at the section that local polynomials find at the edge, and is driven at the frequency of
+    the line through the edges of the stretch that the part lies in.
+
+    Parameters
+    ----------
+    recording
+        As `pipeline.rig.recordings.read_recording` gives it, with all states or the angles whose rates they
+        are.
+    parameters
+        Of the recording's model.
+    start_s
+        The first rising edge at or after it [s] is taken; by default the recording's begin.
+    n_periods
+        Drive periods of the part; it ends sooner where the drive's frequency changes.
+    window_s, order, hysteresis
+        As for `pipeline.rig.measured.sections.find_sections` and `pipeline.rig.edges.find_edges`.
+
+    Returns
+    -------
+    Dataset
+        Over ``time`` [s since the edge]: the measured states under their names, smoothed rates where they are
+        not measured, and the computed ones with the suffix ``_computed``. Attributes: ``frequency_hz``,
+        ``start_s`` of the edge, ``start`` and ``rms`` (JSON by state; of angles on their circle),
+        ``duty_cycle``.
+
+    Raises
+    ------
+    SpecError
+        If the parameters are of another model, a state is not known, no edge follows `start_s` with samples
+        around it, or no period of one frequency does.
+    ArithmeticError
+        If the model diverges.
+    """
+    model = parameters.model
+    if str(recording.attrs["model"]) != model.name:
+        raise SpecError([
+            f"{name_of(recording)}: mapped to the model {recording.attrs['model']}, while {model.name} is to "
+            "be computed: choose one of them."
+        ])  # fmt: skip
+    if n_periods < 1:
+        raise SpecError([f"periods = {n_periods}: must be at least 1."])
+    edges = edges_of(recording, hysteresis=hysteresis)
+    timing = _first_timing(edges)
+    later = section_phase(parameters, timing) / timing
+    at = Edges(edges.rising + later, edges.falling, edges.resolution_s) if later else edges
+    sections = find_sections(recording, at, window_s=window_s, order=order)
+    missing = [n for n in model.state_names if n not in sections["state"].values]
+    if missing:
+        raise SpecError([
+            f"{name_of(recording)}: {', '.join(missing)} at the start is not known: map its channel, or that "
+            "of the angle whose rate it is."
+        ])  # fmt: skip
+    first, last = _part(recording, edges, sections, start_s, n_periods)
+    own = _fitted(edges, first, last)
+    period = (own[-1] - own[0]) / (own.size - 1)
+    part = int(np.flatnonzero(sections["number"].values == first)[0])
+    start = sections["section"].values[part]
+    # the section was taken at the edge that was seen; the line through many knows its instant better
+    start_time = float(edges.rising[first]) + later
+    return _dataset(recording, parameters, edges, start, start_time, 1 / period, last - first)
+
+
+def _part(
+    recording: xr.Dataset, edges: Edges, sections: xr.Dataset, start_s: float | None, n_periods: int
+) -> tuple[int, int]:
+    """First and last edge of the part."""
+    begin = -math.inf if start_s is None else start_s
+    known = [int(n) for n in sections["number"].values if edges.rising[int(n)] >= begin]
+    for first in known:
+        for a, b in constant_spans(edges):
+            # a stretch of a few periods is where the drive changes
+            if a <= first < b and b - a >= _LEAST:
+                return first, min(b, first + n_periods)
+    raise SpecError([
+        f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} "
+        f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
+        f"{edges.rising[-1]:.3f} s."
+    ])  # fmt: skip
+
+
+def _first_timing(edges: Edges) -> float:
+    """Frequency of the drive, roughly [Hz]."""
+    if edges.rising.size < _LEAST:
+        raise SpecError([f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them."])
+    return 1 / float(np.median(np.diff(edges.rising)))
+
+
+def _fitted(edges: Edges, first: int, last: int) -> np.ndarray:
+    """Edges of the stretch that the part lies in."""
+    a, b = next((a, b) for a, b in constant_spans(edges) if a <= first < b)
+    rising = edges.rising[a : b + 1]
+    n = np.arange(rising.size, dtype=np.float64)
+    slope, begin = np.polyfit(n - n.mean(), rising - rising.mean(), 1)
+    line = rising.mean() + begin + slope * (n - n.mean())
+    return np.asarray(line[first - a : last - a + 1])
+
+
+def _dataset(
+    recording: xr.Dataset, parameters: Parameters, edges: Edges, start: np.ndarray, begin: float,
+    frequency_hz: float, n_periods: int,
+) -> xr.Dataset:  # fmt: skip
+    from magpend_core import trajectory
+    from pipeline.rig.recordings import smooth
+
+    model = parameters.model
+    chosen = (recording["time"].values >= begin) & (
+        recording["time"].values <= begin + n_periods / frequency_hz
+    )
+    margin = (recording["time"].values > begin - 1) & (
+        recording["time"].values < begin + n_periods / frequency_hz + 1
+    )
+    around = np.concatenate([edges.rising, edges.falling])
+    smoothed = smooth(recording.isel(sample=np.flatnonzero(margin)), edges_s=np.sort(around))
+    inner = chosen[margin]
+    time = recording["time"].values[chosen] - begin
+    states = trajectory(parameters, frequency_hz, start, time, rtol=RTOL, atol=RTOL)
+    variables, rms = {}, {}
+    for i, s in enumerate(model.states):
+        source = recording[s.name].values[chosen] if s.name in recording else smoothed[s.name].values[inner]
+        # the recording counts turns from its own begin
+        shift = 2 * np.pi * np.round((source[0] - states[0, i]) / (2 * np.pi)) if s.on_circle else 0.0
+        off = source - shift - states[:, i]
+        off = off - 2 * np.pi * np.round(off / (2 * np.pi)) if s.on_circle else off
+        about = {"units": s.unit, "long_name": s.meaning}
+        variables[s.name] = ("time", source - shift, about)
+        variables[f"{s.name}_computed"] = (
+            "time",
+            states[:, i],
+            {**about, "long_name": f"{s.meaning}, computed"},
+        )
+        rms[s.name] = float(np.sqrt(np.nanmean(off**2)))
+    if DRIVE in recording:
+        variables[DRIVE] = ("time", recording[DRIVE].values[chosen], dict(recording[DRIVE].attrs))
+    axis = ("time", time, {"units": "s", "long_name": f"time since {model.section}"})
+    return xr.Dataset(variables, coords={"time": axis}).assign_attrs(
+        title="recording and model from the same state", model=model.name, frequency_hz=frequency_hz,
+        start_s=begin, start=json.dumps(dict(zip(model.state_names, start.tolist(), strict=True))),
+        rms=json.dumps(rms), simulated=int(recording.attrs.get("simulated", 0)), file=name_of(recording),
+        parameters="\n".join(f"{n} = {v!r}" for n, v in parameters.as_dict().items()),
+    )  # fmt: skip

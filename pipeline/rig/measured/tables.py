@@ -1,0 +1,139 @@
+"""Tables of measured diagrams: a row per step, and a row per window's edge."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.tabular import Row, aligned, number
+from pipeline.layout.vocabulary import model_of
+from pipeline.products.product import Table
+from pipeline.rig.measured.windows import CONFIDENT, words_for
+
+FAR = 5.0
+"""Noise floors beyond which an attractor is not the rig's."""
+
+
+def steps_table(measured: xr.Dataset) -> Table:
+    """Table of the steps: frequency, jitter, duty cycle, period, how sure it is; compared ones have more."""
+    rows = [_row(measured, i) for i in range(measured.sizes["step"])]
+    plural = "s" * (len(rows) != 1)
+    return Table(rows, [f"{len(rows)} step{plural}", *aligned([_words(r) for r in rows])])
+
+
+def _row(measured: xr.Dataset, step: int) -> Row:
+    one = measured.isel(step=step)
+    words = words_of(measured)
+    row: Row = {
+        "frequency_hz": float(one["frequency"]),
+        "frequency_error_hz": float(one["frequency_error_hz"]),
+        "direction": str(one["direction"].values),
+        "recording": int(one["recording"]),
+        "start_s": float(one["start_s"]),
+        "jitter_s": float(one["jitter_s"]),
+        "duty_cycle": float(one["duty_cycle"]),
+        "duty_cycle_error": float(one["duty_cycle_error"]),
+        "n_sections": int(one["n_sections"]),
+        "orbit_period": int(one["orbit_period"]),
+        "confidence": float(one["confidence"]),
+        "closure": float(one["closure"]),
+    }
+    if "side" in one:
+        row["side"] = words[int(one["side"])]
+    if "winner" in one:
+        row |= {n: float(one[n]) for n in ("distance", "distance_in_noise", "runner_up", "noise_floor")}
+        row |= {n: int(one[n]) for n in ("winner", "computed_period", "same_period", "same_side")}
+        if words:
+            row["computed_side"] = words[int(one["computed_side"])]
+    return row
+
+
+def words_of(measured: xr.Dataset) -> tuple[str, ...]:
+    """Words of the model's classifier; none without one."""
+    classifier = model_of(measured).classifier
+    return classifier.words if classifier is not None else ()
+
+
+def _words(row: Row) -> dict[str, str]:
+    ms, error = 1e3 * row["jitter_s"], row["frequency_error_hz"]
+    digits = int(np.clip(1 - math.floor(math.log10(error)), 0, 8)) if 0 < error < 1 else 6
+    words = {
+        "frequency Hz": f"{row['frequency_hz']:.{digits}f} ± {error:.{digits}f}",
+        "way": row["direction"],
+        "jitter ms": number(ms, ".3f"),
+        "duty cycle": f"{row['duty_cycle']:.4f} ± {row['duty_cycle_error']:.4f}",
+        "sections": str(row["n_sections"]),
+        "period": str(row["orbit_period"] or "-"),
+        "sure": f"{row['confidence']:.2f}",
+    }
+    if "side" in row:
+        words["side"] = row["side"]
+    if "winner" in row:
+        nobody = row["winner"] < 0
+        words["nearest"] = "-" if nobody else str(row["winner"])
+        words["its period"] = "-" if nobody else str(row["computed_period"] or "-")
+        if "computed_side" in row:
+            words["its side"] = "-" if nobody else row["computed_side"]
+        words["distance"] = number(row["distance"], ".4f")
+        words["in noise"] = number(row["distance_in_noise"], ".2f")
+        words["next"] = number(row["runner_up"], ".4f")
+    return words
+
+
+def edges_table(compared: xr.Dataset) -> Table:
+    """Table of the ends of windows, on the rig and in the model."""
+    words = words_of(compared)
+    rows: list[Row] = []
+    for k in range(compared.sizes.get("edge", 0)):
+        one = compared.isel(edge=k)
+        row: Row = {"direction": str(one["edge_direction"].values)}
+        for n in ("before", "after"):
+            row[n] = words_for((int(one[f"edge_{n}_period"]), int(one[f"edge_{n}_side"])), words)
+        for n in ("measured", "computed", "shift"):
+            row |= {f"{n}_hz": float(one[f"edge_{n}_hz"]), f"{n}_error_hz": float(one[f"edge_{n}_error_hz"])}
+        rows.append(row | {"note": str(one["edge_note"].values)})
+    plural = "s" * (len(rows) != 1)
+    lines = [f"{len(rows)} window edge{plural}", *aligned([_edge_words(r) for r in rows])]
+    return Table(rows, lines)
+
+
+def _edge_words(row: Row) -> dict[str, str]:
+    return {
+        "way": row["direction"],
+        "from": row["before"],
+        "to": row["after"],
+        "measured Hz": _between(row, "measured"),
+        "computed Hz": _between(row, "computed"),
+        "shift Hz": _between(row, "shift"),
+        "note": row["note"],
+    }
+
+
+def _between(row: Row, name: str) -> str:
+    value, error = row[f"{name}_hz"], row[f"{name}_error_hz"]
+    return "-" if math.isnan(value) else f"{value:.4f} ± {error:.4f}"
+
+
+def summary_lines(compared: xr.Dataset) -> list[str]:
+    """Return what the comparison comes to, in a few lines."""
+    covered = compared["winner"].values >= 0
+    sure = covered & (compared["confidence"].values >= CONFIDENT)
+    d = compared["distance_in_noise"].values[covered]
+    lines = [
+        f"{int(covered.sum())} of {covered.size} steps lie on the run's axis; distance from the nearest "
+        f"attractor: median {np.median(d):.2f}, 90 % below {np.quantile(d, 0.9):.2f} noise floors"
+    ]
+    for name, what in (("same_period", "periods"), ("same_side", "sides")):
+        known = sure & (compared[name].values >= 0)
+        if known.any():
+            share = compared[name].values[known].mean()
+            lines.append(f"{what} agree at {100 * share:.0f} % of the {int(known.sum())} steps that are sure")
+    far = int((d > FAR).sum())
+    if far:
+        lines.append(
+            f"at {far} steps the nearest attractor is more than {FAR:g} noise floors away: the model is off, "
+            "or the run did not find the attractor, which more initial conditions may"
+        )
+    return lines

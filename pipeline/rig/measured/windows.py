@@ -1,0 +1,165 @@
+"""Windows of a sweep: where a motion's regime ends on the rig and in the model, and how far apart."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from pipeline.rig.measured.computed import Computed
+
+CONFIDENT = 0.8
+"""A step whose period is less sure has no part in the windows."""
+
+Regime = tuple[int, int]
+"""Period, 0 for none, and code of the side."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """Neighbouring steps of one recording and direction with the same regime."""
+
+    regime: Regime
+    steps: tuple[int, ...]
+    recording: int
+    direction: str
+
+
+@dataclass(frozen=True)
+class WindowEdge:
+    """The end of a window on the rig, and of the same regime in the model.
+
+    Attributes
+    ----------
+    direction : str
+        Of the sweep.
+    before, after : tuple of int
+        Regimes on the rig.
+    measured_hz, measured_error_hz : float
+        Middle between the last step before and the first after, and half their distance.
+    computed_hz, computed_error_hz : float
+        The same in the model, for the attractor that is nearest within the window; NaN if there is none with
+        that regime, or it goes on to the end of the run's axis.
+    note : str
+        Why there is no number.
+    """
+
+    direction: str
+    before: Regime
+    after: Regime
+    measured_hz: float
+    measured_error_hz: float
+    computed_hz: float
+    computed_error_hz: float
+    note: str
+
+    @property
+    def shift_hz(self) -> float:
+        """Measured less computed [Hz]."""
+        return self.measured_hz - self.computed_hz
+
+    @property
+    def shift_error_hz(self) -> float:
+        """Sum of both halves of a step [Hz]: a bound, not a standard error."""
+        return self.measured_error_hz + self.computed_error_hz
+
+
+def regime_of(measured: xr.Dataset, step: int) -> Regime:
+    """Period and side of a step."""
+    side = int(measured["side"].values[step]) if "side" in measured else 0
+    return int(measured["orbit_period"].values[step]), side
+
+
+def words_for(regime: Regime, words: tuple[str, ...]) -> str:
+    """Say a regime."""
+    period = f"period {regime[0]}" if regime[0] else "unclosed"
+    return f"{period}, {words[regime[1]]}" if regime[1] and words else period
+
+
+def windows_of(measured: xr.Dataset, *, confident: float = CONFIDENT) -> list[Window]:
+    """Windows of all recordings; steps that are not sure of their period are passed over."""
+    keys = list(
+        zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True)
+    )
+    sure = [i for i in range(len(keys)) if measured["confidence"].values[i] >= confident]
+    labelled = itertools.groupby(sure, key=lambda i: (keys[i], regime_of(measured, i)))
+    return [Window(regime, tuple(steps), *key) for (key, regime), steps in labelled]
+
+
+def window_edges(
+    measured: xr.Dataset, winners: np.ndarray, computed: Computed, *, confident: float = CONFIDENT
+) -> list[WindowEdge]:
+    """Ends of the measured windows, each with the end of the same regime in the model.
+
+    Parameters
+    ----------
+    measured
+        Result of `pipeline.rig.measured.measuring.measure`, with sides if the model tells any.
+    winners
+        Id of the nearest attractor of each step, -1 for none.
+    computed
+        The model's attractors.
+    confident
+        Least confidence of a step.
+    """
+    windows = windows_of(measured, confident=confident)
+    found = []
+    for one, two in itertools.pairwise(windows):
+        if (one.recording, one.direction) != (two.recording, two.direction):
+            continue
+        f = measured["frequency"].values
+        last, first = float(f[one.steps[-1]]), float(f[two.steps[0]])
+        computed_hz, error, note = _computed_end(one, measured, winners, computed)
+        found.append(
+            WindowEdge(
+                one.direction, one.regime, two.regime, 0.5 * (last + first), 0.5 * abs(first - last),
+                computed_hz, error, note,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _computed_end(
+    window: Window, measured: xr.Dataset, winners: np.ndarray, computed: Computed
+) -> tuple[float, float, str]:
+    """Where the regime of a measured window ends in the model, in the direction of the sweep."""
+    f = measured["frequency"].values
+    with_side = "side" in measured
+    chosen = {}
+    for step in window.steps:
+        place = computed.place(float(f[step]))
+        regime = computed.regime(place, int(winners[step])) if place >= 0 and winners[step] >= 0 else None
+        if regime is not None and _same(regime, window.regime, with_side):
+            chosen[step] = (place, int(winners[step]))
+    if not chosen:
+        return math.nan, math.nan, "the model's nearest attractor has another regime all along"
+    number = Counter(n for _, n in chosen.values()).most_common(1)[0][0]
+    middle = window.steps[len(window.steps) // 2]
+    start = min((s for s, (_, n) in chosen.items() if n == number), key=lambda s: abs(s - middle))
+    place, sign = chosen[start][0], 1 if window.direction != "down" else -1
+    return _walk(place, sign, computed, lambda i: _is(computed.regime(i, number), window.regime, with_side))
+
+
+def _walk(
+    place: int, sign: int, computed: Computed, holds: Callable[[int], bool]
+) -> tuple[float, float, str]:
+    """Go along the run's axis while something holds; middle of the last with it and the first without."""
+    f = computed.frequencies
+    while 0 <= place + sign < f.size:
+        if not holds(place + sign):
+            return 0.5 * float(f[place] + f[place + sign]), 0.5 * abs(float(f[place + sign] - f[place])), ""
+        place += sign
+    return math.nan, math.nan, f"in the model it goes on beyond {f[place]:g} Hz"
+
+
+def _is(regime: Regime | None, wanted: Regime, with_side: bool) -> bool:
+    return regime is not None and _same(regime, wanted, with_side)
+
+
+def _same(a: Regime, b: Regime, with_side: bool) -> bool:
+    return a == b if with_side else a[0] == b[0]

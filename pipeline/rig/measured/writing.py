@@ -1,0 +1,65 @@
+"""A comparison as files: figures, tables, data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import xarray as xr
+
+from pipeline.plots.files import save_data, save_figure
+from pipeline.plots.style import WIDE, Frame
+from pipeline.products.product import Table
+from pipeline.rig.measured.computed import Computed
+from pipeline.rig.measured.figures import plot_comparison, plot_measured
+from pipeline.rig.measured.tables import edges_table, steps_table
+
+
+def write_comparison(
+    compared: xr.Dataset, computed: Computed, folder: Path, *, state: str = "", degrees: bool = False,
+    frame: Frame = WIDE,
+) -> list[Path]:  # fmt: skip
+    """Write the figures, the tables and the numbers of a comparison.
+
+    Parameters
+    ----------
+    compared
+        Result of `pipeline.rig.measured.compare.compare_with`.
+    computed
+        What it was compared with.
+    folder
+        Made if absent; files of an earlier comparison are replaced.
+    state, degrees, frame
+        As for the figures.
+
+    Returns
+    -------
+    list of Path
+        ``comparison``, ``beside`` and ``over`` as ``.png`` with their data as ``.nc``, ``steps.csv`` and
+        ``edges.csv``.
+    """
+    figures = {
+        "comparison": plot_comparison(compared, computed, state=state, degrees=degrees, frame=frame),
+        "beside": plot_measured(compared, computed.cube, state=state, degrees=degrees, frame=frame),
+        "over": plot_measured(
+            compared, computed.cube, state=state, degrees=degrees, layout="over", frame=frame
+        ),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, figure in figures.items():
+        figure.data = figure.data.assign_attrs(run=computed.title, cube_digest=computed.digest)
+        written += [save_figure(figure, folder / f"{name}.png"), save_data(figure, folder / f"{name}.nc")]
+    for name, table in (("steps", steps_table(compared)), ("edges", edges_table(compared))):
+        written.append(_write(table, folder / f"{name}.csv"))
+    return written
+
+
+def _write(table: Table, path: Path) -> Path:
+    import csv
+
+    names = list(dict.fromkeys(name for row in table.rows for name in row))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in table.rows)
+    return path

@@ -1,0 +1,342 @@
+"""The fit: residuals, slopes and optima against scipy's integrator, closed forms and known truths."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
+
+from magpend_core.models import load_model
+from magpend_core.sampling import Drive
+from pipeline.rig.identify.local import fit_local
+from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.problem import Free, Piece, Problem
+from pipeline.rig.identify.search import cut, refine, search, slowest_period, sobol
+from pipeline.rig.identify.starts import fit_starts
+
+MODEL = load_model("duffing")
+TRUTH = {"damping": 0.15, "linear": 3.0, "cubic": 0.8, "amplitude": 1.2}
+FREQUENCY = 0.31
+ZERO = 0.02
+NOISE = 1e-3
+
+
+def motion(p, start, time, phase_s=0.0):
+    """The oscillator by scipy, from its equation."""
+
+    def rhs(t, y):
+        force = p["amplitude"] * np.cos(2 * np.pi * FREQUENCY * (t + phase_s))
+        return [y[1], force - p["damping"] * y[1] - p["linear"] * y[0] - p["cubic"] * y[0] ** 3]
+
+    return solve_ivp(rhs, (0, time[-1]), start, "DOP853", time, rtol=1e-10, atol=1e-10).y.T
+
+
+def drive_from(phase_s):
+    return Drive(np.full(9, 1 / FREQUENCY)).window(phase_s, phase_s + 8.0)
+
+
+STARTS = np.array([[1.5, 0.0], [-0.6, 1.1], [0.3, -2.0]])
+
+
+def make_problem(noise=0.0, free=("damping", "linear", "cubic", "amplitude"), **more):
+    rng = np.random.default_rng(7)
+    time = np.arange(161) * 0.05
+    pieces = []
+    for k, start in enumerate(STARTS):
+        phase = 0.7 * k
+        x = motion(TRUTH, start, time, phase)[:, :1] + ZERO + noise * rng.normal(size=(161, 1))
+        guess = start + np.array([0.01, -0.02])
+        pieces.append(Piece(0, k, time, x, guess, drive_from(phase)))
+    unknowns = tuple(Free(n, 1.25 * TRUTH[n], 0.0, 10.0) for n in free)
+    unknowns += (Free("zero.x", 0.0, -0.5, 0.5),)
+    fixed = MODEL.load(**TRUTH)
+    return Problem(MODEL, fixed, unknowns, ("x",), tuple(pieces), np.array([NOISE]), rtol=1e-9, **more)
+
+
+def truth_of(problem):
+    return np.array([TRUTH.get(name, ZERO) for name in problem.names])
+
+
+def brute_rows(problem, theta, starts):
+    """Residuals in units of the noise, by scipy, all rows."""
+    values = {**TRUTH, **{n: v for n, v in zip(problem.names, theta, strict=True) if n in TRUTH}}
+    rows = []
+    for k, piece in enumerate(problem.pieces):
+        x = motion(values, starts[k], piece.time, 0.7 * k)[:, 0] + theta[-1]
+        rows.append((piece.measured[:, 0] - x) / NOISE)
+    return np.concatenate(rows)
+
+
+def brute_jacobian(problem, theta, starts):
+    whole = np.append(theta, starts.ravel())
+    columns, n = [], len(theta)
+    for i in range(len(whole)):
+        h = 1e-5 * max(abs(whole[i]), 0.1)
+        sides = [whole + s * h * np.eye(len(whole))[i] for s in (1, -1)]
+        a, b = (brute_rows(problem, w[:n], w[n:].reshape(starts.shape)) for w in sides)
+        columns.append((a - b) / (2 * h))
+    return np.column_stack(columns)
+
+
+@pytest.mark.parametrize("slopes", ["differences", "variational"])
+def test_evaluate__has_the_cost_and_the_normal_equations_of_all_samples(slopes):
+    """The compressed rows stand for all of them: same cost, gradient and normal matrix as by brute force."""
+    problem = make_problem(slopes=slopes)
+    theta = truth_of(problem) * 1.02
+    found = evaluate(problem, theta[None], problem.starts[None], slopes=True)[0]
+    rows, jacobian = (
+        brute_rows(problem, theta, problem.starts),
+        brute_jacobian(problem, theta, problem.starts),
+    )
+    assert len(found.rows) < len(rows) / 10
+    assert found.cost == pytest.approx(0.5 * rows @ rows, rel=1e-5)
+    size = np.linalg.norm(jacobian, axis=0)
+    normal = (jacobian.T @ jacobian) / np.outer(size, size)
+    np.testing.assert_allclose(found.jacobian.T @ found.jacobian / np.outer(size, size), normal, atol=2e-4)
+    gradient = jacobian.T @ rows / size / np.linalg.norm(rows)
+    np.testing.assert_allclose(
+        found.jacobian.T @ found.rows / size / np.linalg.norm(rows), gradient, atol=2e-4
+    )
+
+
+def test_evaluate__of_a_population_is_that_of_each_alone():
+    problem = make_problem()
+    thetas = truth_of(problem) * np.array([[0.9], [1.0], [1.1]])
+    starts = np.stack([problem.starts, problem.starts + 0.1, problem.starts - 0.1])
+    together = evaluate(problem, thetas, starts, slopes=False)
+    for i, one in enumerate(together):
+        alone = evaluate(problem, thetas[i : i + 1], starts[i : i + 1], slopes=False)[0]
+        np.testing.assert_array_equal(one.rows, alone.rows)
+
+
+@pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
+def test_evaluate__counts_a_robust_loss_as_scipy_does(loss):
+    problem = make_problem(loss=loss, loss_scale=3.0)
+    theta = truth_of(problem) * 1.001
+    z = brute_rows(problem, theta, problem.starts)
+    asked = least_squares(
+        lambda x: z + 0 * x, [0.0], jac=lambda x: np.zeros((len(z), 1)), loss=loss, f_scale=3.0
+    )
+    for slopes in (False, True):
+        found = evaluate(problem, theta[None], problem.starts[None], slopes=slopes)[0]
+        assert found.cost == pytest.approx(asked.cost, rel=1e-5)
+
+
+def test_evaluate__ignores_what_was_not_measured():
+    problem = make_problem()
+    holes = [
+        replace(p, measured=np.where(np.arange(161)[:, None] % 3 == 0, np.nan, p.measured))
+        for p in problem.pieces
+    ]
+    theta = truth_of(problem) * 1.01
+    found = evaluate(replace(problem, pieces=tuple(holes)), theta[None], problem.starts[None], slopes=True)[0]
+    rows = brute_rows(replace(problem, pieces=tuple(holes)), theta, problem.starts)
+    assert found.cost == pytest.approx(0.5 * np.nansum(rows**2), rel=1e-5)
+
+
+def test_fit_local__finds_the_truth():
+    problem = make_problem()
+    fit = fit_local(problem, problem.start)
+    assert fit.converged
+    np.testing.assert_allclose(fit.theta, truth_of(problem), rtol=1e-5)
+    np.testing.assert_allclose(fit.starts, STARTS, atol=1e-5)
+    assert fit.rms[0] < 1e-6
+
+
+def test_fit_local__is_the_optimum_of_brute_force():
+    """With noise: where scipy's own differences of all residuals end."""
+    problem = make_problem(NOISE)
+    fit = fit_local(problem, problem.start)
+    whole = np.append(fit.theta, fit.starts.ravel())
+    n = len(fit.theta)
+    other = least_squares(
+        lambda w: brute_rows(problem, w[:n], w[n:].reshape(-1, 2)), whole * 1.001,
+        jac=lambda w: brute_jacobian(problem, w[:n], w[n:].reshape(-1, 2)), x_scale="jac",
+    )  # fmt: skip
+    deviation = np.sqrt(np.diag(np.linalg.inv(other.jac.T @ other.jac)))
+    assert np.max(np.abs(whole - other.x) / deviation) < 1e-2
+    assert fit.rms[0] == pytest.approx(NOISE, rel=0.1)
+
+
+def test_fit_local__holds_what_is_fixed():
+    problem = make_problem()
+    truth = dict(zip(problem.names, truth_of(problem), strict=True))
+    fit = fit_local(problem, truth_of(problem), fixed=truth)
+    np.testing.assert_allclose(fit.theta, truth_of(problem))
+    np.testing.assert_allclose(fit.starts, STARTS, atol=1e-6)
+    some = fit_local(problem, problem.start, fixed={"cubic": 0.9, "zero.x": ZERO})
+    assert some.theta[problem.names.index("cubic")] == 0.9
+    assert some.cost > 100 * fit.cost
+
+
+def test_fit_starts__finds_each_start_by_itself():
+    """One piece's guess is far off: the others do not wait for it, and it gets there."""
+    problem = make_problem()
+    guess = problem.starts.copy()
+    guess[1] += [0.8, -1.5]
+    found = fit_starts(problem, truth_of(problem), guess)
+    np.testing.assert_allclose(found, STARTS, atol=1e-5)
+    alone = replace(problem, pieces=problem.pieces[1:2])
+    np.testing.assert_allclose(fit_starts(alone, truth_of(problem), guess[1:2])[0], found[1], atol=1e-9)
+
+
+def test_fit_local__withstands_outliers_with_a_robust_loss():
+    problem = make_problem(NOISE)
+    rng = np.random.default_rng(3)
+    spoilt = tuple(
+        replace(p, measured=p.measured + 0.3 * (rng.random((161, 1)) < 0.05)) for p in problem.pieces
+    )
+    errors = {}
+    for loss in ("linear", "soft_l1"):
+        fit = fit_local(replace(problem, pieces=spoilt, loss=loss), problem.start)
+        assert fit.converged
+        errors[loss] = np.abs(fit.theta / truth_of(problem) - 1).max()
+    assert errors["soft_l1"] < 0.1 * errors["linear"]
+
+
+def test_fit_local__follows_ties_and_priors():
+    tied = make_problem(free=("damping", "linear", "amplitude"), tied={"cubic": (0.8 / 3.0, "linear")})
+    fit = fit_local(tied, tied.start)
+    np.testing.assert_allclose(fit.theta, truth_of(tied), rtol=1e-5)
+    plain = make_problem(NOISE)
+    free = tuple(replace(f, prior_mean=3.3, prior_sd=1e-7) if f.name == "linear" else f for f in plain.free)
+    pinned = fit_local(replace(plain, free=free), plain.start)
+    assert pinned.theta[1] == pytest.approx(3.3, abs=1e-4)
+
+
+def test_fit_local__keeps_to_the_bounds():
+    problem = make_problem()
+    free = tuple(replace(f, lower=0.2, start=0.3) if f.name == "damping" else f for f in problem.free)
+    fit = fit_local(replace(problem, free=free), np.array([f.start for f in free]))
+    assert fit.theta[0] == pytest.approx(0.2, abs=1e-6)
+
+
+def test_fit_local__says_that_it_has_not_converged():
+    problem = make_problem()
+    fit = fit_local(problem, problem.start * 0.5, max_evaluations=2)
+    assert not fit.converged
+
+
+def long_problem(weight):
+    """One record as three stretches, each continuing the one before."""
+    time = np.arange(321) * 0.05
+    x = motion(TRUTH, STARTS[0], time)[:, :1] + ZERO
+    x += 5 * NOISE * np.random.default_rng(8).normal(size=x.shape)
+    bounds = [0, 100, 210, 321]
+    pieces = []
+    for k, (a, b) in enumerate(pairwise(bounds)):
+        drive = Drive(np.full(9, 1 / FREQUENCY)).window(time[a], time[b - 1] + 0.05)
+        start = [1.5, 0.0] if k == 0 else [x[a, 0] - ZERO, (x[a + 2, 0] - x[a - 2, 0]) / 0.2]
+        pieces.append(Piece(0, 0, time[a:b] - time[a], x[a:b], np.array(start), drive, k - 1))
+    unknowns = tuple(Free(n, 1.05 * TRUTH[n], 0.0, 10.0) for n in TRUTH)
+    return Problem(
+        MODEL,
+        MODEL.load(**TRUTH),
+        unknowns,
+        ("x",),
+        tuple(pieces),
+        np.array([NOISE]),
+        continuity=weight,
+        rtol=1e-9,
+    )
+
+
+def test_fit_local__closes_the_gaps_as_their_weight_grows():
+    gaps = []
+    for weight in (0.01, 1.0, 100.0):
+        problem = long_problem(weight)
+        fit = fit_local(problem, problem.start)
+        assert fit.converged
+        ends = [
+            motion(
+                dict(zip(TRUTH, fit.theta, strict=True)),
+                fit.starts[k],
+                np.append(p.time, p.time[-1] + 0.05),
+                t,
+            )[-1]
+            for k, (p, t) in enumerate(zip(problem.pieces, (0.0, 5.0, 10.5), strict=True))
+        ]
+        gaps.append(max(np.abs(ends[k] - fit.starts[k + 1]).max() for k in range(2)))
+    assert gaps[0] > 1.5 * gaps[1] > 100 * gaps[2], gaps
+    assert gaps[2] < 1e-3
+
+
+def test_cut__reads_starts_off_the_recording():
+    problem = make_problem(0.1 * NOISE)
+    pieces = cut(problem, 1.5).pieces
+    assert len(pieces) == 3 * 5
+    for p in pieces:
+        assert p.time[0] == 0.0
+        begin = {k: 0.7 * k for k in range(3)}[p.number]
+        whole = motion(TRUTH, STARTS[p.number], np.arange(161) * 0.05, begin)
+        at = int(np.argmin(np.abs(problem.pieces[p.number].measured[:, 0] - p.measured[0, 0])))
+        if at:
+            np.testing.assert_allclose(p.start, whole[at] + [ZERO, 0.0], atol=0.03)
+
+
+def test_slowest_period__is_that_of_a_sine():
+    time = np.arange(4001) * 0.01
+    x = np.column_stack([np.sin(2 * np.pi * time / 1.7) + 0.3])
+    problem = replace(make_problem(), pieces=(Piece(0, 0, time, x, np.zeros(2)),))
+    assert slowest_period(problem) == pytest.approx(1.7, rel=0.05)
+
+
+class Shelf:
+    def __init__(self):
+        self.fits, self.recalled = {}, []
+
+    def recall(self, number):
+        if number in self.fits:
+            self.recalled.append(number)
+        return self.fits.get(number)
+
+    def store(self, number, fit):
+        self.fits[number] = fit
+
+
+def test_search__ends_at_the_truth_from_guesses_far_off():
+    problem, shelf = make_problem(NOISE), Shelf()
+    arguments = {"n_starts": 6, "seed": 3, "spread": 0.3, "n_samples": 6}
+    fits = search(problem, keep=shelf, **arguments)
+    assert all(fit.converged for fit in fits)
+    assert max(fit.cost for fit in fits) == pytest.approx(fits[0].cost, rel=1e-6)
+    np.testing.assert_allclose(fits[0].theta, truth_of(problem), rtol=0.01)
+    del shelf.fits[2]
+    again = search(problem, keep=shelf, **arguments)
+    assert sorted(shelf.recalled) == [0, 1, 3, 4, 5]
+    np.testing.assert_array_equal([f.theta for f in again], [f.theta for f in fits])
+
+
+def test_search__finds_guesses_by_cma():
+    """From a guess from which the local stage alone ends elsewhere."""
+    problem = make_problem(NOISE)
+    free = tuple(replace(f, start=7.0) if f.name == "linear" else f for f in problem.free)
+    fits = search(replace(problem, free=free), n_starts=2, seed=1, spread=0.5, method="cma")
+    np.testing.assert_allclose(fits[0].theta, truth_of(problem), rtol=0.01)
+
+
+def test_sobol__keeps_to_spread_and_bounds():
+    problem = make_problem()
+    points = sobol(problem, 100, 5, 0.3)
+    start = problem.start
+    assert points.shape == (100, len(start))
+    assert (np.abs(points - start) <= 0.3 * np.array([f.size for f in problem.free]) + 1e-12).all()
+    assert (np.ptp(points, axis=0) > 0.5 * 0.6 * np.array([f.size for f in problem.free])).all()
+    np.testing.assert_array_equal(points, sobol(problem, 100, 5, 0.3))
+
+
+def test_refine__under_a_measured_torque():
+    """The same motion, its drive given as values at instants."""
+    problem = make_problem(free=("damping", "linear", "cubic"))
+    time = np.arange(1601) * 0.005
+    pieces = tuple(
+        replace(p, drive=Drive.from_torque(time, 1.2 * np.cos(2 * np.pi * FREQUENCY * (time + 0.7 * k))))
+        for k, p in enumerate(problem.pieces)
+    )
+    fit = refine(replace(problem, pieces=pieces, recorded=True), problem.start)
+    assert fit.converged
+    np.testing.assert_allclose(fit.theta, truth_of(problem), rtol=1e-4)

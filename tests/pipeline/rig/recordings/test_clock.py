@@ -1,0 +1,233 @@
+"""Clocks: even time, gaps, jitter, channels that begin or end apart, rates that do not fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.rig.recordings import findings_of, recording_of, window
+from pipeline.rig.recordings.clock import clock_of
+from pipeline.rig.recordings.mapping import parse_mapping
+from pipeline.rig.recordings.raw import Channel
+from pipeline.spec.problems import SpecError
+
+
+def stamped(make, stamps, **more):
+    """Recording with a channel of time stamps."""
+    n = len(stamps)
+    a, b = make.swing(n)
+    mapping = parse_mapping({
+        "model": "pendulum", "time": {"channel": "t", **more},
+        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+    })  # fmt: skip
+    return recording_of(make.raw(make.channels({"t": stamps, "a": a, "b": b}, step_s=np.nan)), mapping)
+
+
+def test_clock__even_stamps_give_a_round_rate(make):
+    stamps = np.round(17.25 + np.arange(5000) / 3000.0, 6)  # cut to microseconds
+    ds = stamped(make, stamps)
+    assert ds.attrs["sampling_rate_hz"] == 3000.0
+    assert findings_of(ds) == []
+    np.testing.assert_allclose(ds["time"], np.arange(5000) / 3000.0, atol=1e-12)
+
+
+def test_clock__a_rate_that_is_not_round_stays_as_it_is(make):
+    step = 1.0 / 997.3137
+    assert stamped(make, step * np.arange(4000)).attrs["sampling_rate_hz"] == pytest.approx(
+        997.3137, rel=1e-9
+    )
+
+
+def test_clock__unit_of_the_stamps(make):
+    assert stamped(make, np.arange(1000) * 2.0, unit="ms").attrs["sampling_rate_hz"] == 500.0
+
+
+def test_clock__gap_begins_a_new_piece(make):
+    stamps = make.time.copy()
+    stamps[700:] += 0.5
+    stamps[1500:] += 0.004  # two samples
+    ds = stamped(make, stamps)
+    found = findings_of(ds)
+    assert [f.kind for f in found] == ["gap", "gap"]
+    assert (found[0].start_s, found[0].end_s) == (pytest.approx(stamps[699]), pytest.approx(stamps[700]))
+    assert "250 samples are missing" in found[0].text
+    assert "2 samples are missing" in found[1].text
+    assert np.flatnonzero(np.diff(ds["piece"])).tolist() == [699, 1499]
+    np.testing.assert_allclose(ds["time"], stamps, atol=1e-9)
+
+
+def test_clock__jitter_is_told_and_time_is_even(make):
+    rng = np.random.default_rng(1)
+    stamps = make.time + rng.uniform(-0.2, 0.2, make.n) * make.step_s
+    ds = stamped(make, stamps)
+    (found,) = findings_of(ds)
+    assert (found.kind, found.severity) == ("jitter", "note")
+    assert f"{0.2 * make.step_s / 3**0.5:.2g}"[:4] in found.text  # 0.00023: standard deviation
+    assert np.ptp(np.diff(ds["time"])) < 1e-12
+    np.testing.assert_allclose(ds["time"], make.time - make.time[0], atol=0.3 * make.step_s)
+
+
+def test_clock__late_stamps_are_no_gap_and_gaps_are_found_among_them(make):
+    """Jitter so strong that neighbours stand more than one and a half steps apart."""
+    rng = np.random.default_rng(1)
+    stamps = make.time + rng.uniform(-0.35, 0.35, make.n) * make.step_s
+    assert np.diff(stamps).max() > 1.6 * make.step_s
+    stamps[900:] += 0.7
+    stamps[1400:] += make.step_s  # a single sample
+    ds = stamped(make, stamps)
+    found = findings_of(ds)
+    assert [f.kind for f in found] == ["gap", "gap", "jitter"]
+    assert "350 samples" in found[0].text
+    assert "1 samples" in found[1].text
+    assert ds.attrs["sampling_rate_hz"] == pytest.approx(500.0, rel=1e-4)
+
+
+def test_clock__uneven_sampling_is_a_warning(make):
+    """A clock that runs two samples ahead in the middle of the recording."""
+    stamps = make.time + 2.0 * make.step_s * np.sin(np.pi * np.arange(make.n) / make.n)
+    (found,) = findings_of(stamped(make, stamps))
+    assert (found.kind, found.severity) == ("jitter", "warning")
+    assert "resample" in found.text
+
+
+def test_clock__stamps_coarser_than_the_sampling(make):
+    """Stamps in whole milliseconds of a sampling at 3 kHz: three alike, and then the next."""
+    ds = stamped(make, np.floor(np.arange(6000) / 3.0 + 1e-9) * 1e-3)
+    assert ds.attrs["sampling_rate_hz"] == pytest.approx(3000.0, rel=1e-4)
+    assert [f.kind for f in findings_of(ds)] == ["jitter"]
+    assert len(np.unique(ds["piece"])) == 1
+
+
+def test_clock__time_that_goes_backwards_is_refused(make):
+    stamps = make.time.copy()
+    stamps[1000:] -= 1.0
+    with pytest.raises(SpecError, match=r"goes backwards after sample 999 .* give sampling_rate_hz"):
+        stamped(make, stamps)
+
+
+def test_clock__mixed_rates_are_refused(make):
+    a, b = make.swing()
+    channels = {"a": Channel("a", a, step_s=0.001), "b": Channel("b", b[::2], step_s=0.002)}
+    with pytest.raises(
+        SpecError, match=r"different sampling rates \(psi1 1000 Hz, psi2 500 Hz\); map channels"
+    ):
+        recording_of(make.raw(channels), make.mapping())
+
+
+def test_clock__unknown_rate_is_refused_with_the_remedy(make):
+    raw = make.raw(make.channels(dict(zip("ab", make.swing(), strict=True)), step_s=np.nan))
+    with pytest.raises(SpecError, match=r"psi1, psi2 is not known; add .* time = .* or sampling_rate_hz"):
+        recording_of(raw, make.mapping())
+    stated = make.mapping().model_copy(update={"sampling_rate_hz": 500.0})
+    assert recording_of(raw, stated).attrs["sampling_rate_hz"] == 500.0
+
+
+def test_clock__stated_rate_that_is_not_the_files(make):
+    stated = make.mapping().model_copy(update={"sampling_rate_hz": 250.0})
+    ds = recording_of(make.raw(make.channels(dict(zip("ab", make.swing(), strict=True)))), stated)
+    assert {f.kind for f in findings_of(ds)} == {"rate"}
+    assert ds.attrs["sampling_rate_hz"] == 250.0
+
+
+def test_clock__unequal_lengths(make):
+    a, b = make.swing()
+    ds = recording_of(make.raw(make.channels({"a": a, "b": b[:1900]})), make.mapping())
+    (found,) = findings_of(ds)
+    assert (found.kind, found.channel) == ("length", "psi1")
+    assert "the last 100 are left out" in found.text
+    assert ds.sizes["sample"] == 1900
+
+
+def test_clock__channels_that_begin_apart(make):
+    """Channel b began 50 samples late: what both saw at one instant stands at one place."""
+    a, b = make.swing()
+    channels = make.channels({"a": a, "b": b[50:]}, starts={"a": 7.0, "b": 7.1})
+    ds = recording_of(make.raw(channels), make.mapping())
+    (found,) = findings_of(ds)
+    assert (found.kind, found.channel) == ("start", "psi1")
+    assert "50 samples" in found.text
+    np.testing.assert_array_equal(ds["psi1"], a[50:])
+    np.testing.assert_array_equal(ds["psi2"], b[50:])
+    assert float(ds["time"][0]) == 0.0
+
+
+def test_clock__channels_that_begin_a_part_of_a_sample_apart(make):
+    a, b = make.swing()
+    channels = make.channels({"a": a, "b": b}, starts={"a": 0.0, "b": 0.3 * make.step_s})
+    (found,) = findings_of(recording_of(make.raw(channels), make.mapping()))
+    assert (found.kind, found.channel) == ("start", "psi1")
+    assert "0.0006 s before the others" in found.text
+
+
+def test_clock__no_stretch_in_common_is_refused(make):
+    a, b = make.swing()
+    channels = make.channels({"a": a, "b": b}, starts={"a": 0.0, "b": 100.0})
+    with pytest.raises(SpecError, match="no stretch in common"):
+        recording_of(make.raw(channels), make.mapping())
+
+
+def test_clock__stretches_without_a_common_clock_are_laid_one_after_another(make):
+    a, b = make.swing()
+    halves = [make.channels({"a": a[s], "b": b[s]}) for s in (slice(0, 800), slice(800, None))]
+    ds = recording_of(make.raw(*halves), make.mapping())
+    (found,) = findings_of(ds)
+    assert (found.kind, found.severity) == ("pieces", "note")
+    np.testing.assert_allclose(ds["time"], make.time, atol=1e-12)
+    assert np.flatnonzero(np.diff(ds["piece"])).tolist() == [799]
+
+
+def test_clock__stretches_that_follow_on_are_one_piece(make):
+    a, b = make.swing()
+    first = make.channels({"a": a[:800], "b": b[:800]})
+    second = make.channels({"a": a[800:], "b": b[800:]}, starts=dict.fromkeys("ab", 1.6))
+    ds = recording_of(make.raw(first, second), make.mapping())
+    assert findings_of(ds) == []
+    assert not ds["piece"].any()
+
+
+def test_clock__piece_channel_begins_new_pieces(make):
+    a, b = make.swing()
+    number = (np.arange(make.n) >= 1200).astype(float)
+    raw = make.raw(make.channels({"a": a, "b": b, "k": number}))
+    mapping = parse_mapping({
+        "model": "pendulum", "piece": {"channel": "k"},
+        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+    })  # fmt: skip
+    ds = recording_of(raw, mapping)
+    np.testing.assert_array_equal(ds["piece"], number)
+
+
+def test_resolved__missing_channels_are_named_with_the_nearest(make):
+    raw = make.raw(make.channels({"rig/angle 1": make.swing()[0], "rig/motor": make.swing()[1]}))
+    mapping = parse_mapping({
+        "model": "pendulum",
+        "channels": {"psi1": {"channel": "rig/angle1"}, "psi2": {"channel": 7}},
+    })  # fmt: skip
+    with pytest.raises(SpecError) as caught:
+        recording_of(raw, mapping)
+    assert len(caught.value.problems) == 2
+    assert "did you mean rig/angle 1?" in caught.value.problems[0]
+    assert "channels.psi2.channel = 7" in caught.value.problems[1]
+
+
+def test_window__keeps_time(make):
+    ds = window(make.recorded(), (1.0, 2.0))
+    assert float(ds["time"][0]) == pytest.approx(1.0)
+    assert ds.sizes["sample"] == 501
+
+
+def test_window__that_is_empty_is_refused(make):
+    with pytest.raises(SpecError, match=r"window_s = \[10, 20\]: holds 0 samples; .* goes from 0 to 3.998 s"):
+        window(make.recorded(), (10.0, 20.0))
+
+
+def test_clock_of__five_million_stamps_take_seconds():
+    """Vectorised: no loop over samples."""
+    import time
+
+    stamps = np.arange(5_000_000) / 1e4
+    channel = Channel("a", np.zeros(len(stamps)), time=stamps)
+    begin = time.process_time()
+    clock = clock_of([{"a": channel}], None, "x")
+    assert time.process_time() - begin < 5.0
+    assert clock.step_s == pytest.approx(1e-4)

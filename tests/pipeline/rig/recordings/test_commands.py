@@ -1,0 +1,118 @@
+"""``magpend recordings``: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[4] / "workflows" / "recordings" / "multiarm"
+
+RIG = """
+model = "pendulum"
+initial_state = { psi1_deg = 40.0, psi2_dot = 25.0 }
+sampling_rate_hz = 500.0
+seed = 1
+[drive]
+steps = [{ frequency_hz = 2.0, n_periods = 4 }]
+[sensors.psi1]
+kind = "potentiometer"
+noise = 1e-3
+bits = 12
+dead_band = 0.2
+[sensors.psi2]
+kind = "potentiometer"
+noise = 1e-3
+bits = 12
+dead_band = 0.2
+"""
+
+
+@pytest.fixture
+def swing(main, tmp_path):
+    """Recording of a virtual rig, and its mapping."""
+    (tmp_path / "rig.toml").write_text(RIG)
+    code, out, err = main("recordings", "simulate", "rig.toml", "--out", "swing.tdms")
+    assert (code, out) == (0, "recording: swing.tdms\nmapping: swing.toml\n"), err
+    return tmp_path / "swing.tdms"
+
+
+def test_recordings_show__lists_the_channels_of_a_file(main, swing):
+    code, out, _ = main("recordings", "show", swing.name)
+    assert code == 0
+    assert "3 channels, simulated" in out
+    assert [line.split()[:3] for line in out.splitlines()[2:]] == [
+        ["rig/psi1", "1000", "500"], ["rig/psi2", "1000", "500"], ["rig/drive", "1000", "500"],
+    ]  # fmt: skip
+    code, out, _ = main("recordings", "show", swing.name, "--json")
+    assert [row["channel"] for row in json.loads(out)] == ["rig/psi1", "rig/psi2", "rig/drive"]
+
+
+def test_recordings_show__with_a_mapping_says_what_was_found(main, swing, tmp_path):
+    code, out, err = main("recordings", "show", swing.name, "--mapping", "swing.toml", "--out", "swing.png")
+    assert code == 0, err
+    assert "1000 samples at 500 Hz" in out
+    assert "warning: dead-band of psi2" in out
+    assert "note: wrap of psi2" in out
+    assert (tmp_path / "swing.png").stat().st_size > 10_000
+    code, out, _ = main("recordings", "show", swing.name, "--mapping", "swing.toml", "--json")
+    told = json.loads(out)
+    assert told["simulated"] == 1
+    assert told["sampling_rate_hz"] == 500.0
+    assert {row["quantity"] for row in told["quantities"]} == {"psi1", "psi2", "drive"}
+    assert {row["kind"] for row in told["findings"]} == {"dead-band", "wrap"}
+    # a grain of 1.65 mrad: 1 mrad and 0.48 mrad together
+    assert told["quantities"][0]["noise"] == pytest.approx(1.1e-3, rel=0.1)
+
+
+def test_recordings_convert__is_read_with_its_mapping(main, swing):
+    for target in ("x.csv", "x.tdms"):
+        code, out, err = main(
+            "recordings",
+            "convert",
+            swing.name,
+            "--mapping",
+            "swing.toml",
+            "--out",
+            target,
+            "--window",
+            0.5,
+            1.5,
+        )
+        assert (code, out) == (0, f"recording: {target}\nmapping: x.toml\n"), err
+        code, out, _ = main("recordings", "show", target, "--mapping", "x.toml")
+        assert "501 samples at 500 Hz" in out
+        assert "simulated" in out
+    code, out, _ = main(
+        "recordings", "convert", swing.name, "--mapping", "swing.toml", "--out", "x.nc", "--smooth"
+    )
+    assert out == "recording: x.nc\n"
+
+
+def test_recordings_show__real_pendulum(main, tmp_path):
+    for name in ("multiarm_free_swings.mat", "multiarm_free_swings.toml"):
+        shutil.copy(FOLDER / name, tmp_path)
+    words = ("--mapping", "multiarm_free_swings.toml", "--smooth", "--out", "x.png")
+    code, out, err = main("recordings", "show", "multiarm_free_swings.mat", *words)
+    assert code == 0, err
+    assert "69342 samples at 1000 Hz, 69.341 s in 26 pieces" in out
+    assert "findings: none" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("none.tdms",), "there is no such file"),
+        (("swing.tdms", "--mapping", "none.toml"), "cannot be read"),
+        (("swing.tdms", "--out", "x.png"), "--mapping: missing"),
+        (("swing.tdms", "--mapping", "swing.toml", "--out", "x.gif"), "suffix"),
+        (("swing.tdms", "--mapping", "swing.toml", "--window", "90", "99"), "holds 0 samples"),
+        (("swing.tdms", "--mapping", "rig.toml"), "channels: missing"),
+    ],
+)
+def test_recordings_show__refuses(main, swing, words, sentence):
+    code, out, err = main("recordings", "show", *words)
+    assert (code, out) == (2, "")
+    assert sentence in err

@@ -1,0 +1,453 @@
+"""Files of every format: what stands in them is what is read, and what is broken is said."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import pytest
+
+from pipeline.rig.recordings import findings_of, parse_mapping, read_recording
+from pipeline.rig.recordings.formats import read_raw
+from pipeline.rig.recordings.mapping import CsvMap
+from pipeline.spec.problems import SpecError
+
+nptdms = pytest.importorskip("nptdms")
+
+RIG = {
+    "channels": {"psi1": {"channel": "rig/angle 1"}, "psi2": {"channel": "rig/angle 2"}},
+    "model": "pendulum",
+}
+
+
+def write_tdms(path, columns, *, segments=1, **properties):
+    """TDMS file of channels of the group rig; properties by channel are dictionaries."""
+    parts = {n: np.array_split(np.asarray(v), segments) for n, v in columns.items()}
+    with nptdms.TdmsWriter(str(path)) as writer:
+        for i in range(segments):
+            writer.write_segment(
+                [nptdms.ChannelObject("rig", n, part[i], properties.get(n, {})) for n, part in parts.items()]
+            )
+
+
+# ---- TDMS ----------------------------------------------------------------------------------------
+
+
+def test_read_tdms__waveforms(tmp_path, make):
+    a, b = make.swing()
+    path = tmp_path / "swing.tdms"
+    wave = {
+        "wf_increment": 0.002,
+        "unit_string": "rad",
+        "wf_start_time": np.datetime64("2026-03-01T12:00:00.25"),
+    }
+    write_tdms(path, {"angle 1": a, "angle 2": b}, segments=7, **{"angle 1": wave, "angle 2": wave})
+    ds = read_recording(path, parse_mapping(RIG))
+    assert findings_of(ds) == []
+    assert ds.attrs["sampling_rate_hz"] == 500.0
+    np.testing.assert_array_equal(ds["psi1"], a)
+    np.testing.assert_array_equal(ds["psi2"], b)
+
+
+def test_read_tdms__starts_are_read_beyond_microseconds(tmp_path, make):
+    """At 2 MHz, half a microsecond is a sample."""
+    a, b = make.swing()
+    path = tmp_path / "fast.tdms"
+    stamps = [nptdms.timestamp.TdmsTimestamp(3_800_000_000, int(x * 2**64)) for x in (0.25, 0.2500005)]
+    waves = [{"wf_increment": 5e-7, "wf_start_time": s} for s in stamps]
+    write_tdms(path, {"angle 1": a, "angle 2": b}, **{"angle 1": waves[0], "angle 2": waves[1]})
+    ds = read_recording(path, parse_mapping(RIG))
+    (start, length) = findings_of(ds)
+    assert (start.kind, start.channel, "1 samples" in start.text) == ("start", "psi1", True)
+    assert (length.kind, length.channel) == ("length", "psi2")
+    np.testing.assert_array_equal(ds["psi1"], a[1:])
+    np.testing.assert_array_equal(ds["psi2"], b[:-1])
+
+
+def test_read_tdms__time_stamps_as_a_channel(tmp_path, make):
+    a, b = make.swing()
+    path = tmp_path / "stamped.tdms"
+    stamps = np.datetime64("2026-03-01T12:00:00", "us") + np.round(make.time * 1e6).astype("timedelta64[us]")
+    write_tdms(path, {"angle 1": a, "angle 2": b, "t": stamps})
+    ds = read_recording(path, parse_mapping({**RIG, "time": {"channel": "rig/t"}}))
+    assert ds.attrs["sampling_rate_hz"] == 500.0
+    assert findings_of(ds) == []
+
+
+def test_read_tdms__truncated_file_is_a_finding(tmp_path, make, caplog):
+    """npTDMS only warns; cut anywhere in its data, the file says how much is missing."""
+    a, b = make.swing()
+    path = tmp_path / "whole.tdms"
+    wave = {"wf_increment": 0.002}
+    write_tdms(path, {"angle 1": a, "angle 2": b}, **{"angle 1": wave, "angle 2": wave})
+    cut = tmp_path / "cut.tdms"
+    cut.write_bytes(path.read_bytes()[: -500 * 8])
+    with caplog.at_level(logging.WARNING):
+        ds = read_recording(cut, parse_mapping(RIG))
+    kinds = [(f.kind, f.channel) for f in findings_of(ds)]
+    assert ("truncated", "rig/angle 2") in kinds
+    assert ("length", "psi1") in kinds
+    assert ds.sizes["sample"] == 1500
+    np.testing.assert_array_equal(ds["psi2"], b[:1500])
+    assert not caplog.records  # said once, as a finding
+
+
+def test_read_tdms__cut_in_the_metadata_of_a_later_segment(tmp_path, make):
+    a, b = make.swing()
+    path = tmp_path / "two.tdms"
+    wave = {"wf_increment": 0.002}
+    write_tdms(path, {"angle 1": a, "angle 2": b}, **{"angle 1": wave, "angle 2": wave})
+    size = len(path.read_bytes())
+    write_tdms(path, {"angle 1": a, "angle 2": b}, segments=2, **{"angle 1": wave, "angle 2": wave})
+    data = path.read_bytes()
+    second = data.index(b"TDSm", 4)
+    assert size > second
+    path.write_bytes(data[: second + 20])
+    ds = read_recording(path, parse_mapping(RIG))
+    assert "truncated" in {f.kind for f in findings_of(ds)}
+    assert ds.sizes["sample"] == 1000
+
+
+def test_read_tdms__unequal_channels_are_a_finding(tmp_path, make):
+    a, b = make.swing()
+    path = tmp_path / "unequal.tdms"
+    wave = {"wf_increment": 0.002}
+    write_tdms(path, {"angle 1": a, "angle 2": b[:-10]}, **{"angle 1": wave, "angle 2": wave})
+    (found,) = findings_of(read_recording(path, parse_mapping(RIG)))
+    assert (found.kind, found.channel) == ("length", "psi1")
+
+
+def test_read_tdms__other_unit_is_a_finding(tmp_path, make):
+    a, b = make.swing()
+    path = tmp_path / "deg.tdms"
+    waves = [{"wf_increment": 0.002, "unit_string": u} for u in ("Volts", "deg")]
+    write_tdms(path, {"angle 1": a, "angle 2": b}, **{"angle 1": waves[0], "angle 2": waves[1]})
+    mapping = parse_mapping({
+        "model": "pendulum",
+        "channels": {
+            "psi1": {"channel": "rig/angle 1", "unit": "V", "scale": 2.0},
+            "psi2": {"channel": "rig/angle 2"},
+        },
+    })  # fmt: skip
+    (found,) = findings_of(read_recording(path, mapping))
+    assert (found.kind, found.channel) == ("unit", "psi2")
+    assert "the file says 'deg', the mapping 'rad'" in found.text
+
+
+@pytest.mark.parametrize("content", [b"", b"TDSm", b"no TDMS file at all" * 10, b"TDSm" + bytes(40)])
+def test_read_tdms__what_is_none_is_refused(tmp_path, content):
+    path = tmp_path / "bad.tdms"
+    path.write_bytes(content)
+    with pytest.raises(SpecError, match=r"bad\.tdms: "):
+        read_raw(path)
+
+
+# ---- MATLAB --------------------------------------------------------------------------------------
+
+
+def test_read_matlab__vectors_rows_structures_and_cells(tmp_path, make):
+    from scipy.io import savemat
+
+    a, b = make.swing()
+    cells = np.empty(2, object)
+    cells[:] = [np.stack([a[:900], b[:900]]), np.stack([a[900:], b[900:]])]
+    savemat(
+        tmp_path / "x.mat", {"y": np.stack([a, b]), "column": a[:, None], "rig": {"angle": b}, "dt": 0.002}
+    )
+    savemat(tmp_path / "cells.mat", {"y": cells, "dt": 0.002, "name": "text is no channel"})
+    whole = read_raw(tmp_path / "x.mat")
+    assert whole.names == ("y[0]", "y[1]", "column", "rig.angle")
+    (channels,) = whole.stretches
+    np.testing.assert_array_equal(channels["column"].values, a)
+    np.testing.assert_array_equal(channels["rig.angle"].values, b)
+    assert channels["y[1]"].step_s == 0.002
+    mapping = {"model": "pendulum", "channels": {"psi1": {"channel": "y[0]"}, "psi2": {"channel": "y[1]"}}}
+    ds = read_recording(tmp_path / "cells.mat", parse_mapping(mapping))
+    assert np.bincount(ds["piece"]).tolist() == [900, 1100]
+    np.testing.assert_array_equal(ds["psi2"], b)
+    assert [f.kind for f in findings_of(ds)] == ["pieces"]
+
+
+def test_read_matlab__structure_array_is_pieces(tmp_path, make):
+    from scipy.io import savemat
+
+    a, _ = make.swing()
+    records = np.zeros((1, 3), dtype=[("angle", object), ("dt", object)])
+    for i in range(3):
+        records[0, i] = (a[400 * i : 400 * (i + 1)], 0.002)
+    savemat(tmp_path / "s.mat", {"run": records})
+    raw = read_raw(tmp_path / "s.mat")
+    assert len(raw.stretches) == 3
+    np.testing.assert_array_equal(raw.stretches[2]["run.angle"].values, a[800:1200])
+    assert raw.stretches[0]["run.angle"].step_s == 0.002
+
+
+def test_read_matlab__version_7_3_is_refused_with_the_remedy(tmp_path):
+    path = tmp_path / "new.mat"
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, Created on: Mon Mar  2 2026 HDF5 schema 1.00 ."
+    path.write_bytes(head.ljust(512, b" ") + b"\x89HDF\r\n\x1a\n" + bytes(64))
+    with pytest.raises(SpecError, match=r"version 7\.3 \(HDF5\).*save\(FILE, '-v7'\)"):
+        read_raw(path)
+
+
+def test_read_matlab__cells_that_differ_in_number_are_refused(tmp_path):
+    from scipy.io import savemat
+
+    def cells(n):
+        made = np.empty(n, object)
+        made[:] = [np.arange(5.0)] * n
+        return made
+
+    savemat(tmp_path / "c.mat", {"a": cells(2), "b": cells(3)})
+    with pytest.raises(SpecError, match="a has 2, b has 3; save equally many"):
+        read_raw(tmp_path / "c.mat")
+
+
+def test_read_matlab__what_is_none_is_refused(tmp_path):
+    (tmp_path / "bad.mat").write_bytes(b"not a MATLAB file " * 40)
+    with pytest.raises(SpecError, match="save it with -v7"):
+        read_raw(tmp_path / "bad.mat")
+
+
+# ---- LVM -----------------------------------------------------------------------------------------
+
+LVM_HEAD = """LabVIEW Measurement\t
+Writer_Version\t2
+Reader_Version\t2
+Separator\tTab
+Decimal_Separator\t{decimal}
+Multi_Headings\t{multi}
+X_Columns\t{columns}
+Time_Pref\tAbsolute
+Operator\trig
+Date\t2026/03/01
+Time\t12:00:00{decimal}5
+***End_of_Header***\t
+\t
+"""
+
+
+def lvm_segment(a, b, *, columns, time, x0=0.0, step=0.002, samples=None, comment=""):
+    """A segment of two channels as LabVIEW writes it, with points."""
+    n = len(a) if samples is None else samples
+    gap = "\t\t" if columns == "Multi" else "\t"
+    lines = [
+        "Channels\t2\t", f"Samples\t{n}{gap}{n}\t", f"Date\t2026/03/01{gap}2026/03/01\t",
+        f"Time\t{time}{gap}{time}\t", f"Y_Unit_Label\tVolts{gap}Volts\t", f"X_Dimension\tTime{gap}Time\t",
+        f"X0\t{x0:.16E}{gap}{x0:.16E}\t", f"Delta_X\t{step:.6f}{gap}{step:.6f}\t",
+        "***End_of_Header***\t\t\t",
+    ]  # fmt: skip
+    x = [f"{x0 + step * i:.6f}" for i in range(len(a))]
+    head = (
+        "X_Value\tVoltage_0\tX_Value\tVoltage_1\tComment"
+        if columns == "Multi"
+        else "X_Value\tVoltage_0\tVoltage_1\tComment"
+    )
+    lines.append(head)
+    for i, (p, q) in enumerate(zip(a, b, strict=True)):
+        middle = f"\t{x[i]}\t" if columns == "Multi" else "\t"
+        first = "" if columns == "No" else x[i]
+        lines.append(f"{first}\t{p:.12f}{middle}{q:.12f}" + (f"\t{comment}" if comment and i == 0 else ""))
+    return "\n".join(lines) + "\n\n"
+
+
+def written_lvm(path, segments, *, decimal=".", columns="One", multi="Yes"):
+    body = "".join(segments)
+    text = LVM_HEAD.format(decimal=decimal, columns=columns, multi=multi)
+    path.write_bytes((text + (body.replace(".", ",") if decimal == "," else body)).encode("cp1252"))
+    return path
+
+
+LVM_MAPPING = {
+    "model": "pendulum",
+    "channels": {
+        "psi1": {"channel": "Voltage_0", "unit": "V", "scale": 1.0},
+        "psi2": {"channel": "Voltage_1", "unit": "V", "scale": 1.0},
+    },
+}
+
+
+@pytest.mark.parametrize("columns", ["One", "Multi", "No"])
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_read_lvm__columns_and_decimal_commas(tmp_path, make, columns, decimal):
+    a, b = (v[:300] for v in make.swing())
+    segment = lvm_segment(a, b, columns=columns, time="12:00:00.5", comment="début")
+    path = written_lvm(tmp_path / "x.lvm", [segment], decimal=decimal, columns=columns)
+    ds = read_recording(path, parse_mapping(LVM_MAPPING))
+    assert findings_of(ds) == []
+    assert ds.attrs["sampling_rate_hz"] == 500.0
+    np.testing.assert_allclose(ds["psi1"], a, atol=1e-12)
+    np.testing.assert_allclose(ds["psi2"], b, atol=1e-12)
+
+
+@pytest.mark.parametrize("columns", ["One", "Multi", "No"])
+def test_read_lvm__segments_that_follow_on_are_one_recording(tmp_path, make, columns):
+    """A header for every 100 samples, as a program writes that appends what it has."""
+    a, b = (v[:300] for v in make.swing())
+    segments = [
+        lvm_segment(a[i : i + 100], b[i : i + 100], columns=columns, time=f"12:00:{0.5 + 0.002 * i:09.6f}")
+        for i in (0, 100, 200)
+    ]
+    path = written_lvm(tmp_path / "x.lvm", segments, decimal=",", columns=columns)
+    ds = read_recording(path, parse_mapping(LVM_MAPPING))
+    assert findings_of(ds) == []
+    assert not ds["piece"].any()
+    np.testing.assert_allclose(ds["time"], make.time[:300], atol=1e-9)
+    np.testing.assert_allclose(ds["psi1"], a, atol=1e-12)
+
+
+def test_read_lvm__gap_between_segments_is_a_finding(tmp_path, make):
+    a, b = (v[:200] for v in make.swing())
+    segments = [
+        lvm_segment(a[:100], b[:100], columns="One", time="23:59:59.9"),
+        lvm_segment(a[100:], b[100:], columns="One", time="23:59:59.9", x0=0.7),
+    ]
+    ds = read_recording(written_lvm(tmp_path / "x.lvm", segments), parse_mapping(LVM_MAPPING))
+    (found,) = findings_of(ds)
+    assert (found.kind, found.end_s) == ("gap", pytest.approx(0.7))
+    assert np.bincount(ds["piece"]).tolist() == [100, 100]
+
+
+def test_read_lvm__stamps_go_before_a_nominal_interval(tmp_path, make):
+    """Software-timed samples: Delta_X is a wish, the X column says when."""
+    a, b = (v[:100] for v in make.swing())
+    segment = lvm_segment(a, b, columns="One", time="12:00:00", step=0.01, samples=1)
+    segment = segment.replace("Delta_X\t0.010000\t0.010000", "Delta_X\t1.000000\t1.000000")
+    ds = read_recording(written_lvm(tmp_path / "x.lvm", [segment], multi="No"), parse_mapping(LVM_MAPPING))
+    assert ds.attrs["sampling_rate_hz"] == 100.0
+
+
+def test_read_lvm__fewer_samples_than_stated_is_a_finding(tmp_path, make):
+    a, b = (v[:90] for v in make.swing())
+    segment = lvm_segment(a, b, columns="One", time="12:00:00", samples=100)
+    ds = read_recording(written_lvm(tmp_path / "x.lvm", [segment]), parse_mapping(LVM_MAPPING))
+    assert [(f.kind, f.channel) for f in findings_of(ds)] == [
+        ("truncated", "Voltage_0"), ("truncated", "Voltage_1")
+    ]  # fmt: skip
+    assert "90 of the 100 samples" in findings_of(ds)[0].text
+
+
+def test_read_lvm__special_blocks_and_empty_columns(tmp_path, make):
+    a, b = (v[:50] for v in make.swing())
+    segment = lvm_segment(a, b, columns="One", time="12:00:00")
+    special = "***Start_Special***\t\nVendor\tanything\n***End_Special***\t\n\n"
+    raw = read_raw(written_lvm(tmp_path / "x.lvm", [special, segment]))
+    assert raw.names == ("Voltage_0", "Voltage_1")
+    assert len(raw.stretches[0]["Voltage_1"]) == 50
+
+
+@pytest.mark.parametrize("keep", [1, 5, 12, 13, 16, 22])
+def test_read_lvm__broken_headers_are_refused(tmp_path, make, keep):
+    a, b = (v[:50] for v in make.swing())
+    path = written_lvm(tmp_path / "x.lvm", [lvm_segment(a, b, columns="One", time="12:00:00")])
+    path.write_text("\n".join(path.read_text().splitlines()[:keep]))
+    with pytest.raises(SpecError, match=r"x\.lvm: "):
+        read_raw(path)
+
+
+def test_read_lvm__another_text_is_refused(tmp_path):
+    (tmp_path / "x.lvm").write_text("t,a\n0,1\n")
+    with pytest.raises(SpecError, match="is it a CSV file"):
+        read_raw(tmp_path / "x.lvm")
+
+
+# ---- CSV -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
+@pytest.mark.parametrize("decimal", [".", ","])
+@pytest.mark.parametrize("header", [True, False])
+def test_read_csv__form_is_found_out(tmp_path, make, delimiter, decimal, header):
+    if delimiter == decimal:
+        return
+    a, b = (v[:200] for v in make.swing())
+    rows = [
+        delimiter.join(f"{x:.9f}" for x in row).replace(".", decimal)
+        for row in zip(a, b, make.time, strict=False)
+    ]
+    head = [delimiter.join(["left", "right", "t"])] if header else []
+    path = tmp_path / "x.csv"
+    path.write_text("\n".join(head + rows) + "\n")
+    raw = read_raw(path)
+    assert raw.names == (("left", "right", "t") if header else ("1", "2", "3"))
+    (channels,) = raw.stretches
+    np.testing.assert_allclose(channels[raw.names[1]].values, b, atol=1e-9)
+
+
+def test_read_csv__names_with_units_in_brackets_or_below(tmp_path):
+    (tmp_path / "a.csv").write_text('"t [s]","angle (V)"\n0,1.5\n0.1,2.5\n')
+    (tmp_path / "b.csv").write_text("Time;Channel A\n(ms);(V)\n\n0,0;1,5\n0,1;2,5\n")
+    a, b = read_raw(tmp_path / "a.csv"), read_raw(tmp_path / "b.csv")
+    assert [c.unit for c in a.stretches[0].values()] == ["s", "V"]
+    assert b.names == ("Time", "Channel A")
+    assert [c.unit for c in b.stretches[0].values()] == ["ms", "V"]
+    np.testing.assert_array_equal(b.stretches[0]["Channel A"].values, [1.5, 2.5])
+
+
+def test_read_csv__comma_that_may_be_both_is_refused_and_can_be_stated(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("1,5\n2,5\n3,5\n")
+    with pytest.raises(SpecError, match=r"a comma may be between fields or in numbers"):
+        read_raw(path)
+    one = read_raw(path, csv=CsvMap(decimal=","))
+    np.testing.assert_array_equal(one.stretches[0]["1"].values, [1.5, 2.5, 3.5])
+    two = read_raw(path, csv=CsvMap(delimiter=",", decimal="."))
+    np.testing.assert_array_equal(two.stretches[0]["2"].values, [5.0, 5.0, 5.0])
+
+
+def test_read_csv__columns_of_unequal_length_and_holes(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("a,b\n1,1\n2,\n3,3\n4,\n5,\n")
+    (channels,) = read_raw(path).stretches
+    assert len(channels["a"]) == 5
+    np.testing.assert_array_equal(channels["b"].values, [1.0, np.nan, 3.0])
+
+
+def test_read_csv__truncated_last_row_is_a_finding(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("t,a,b\n0,1,2\n1,2,3\n2,3")
+    raw = read_raw(path)
+    assert [f.kind for f in raw.findings] == ["truncated"]
+    assert len(raw.stretches[0]["t"]) == 2
+
+
+def test_read_csv__comments_and_rows_before_the_names(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("Rig 3, run of Monday\nanything\n# comment\nt,a\n0,1\n1,2\n")
+    raw = read_raw(path, csv=CsvMap(skip_rows=2))
+    assert raw.names == ("t", "a")
+
+
+@pytest.mark.parametrize("text", ["", "\n\n", "no numbers\nat all\n", "a,b\n"])
+def test_read_csv__what_is_no_table_is_refused(tmp_path, text):
+    (tmp_path / "x.csv").write_text(text)
+    with pytest.raises(SpecError, match="is not a table of numbers"):
+        read_raw(tmp_path / "x.csv")
+
+
+def test_read_csv__time_column_in_a_recording(tmp_path, make):
+    a, b = make.swing()
+    rows = [
+        f"{t!r};{x!r};{y!r}".replace(".", ",")
+        for t, x, y in zip(*(v.tolist() for v in (make.time, a, b)), strict=True)
+    ]
+    (tmp_path / "x.csv").write_text("t;a;b\n" + "\n".join(rows))
+    mapping = parse_mapping({
+        "model": "pendulum", "time": {"channel": "t"},
+        "channels": {"psi1": {"channel": "a", "unit": "deg"}, "psi2": {"channel": 3}},
+    })  # fmt: skip
+    ds = read_recording(tmp_path / "x.csv", mapping)
+    assert findings_of(ds) == []
+    np.testing.assert_allclose(ds["psi1"], a * math.pi / 180, rtol=1e-14)
+    np.testing.assert_array_equal(ds["psi2"], b)
+
+
+# ---- all -----------------------------------------------------------------------------------------
+
+
+def test_read_raw__missing_file_and_unknown_suffix(tmp_path):
+    with pytest.raises(SpecError, match="there is no such file"):
+        read_raw(tmp_path / "none.tdms")
+    with pytest.raises(SpecError, match=r"the suffix '\.bin' is none of .* add format"):
+        read_raw(tmp_path / "x.bin")

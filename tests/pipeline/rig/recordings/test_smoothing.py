@@ -1,0 +1,235 @@
+"""Local polynomials: no lag, no edge smeared, and noise as large as it was made."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.rig.recordings import recording_of, smooth
+from pipeline.rig.recordings.mapping import parse_mapping
+from pipeline.rig.recordings.smoothing import _along, _filtered, _first_samples, _switches
+from pipeline.spec.problems import SpecError
+
+
+def noisy(make, sigma, seed=0, n=20_000, rate_hz=1000.0):
+    """Noisy swing with its true angles and rates."""
+    t = np.arange(n) / rate_hz
+    a, b = np.sin(6.0 * t) + 0.2 * np.cos(17.0 * t), 0.7 * np.cos(5.0 * t)
+    rates = 6.0 * np.cos(6.0 * t) - 3.4 * np.sin(17.0 * t), -3.5 * np.sin(5.0 * t)
+    rng = np.random.default_rng(seed)
+    columns = {"a": a + sigma * rng.standard_normal(n), "b": b + sigma * rng.standard_normal(n)}
+    raw = make.raw(make.channels(columns, step_s=1.0 / rate_hz))
+    return recording_of(raw, make.mapping()), (a, b), rates
+
+
+def test_smooth__polynomials_of_its_order_are_reproduced(make):
+    """Exactly, up to the ends: angles and rates of a cubic."""
+    t = make.time
+    cubic = 0.3 - 0.5 * t + 0.2 * t**2 - 0.04 * t**3
+    ds = smooth(make.recorded(cubic), window_s=0.102)
+    np.testing.assert_allclose(ds["psi1"], cubic, atol=1e-12)
+    np.testing.assert_allclose(ds["psi1_dot"], -0.5 + 0.4 * t - 0.12 * t**2, atol=1e-10)
+
+
+def test_smooth__does_not_lag(make):
+    """The smoothed sine is the sine: its phase, to a millionth of a turn, at a window of a fifth of it."""
+    t = make.time
+    ds = smooth(make.recorded(np.sin(2.0 * np.pi * 2.0 * t)), window_s=0.1)
+    inner = slice(100, -150)  # whole periods
+    phase = np.angle(np.exp(-4j * np.pi * t[inner]) @ ds["psi1"].values[inner]) + np.pi / 2.0
+    assert abs(phase) < 1e-6
+    rate_phase = np.angle(np.exp(-4j * np.pi * t[inner]) @ ds["psi1_dot"].values[inner])
+    assert abs(rate_phase) < 1e-6
+
+
+@pytest.mark.parametrize("sigma", [1e-4, 1e-3, 1e-2])
+def test_smooth__noise_is_that_which_was_added(make, sigma):
+    """From the residuals with the polynomials' degrees of freedom, 20000 samples: error 0.5 per cent."""
+    ds, _, _ = noisy(make, sigma)
+    found = smooth(ds)
+    for name in ("psi1", "psi2"):
+        assert found[name].attrs["noise"] == pytest.approx(sigma, rel=0.02)
+
+
+def test_smooth__noise_counts_the_degrees_of_freedom(make):
+    """White noise alone, in windows of five samples: a cubic takes half of it, and the ends more."""
+    rng = np.random.default_rng(3)
+    found = [
+        smooth(make.recorded(rng.standard_normal(60), rng.standard_normal(60)), window_s=0.01)[name].attrs
+        for _ in range(100) for name in ("psi1", "psi2")
+    ]  # fmt: skip
+    mean_square = np.mean([attrs["noise"] ** 2 for attrs in found])
+    assert mean_square == pytest.approx(1.0, abs=0.06)  # 200 times some 30 degrees of freedom: 2 per cent
+
+
+def test_smooth__what_is_left_of_the_noise_is_what_it_says(make):
+    ds, angles, rates = noisy(make, 1e-3)
+    found = smooth(ds)
+    for name, true in zip(("psi1", "psi2", "psi1_dot", "psi2_dot"), (*angles, *rates), strict=True):
+        error = (found[name].values - true)[500:-500]
+        # a tenth to a third of it is distortion: that is where the two balance
+        assert error.std() == pytest.approx(found[name].attrs["noise_smoothed"], rel=0.35)
+
+
+def test_smooth__chosen_window_is_near_the_best(make):
+    """The error of angles at the chosen window is at most a fifth above that at the best of all windows."""
+    ds, angles, _ = noisy(make, 1e-3, n=6000)
+    error = {
+        w: (smooth(ds, window_s=w)["psi1"].values - angles[0]).std() for w in np.arange(0.011, 0.2, 0.004)
+    }
+    chosen = (smooth(ds)["psi1"].values - angles[0]).std()
+    assert chosen < 1.2 * min(error.values())
+
+
+def kinked(make):
+    """A rate that leaps in the middle, as a stop would make it; and its edge."""
+    t = make.time
+    edge = 2.0
+    return np.where(t < edge, 1.5 * t, 1.5 * edge - 0.8 * (t - edge)), edge
+
+
+def test_smooth__keeps_a_kink_at_an_edge(make):
+    angle, edge = kinked(make)
+    recorded = make.recorded(angle, angle)
+    kept = smooth(recorded, window_s=0.2, edges_s=[edge])
+    smeared = smooth(recorded, window_s=0.2, edges_s=[])
+    before = make.time < edge
+    true = np.where(before, 1.5, -0.8)
+    np.testing.assert_allclose(kept["psi1_dot"], true, atol=1e-9)
+    np.testing.assert_allclose(kept["psi1"], angle, atol=1e-12)
+    assert np.abs(smeared["psi1_dot"] - true).max() > 0.5
+    assert np.abs(smeared["psi1"] - angle).max() > 0.01
+
+
+def driven(make, level):
+    """Recording with a drive."""
+    a, b = make.swing(len(level))
+    mapping = parse_mapping({
+        "model": "pendulum", "drive": {"channel": "m", "kind": "signal"},
+        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+    })  # fmt: skip
+    return recording_of(make.raw(make.channels({"a": a, "b": b, "m": level})), mapping)
+
+
+def test_switches__of_a_square_wave_and_where_it_is_switched_off(make):
+    t = make.time
+    level = np.where(np.mod(t, 0.5) < 0.25, 1.0, -1.0) * (t < 3.0)
+    rng = np.random.default_rng(0)
+    found = _switches(driven(make, level + 0.03 * rng.standard_normal(make.n)))
+    expected = np.arange(1, 13) * 0.25
+    np.testing.assert_allclose(found, expected, atol=make.step_s)
+
+
+def test_switches__with_flanks_of_a_few_samples(make):
+    level = np.where(np.mod(make.time, 0.5) < 0.25, 5.0, 0.0)
+    flat = np.convolve(np.pad(level, (3, 0), mode="edge"), np.ones(4) / 4, mode="valid")
+    found = _switches(driven(make, flat))
+    assert np.abs(found[:, None] - 0.25 * np.arange(1, 16)).min(axis=1).max() < 3 * make.step_s
+
+
+@pytest.mark.parametrize("kind", ["sine", "none", "noise"])
+def test_switches__none_where_the_drive_does_not_leap(make, kind):
+    rng = np.random.default_rng(0)
+    level = {
+        "sine": 3.0 * np.sin(2 * np.pi * 3.0 * make.time) + 0.01 * rng.standard_normal(make.n),
+        "none": np.full(make.n, 2.0),
+        "noise": rng.standard_normal(make.n),
+    }[kind]
+    assert _switches(driven(make, level)).size == 0
+
+
+def test_smooth__takes_edges_from_the_drive(make):
+    """The acceleration leaps with the drive: without edges the rate is off there."""
+    t = make.time
+    level = np.where(np.mod(t, 0.5) < 0.25, 1.0, -1.0)
+    rate = 4.0 * np.abs(np.mod(t, 0.5) - 0.25)
+    angle = np.cumsum(rate) * make.step_s
+    ds = driven(make, level)
+    ds["psi1"] = ds["psi1"].copy(data=angle)
+    found = smooth(ds, window_s=0.1)["psi1_dot"].values
+    without = smooth(ds, window_s=0.1, edges_s=[])["psi1_dot"].values
+    true = np.gradient(angle, make.step_s)
+    corners = np.abs(np.mod(t + 0.125, 0.25) - 0.125) < 0.02
+    assert np.abs(found - true)[corners][1:-1].max() < 0.01
+    assert np.abs(without - true)[corners][1:-1].max() > 0.02
+
+
+def test_smooth__spans_no_gap_and_no_piece(make):
+    a, b = make.swing()
+    broken = a.copy()
+    broken[1000:] += 3.0
+    broken[400:410] = np.nan
+    halves = [make.channels({"a": broken[s], "b": b[s]}) for s in (slice(0, 1000), slice(1000, None))]
+    found = smooth(recording_of(make.raw(*halves, apart=True), make.mapping()), window_s=0.042)
+    assert np.flatnonzero(np.isnan(found["psi1"])).tolist() == list(range(400, 410))
+    assert np.isnan(found["psi1_dot"]).sum() == 10
+    known = np.isfinite(broken)
+    np.testing.assert_allclose(found["psi1"].values[known], broken[known], atol=2e-5)
+
+
+def test_smooth__stretches_shorter_than_the_window(make):
+    a, _ = make.swing()
+    a[20:1990] = np.nan
+    a[1993:1996] = np.nan
+    found = smooth(make.recorded(a, a), window_s=0.1)
+    assert np.isfinite(found["psi1"].values[:20]).all()
+    assert np.isnan(found["psi1"].values[1990:1993]).all()  # three samples: no cubic
+
+
+def test_smooth__measured_rates_are_kept(make):
+    a, b = make.swing()
+    mapping = parse_mapping({
+        "model": "pendulum",
+        "channels": {"psi1": {"channel": "a"}, "psi1_dot": {"channel": "b"}},
+    })  # fmt: skip
+    ds = recording_of(make.raw(make.channels({"a": a, "b": b})), mapping)
+    found = smooth(ds, window_s=0.02)
+    assert set(found.data_vars) == {"psi1", "psi1_dot"}
+    np.testing.assert_allclose(found["psi1_dot"], b, atol=1e-5)
+
+
+def test_smooth__leaves_its_argument_alone(make):
+    ds = make.recorded()
+    before = ds.copy(deep=True)
+    smooth(ds, window_s=0.1)
+    assert ds.identical(before)
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ({"order": 0}, "order = 0: must be 1 or more"),
+        ({"window_s": 0.001}, r"window_s = 0\.001: holds 1 samples; .* at least 5, which is 0\.01 s"),
+        ({"window_s": -1.0}, "window_s = -1"),
+    ],
+)
+def test_smooth__refuses(make, more, sentence):
+    with pytest.raises(SpecError, match=sentence):
+        smooth(make.recorded(), **more)
+
+
+@pytest.mark.parametrize(("width", "order"), [(5, 1), (9, 3), (15, 2)])
+def test_along__is_the_weight_of_a_sample_in_its_own_value(width, order):
+    """Against the smoothing of unit vectors, sample by sample, up to both ends."""
+    from scipy.signal import savgol_filter
+
+    operator = savgol_filter(np.eye(24), width, order, axis=0, mode="interp")
+    np.testing.assert_allclose(_along(width, order, 24), np.diag(operator), atol=1e-12)
+
+
+@pytest.mark.parametrize("derivative", [0, 1])
+@pytest.mark.parametrize("width", [65, 201, 999])
+def test_filtered__long_windows_are_those_of_scipy(width, derivative):
+    from scipy.signal import savgol_filter
+
+    y = np.random.default_rng(0).standard_normal(1500).cumsum()
+    wanted = savgol_filter(y, width, 3, deriv=derivative, delta=0.01, mode="interp")
+    found = _filtered(y, width, 3, derivative, 0.01)
+    np.testing.assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
+
+
+def test_first_samples__cuts_the_last_stretch():
+    parts = np.array([[0, 10], [20, 50], [60, 90]])
+    assert _first_samples(parts, 25).tolist() == [[0, 10], [20, 35]]
+    assert _first_samples(parts, 1000).tolist() == parts.tolist()
+    assert _first_samples(parts[:0], 5).size == 0

@@ -1,0 +1,100 @@
+"""Recordings that are written are read back to the same numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pipeline.rig.recordings import (
+    findings_of,
+    load_mapping,
+    mapping_for,
+    parse_mapping,
+    read_recording,
+    recording_of,
+    window,
+    write_raw,
+    write_recording,
+)
+from pipeline.spec.problems import SpecError
+
+
+@pytest.fixture
+def pieces(make):
+    """Recording in two pieces, with a gap, samples that were not measured, and a drive."""
+    a, b = make.swing()
+    a[5:9] = np.nan
+    stamps = make.time + 0.3 * (make.time > 2.0)
+    drive = np.where(np.mod(make.time, 0.4) < 0.2, 1.5, -1.5)
+    mapping = parse_mapping({
+        "model": "pendulum", "time": {"channel": "t"}, "drive": {"channel": "m", "kind": "torque"},
+        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+    })  # fmt: skip
+    return recording_of(
+        make.raw(make.channels({"t": stamps, "a": a, "b": b, "m": drive}, step_s=np.nan)), mapping
+    )
+
+
+def same(found, wanted):
+    assert set(found.data_vars) == set(wanted.data_vars)
+    for name in wanted.data_vars:
+        np.testing.assert_array_equal(found[name], wanted[name])
+        assert found[name].attrs == wanted[name].attrs
+    np.testing.assert_array_equal(found["piece"], wanted["piece"])
+    np.testing.assert_allclose(found["time"], wanted["time"], rtol=0, atol=1e-12)
+    assert found.attrs["sampling_rate_hz"] == wanted.attrs["sampling_rate_hz"]
+
+
+@pytest.mark.parametrize("suffix", [".tdms", ".csv"])
+@pytest.mark.parametrize("kind", ["whole", "pieces"])
+def test_write_recording__is_read_back(tmp_path, make, pieces, suffix, kind):
+    ds = pieces if kind == "pieces" else make.recorded()
+    path = write_recording(ds, tmp_path / f"x{suffix}")
+    mapping = tmp_path / "x.toml"
+    mapping.write_text(mapping_for(ds, path).toml())
+    found = read_recording(path, load_mapping(mapping))
+    same(found, ds)
+    assert "simulated" not in found.attrs
+
+
+@pytest.mark.parametrize("suffix", [".tdms", ".csv"])
+def test_write_recording__part_of_a_recording_is_read_back(tmp_path, make, suffix):
+    """Time counts from the first sample of what is in the file."""
+    ds = window(make.recorded(), (1.0, 2.0))
+    path = write_recording(ds, tmp_path / f"x{suffix}")
+    found = read_recording(path, mapping_for(ds, path))
+    np.testing.assert_array_equal(found["psi1"], ds["psi1"])
+    np.testing.assert_allclose(found["time"], ds["time"] - 1.0, atol=1e-12)
+    assert findings_of(found) == []
+
+
+@pytest.mark.parametrize("suffix", [".tdms", ".csv"])
+def test_write_recording__what_is_simulated_stays_so(tmp_path, make, suffix):
+    ds = make.recorded().assign_attrs(simulated=1)
+    path = write_recording(ds, tmp_path / f"x{suffix}")
+    assert read_recording(path, mapping_for(ds, path)).attrs["simulated"] == 1
+
+
+def test_write_recording__netcdf_is_the_dataset(tmp_path, pieces):
+    path = write_recording(pieces, tmp_path / "x.nc")
+    with xr.open_dataset(path, engine="scipy") as found:
+        np.testing.assert_array_equal(found["psi1"], pieces["psi1"])
+        assert findings_of(found) == findings_of(pieces)
+
+
+def test_write_recording__refuses_a_path_that_cannot_be_written(tmp_path, make):
+    with pytest.raises(SpecError, match=r"suffix must be one of \.tdms, \.csv, \.nc"):
+        write_recording(make.recorded(), tmp_path / "x.mat")
+    with pytest.raises(SpecError, match="there is no folder"):
+        write_recording(make.recorded(), tmp_path / "none" / "x.csv")
+
+
+def test_write_raw__csv_has_a_column_of_time(tmp_path, make):
+    a, b = make.swing()
+    path = write_raw(make.raw(make.channels({"a": a, "b": b})), tmp_path / "x.csv")
+    mapping = parse_mapping({
+        "model": "pendulum", "time": {"channel": "time"},
+        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+    })  # fmt: skip
+    np.testing.assert_array_equal(read_recording(path, mapping)["psi2"], b)
