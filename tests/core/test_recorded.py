@@ -158,7 +158,7 @@ def test_recorded_trajectory__of_the_models_own_torque_converges_to_the_ordinary
     parameters, times = load_preset(eps_drive=10.0), np.linspace(0, 3 / HZ, 31)
     exact = trajectory(parameters, HZ, np.array([0.3, -0.1, 0.0, 0.0]), times, **TIGHT)
     errors = []
-    for n in (600, 1200, 2400):
+    for n in (1200, 2400, 4800):
         samples = np.linspace(0, 3 / HZ, n + 1)
         drive = Drive.from_torque(samples, drive_level(samples, parameters, HZ))
         found = recorded_trajectory(parameters, drive, np.array([0.3, -0.1, 0.0, 0.0]), times, **TIGHT)
