@@ -6,9 +6,9 @@ Run it alone on a machine that does nothing else::
 
 The same residuals (pieces of the real double pendulum, samples, parameters, tolerance) by the lanes and by
 `scipy.integrate.solve_ivp` with the same pair of Dormand and Prince and a jitted right-hand side; the target
-is a factor of 20. Then residuals with slopes, as a step of the fit needs them: by one-sided differences between
-lanes and by the variational equations, with the largest difference of the two in the correlations of the
-normal matrix. CPU times of one process, the least of some rounds, taken in turn.
+is a factor of 20. Then residuals with slopes, as a step of the fit needs them: by one-sided differences
+between lanes and by the variational equations, with the largest difference of the two in the correlations of
+the normal matrix. CPU times of one process, the least of some rounds, taken in turn.
 """
 
 from __future__ import annotations
