@@ -137,6 +137,8 @@ def drive(
     check_target(out, (".csv",))
     made = drive_file(_read(file, mapping, window), kind, tolerance=tolerance)
     out.write_text(made.text, encoding="utf-8")
+    for note in made.notes:
+        console.note(note)
     if made.timing is not None:
         t = made.timing
         console.result(

@@ -52,6 +52,16 @@ def test_drive_file__edges_are_those_of_the_wave():
     assert made.timing.duty_cycle == pytest.approx(0.4, abs=1e-3)
 
 
+def test_drive_file__says_where_an_edge_may_be_missing():
+    level = wave()
+    level[1100:1500] = level[1100]  # low: the pulse from 1.15 s on is lost
+    made = drive_file(recording(level), "edges")
+    assert len(made.notes) == 1
+    assert made.notes[0].startswith("the period from 0.65")
+    assert "2 times the median" in made.notes[0]
+    assert drive_file(recording(wave()), "edges").notes == ()
+
+
 def test_drive_file__torque_is_every_sample():
     level = wave() + 0.01 * np.random.default_rng(0).standard_normal(5000)
     made = drive_file(recording(level), "torque")

@@ -91,9 +91,8 @@ def torque(n=1200):
 
 @pytest.mark.parametrize("kind", ["edges", "torque"])
 def test_run__same_bytes_in_other_tasks_and_after_a_failure(recorded, tmp_path, monkeypatch, bytes_of, kind):
-    path = recorded(
-        RECORDED.replace("n_transient = 7", "n_transient = 5"), torque() if kind == "torque" else None
-    )
+    text = RECORDED.replace("n_transient = 7", "n_transient = 5")
+    path = recorded(text.replace("q = {", "T1 = {"), torque()) if kind == "torque" else recorded(text)
     run(path, tmp_path / "whole", workers=0, echo=silent)
     original, calls = task.compute, []
 

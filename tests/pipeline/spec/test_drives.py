@@ -221,6 +221,16 @@ def test_parse_spec__refuses_extremes_and_no_section_of_a_torque(tmp_path):
         parsed(tmp_path, SPEC, "time_s,drive\n0,1\n5,1\n")
 
 
+def test_parse_spec__refuses_an_axis_along_which_nothing_changes(tmp_path):
+    """The amplitude of the model's own drive does nothing where a torque takes its place."""
+    spec = SPEC.replace("[initial", "[axes]\n{} = {{ values = [1.0, 2.0] }}\n[initial")
+    with pytest.raises(SpecError, match=r"axes\.q: acts on the model's own drive alone") as caught:
+        parsed(tmp_path, spec.format("q"), TORQUE)
+    assert len(caught.value.problems) == 1
+    assert parsed(tmp_path, spec.format("q")).axes
+    assert parsed(tmp_path, spec.format("T1"), TORQUE).axes
+
+
 def test_parse_spec__refuses_a_model_without_a_drive(tmp_path, monkeypatch):
     from magpend_core.engine import absent
     from magpend_core.models import load_model
