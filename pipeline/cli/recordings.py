@@ -103,11 +103,14 @@ def simulate(
     from pipeline.cli import console
     from pipeline.rig.recordings.writing import SUFFIXES, check_target, write_raw
     from pipeline.rig.simulation import load_rig, simulated
+    from pipeline.spec.problems import SpecError
 
     check_target(out, SUFFIXES[:2])
+    beside = out.with_suffix(".toml")
+    if beside.resolve() == spec.resolve():
+        raise SpecError([f"--out {out}: its mapping would be written over {spec}; give another name."])
     raw, mapping = simulated(load_rig(spec), is_csv=out.suffix.lower() == ".csv")
     console.result(f"recording: {write_raw(raw, out)}")
-    beside = out.with_suffix(".toml")
     beside.write_text(mapping.toml(), encoding="utf-8")
     console.result(f"mapping: {beside}")
 

@@ -147,3 +147,13 @@ def test_cli__refuses_a_model_and_a_file(main, tmp_path):
     code, _, err = main("simulate", "--drive", "none.csv")
     assert code == 2
     assert "none.csv: cannot be read" in err
+
+
+def test_cli__does_not_write_a_mapping_over_its_source(main, tmp_path):
+    """What a recording is made of stays: the mapping beside the recording has the same suffix."""
+    (tmp_path / "rig.toml").write_text(RIG, "utf-8")
+    code, _, err = main("recordings", "simulate", "rig.toml", "--out", "rig.tdms")
+    assert code == 2
+    assert "its mapping would be written over rig.toml; give another name" in err
+    assert (tmp_path / "rig.toml").read_text("utf-8") == RIG
+    assert not (tmp_path / "rig.tdms").exists()
