@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from magpend_core.models import load_model
+from pipeline.compute.simulate import simulate
 from pipeline.rig.driving import drive_file, thinned
+from pipeline.rig.recordings import read_recording
 from pipeline.spec.drives import load_drive, parse_drive
 from pipeline.spec.problems import SpecError
 
@@ -124,8 +127,6 @@ def test_cli__from_a_recording_to_a_simulation_and_a_run(main, tmp_path):
     assert main("simulate", "--drive", "torque.csv", "--psi1", "0.3", "--out", "a.csv", "--no-figure")[0] == 0
     found = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True)
     measured = np.loadtxt(tmp_path / "rec.csv", delimiter=",", skiprows=2)
-    from pipeline.rig.recordings import read_recording
-
     ds = read_recording(tmp_path / "rec.csv", tmp_path / "rec.toml")
     assert len(ds.time) == len(measured)
     early = found["time_s"] < 3
@@ -147,6 +148,52 @@ def test_cli__refuses_a_model_and_a_file(main, tmp_path):
     code, _, err = main("simulate", "--drive", "none.csv")
     assert code == 2
     assert "none.csv: cannot be read" in err
+
+
+JITTERED = """
+model = "pendulum"
+sampling_rate_hz = 1000.0
+seed = 3
+initial_state = {{ psi1 = 0.3 }}
+parameters = {{ alpha1 = 0.0, alpha2 = 0.0 }}
+[drive]
+kind = "{kind}"
+noise = 0.005
+steps = [{steps}]
+[sensors.psi1]
+kind = "encoder"
+"""
+
+
+def test_cli__what_the_motor_did_is_closer_than_what_it_was_told(main, tmp_path):
+    """Periods that jitter by 1 %: the recorded torque, the edges, the mean frequency, in this order."""
+    rng = np.random.default_rng(0)
+    hz, duty = 2.2 * (1 + 0.01 * rng.standard_normal(30)), 0.4927 + 0.005 * rng.standard_normal(30)
+    steps = ", ".join(
+        f"{{ frequency_hz = {h!r}, n_periods = 1, duty_cycle = {d!r} }}"
+        for h, d in zip(hz.tolist(), duty.tolist(), strict=True)
+    )
+    for kind, drive in (("signal", "edges"), ("torque", "torque")):
+        (tmp_path / f"rig_{kind}.toml").write_text(JITTERED.format(kind=kind, steps=steps), "utf-8")
+        assert main("recordings", "simulate", f"rig_{kind}.toml", "--out", f"{kind}.tdms")[0] == 0
+        both = f"{kind}.tdms", "--mapping", f"{kind}.toml", "--kind", drive, "--out", f"{drive}.csv"
+        assert main("recordings", "drive", *both)[0] == 0
+    truth = read_recording(tmp_path / "torque.tdms", tmp_path / "torque.toml")
+    free = {"alpha1": 0.0, "alpha2": 0.0}  # without magnets the motion is regular, and errors do not grow
+    torque = simulate(None, (0.3, 0.0, 0.0, 0.0), drive=tmp_path / "torque.csv", overrides=free)
+    edges = load_drive(tmp_path / "edges.csv")
+    names = load_model("pendulum").state_names
+    state = [float(np.interp(edges.start_s, torque.time, torque[name])) for name in names]
+    own = simulate(None, state, drive=tmp_path / "edges.csv", overrides=free)
+    told = simulate(edges.frequency_hz, state, n_periods=edges.n_periods, overrides=free)
+    told = told.assign_coords(time=told.time + edges.start_s)
+
+    def rms(series):
+        inside = truth.sel(sample=(truth.time >= series.time[0]) & (truth.time <= series.time[-1]))
+        off = np.interp(inside.time, series.time, series.psi1) - inside.psi1
+        return float(np.sqrt(np.mean(off**2)))
+
+    assert rms(torque) < 3e-4 < rms(own) < 3e-3 < 15e-3 < rms(told)
 
 
 def test_cli__does_not_write_a_mapping_over_its_source(main, tmp_path):
