@@ -100,6 +100,9 @@ class Step:
         return self.n_periods / self.frequency_hz
 
 
+TOLERANCE = 1e-11
+"""Relative and absolute tolerance of the rig's motion."""
+
 Sensors = AnyMapping[str, Sensor | DriveSensor]
 
 
@@ -249,7 +252,11 @@ def _states(
     from magpend_core.status import Status
 
     drives = None if drive is None else [_intervals(parameters, drive, times[-1])]
-    found = sample(parameters.model.system, parameters.pack()[None], start[None], [times], drives=drives)
+    # finer than any fit to it: what comes back is the sensors' noise, not the integration's
+    found = sample(
+        parameters.model.system, parameters.pack()[None], start[None], [times], drives=drives, rtol=TOLERANCE,
+        atol=TOLERANCE,
+    )  # fmt: skip
     status = Status(int(found.status[0]))
     if not np.isfinite(found.states[0]).all():
         raise ArithmeticError(f"The trajectory ended early: {status.sentence}.")

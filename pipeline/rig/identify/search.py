@@ -19,7 +19,6 @@ from pipeline.products.reporting import report
 from pipeline.rig.identify.local import Echo, Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
-from pipeline.rig.identify.starts import fit_starts
 
 Array = NDArray[np.float64]
 
@@ -175,12 +174,10 @@ def refine(
 ) -> Fit:
     """Fit from one first guess: short stretches, longer ones, whole pieces with free starts."""
     for stage in _stages(problem) if stages is None else stages:
-        fit = fit_local(
-            stage, theta, free_starts=False, max_evaluations=STAGE_EVALUATIONS, tolerance=STAGE_TOLERANCE
-        )
+        fit = fit_local(stage, theta, max_evaluations=STAGE_EVALUATIONS, tolerance=STAGE_TOLERANCE)
         if np.isfinite(fit.cost):
             theta = fit.theta
-    return fit_local(problem, theta, starts=fit_starts(problem, theta, problem.starts), echo=echo)
+    return fit_local(problem, theta, echo=echo)
 
 
 def _stages(problem: Problem) -> list[Problem]:
