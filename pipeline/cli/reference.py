@@ -209,6 +209,7 @@ def virtual_rig() -> str:
     parts = [
         _keys("RIG.toml", simulation.RigTable, "", ("drive", "sensors")),
         _keys("[drive]", simulation.DriveTable, 'Or `drive = "none"`.', ()),
+        _keys("sweep = {...}", simulation.SweepTable, "In `[drive]`.", ()),
         _keys("[sensors.STATE]", simulation.SensorTable, "", ()),
     ]
     return "\n\n".join(parts)

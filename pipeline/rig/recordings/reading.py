@@ -15,7 +15,7 @@ import xarray as xr
 
 from pipeline.rig.recordings import checks, formats, units
 from pipeline.rig.recordings.clock import Clock, clock_of
-from pipeline.rig.recordings.findings import Finding, to_json
+from pipeline.rig.recordings.findings import Finding, findings_of, to_json
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, Scaled, load_mapping
 from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.spec.problems import SpecError, unknown_name
@@ -92,7 +92,7 @@ def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | 
 
 
 def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
-    """Return a part of a recording; time goes on counting from the recording's first sample.
+    """Return a part of a recording, with the findings in it; time goes on counting from its first sample.
 
     Parameters
     ----------
@@ -117,7 +117,8 @@ def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
                 f"{Path(str(ds.attrs.get('file', ''))).name} goes from {time[0]:g} to {time[-1]:g} s."
             ]
         )
-    return ds.isel({DIM: np.flatnonzero(inside)})
+    kept = [f for f in findings_of(ds) if not (f.end_s < low - slack or f.start_s > high + slack)]
+    return ds.isel({DIM: np.flatnonzero(inside)}).assign_attrs(findings=to_json(kept))
 
 
 def _entries(mapping: Mapping) -> dict[str, Scaled]:

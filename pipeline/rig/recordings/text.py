@@ -10,9 +10,6 @@ import numpy as np
 
 from pipeline.spec.problems import SpecError
 
-MAX_LINE = 1_000_000
-"""Longest line of a text that is one [characters]."""
-
 
 def read_text(path: Path) -> str:
     """Return a text in UTF-8, or else in the Western encoding of Windows that LabVIEW writes.
@@ -59,41 +56,61 @@ def split(line: str, delimiter: str) -> list[str]:
     return line.split(delimiter)
 
 
-def table(lines: Sequence[str], n_columns: int, delimiter: str, decimal: str) -> np.ndarray:
+def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal: str) -> np.ndarray:
     """Return rows of numbers; what is empty, missing or no number is NaN.
 
     Parameters
     ----------
     lines
         Without their ends.
-    n_columns
-        Fields that count; further ones are left out, such as comments.
+    columns
+        Fields that are wanted, by number from 0.
 
     Returns
     -------
     ndarray
         (n_lines, n_columns).
     """
-    if not lines or n_columns == 0:
-        return np.empty((len(lines), n_columns))
+    if not lines or not columns:
+        return np.empty((len(lines), len(columns)))
     text = "\n".join(lines)
     if decimal == ",":
         text = text.replace(",", ".")
     try:
         found = np.loadtxt(
-            io.StringIO(text), delimiter=None if delimiter == " " else delimiter, usecols=range(n_columns),
+            io.StringIO(text), delimiter=None if delimiter == " " else delimiter, usecols=columns,
             ndmin=2, comments=None, quotechar='"',
         )  # fmt: skip
-        if found.shape == (len(lines), n_columns):
+        if found.shape == (len(lines), len(columns)):
             return found
     except (ValueError, IndexError):
         pass  # empty or short rows: slower, field by field
-    rows = np.full((len(lines), n_columns), np.nan)
+    rows = np.full((len(lines), len(columns)), np.nan)
     for i, line in enumerate(lines):
-        for j, part in enumerate(split(line, delimiter)[:n_columns]):
-            value = number(part, decimal)
-            rows[i, j] = np.nan if value is None else value
+        parts = split(line, delimiter)
+        for k, j in enumerate(columns):
+            value = number(parts[j], decimal) if j < len(parts) else None
+            rows[i, k] = np.nan if value is None else value
     return rows
+
+
+def instants(fields: Sequence[str]) -> np.ndarray | None:
+    """Return dates, or times of day, as seconds since the first; None of other texts.
+
+    Parameters
+    ----------
+    fields
+        In the order of ISO 8601, with a blank or a T between date and time, and a point or a comma before the
+        parts of a second.
+    """
+    plain = [f.strip().strip('"').replace("/", "-").replace(",", ".") for f in fields]
+    if plain and "-" not in plain[0]:
+        plain = [f"1970-01-01T{f}" for f in plain]
+    try:
+        found = np.array(plain, dtype="datetime64[ns]")
+    except ValueError:
+        return None
+    return np.asarray((found - found[0]).astype(np.float64) * 1e-9) if found.size else None
 
 
 def unique(names: Sequence[str]) -> list[str]:

@@ -216,6 +216,16 @@ def test_window__keeps_time(make):
     assert ds.sizes["sample"] == 501
 
 
+def test_window__keeps_the_findings_in_it(make):
+    stamps = make.time.copy()
+    stamps[700:] += 0.5
+    stamps[1500:] += 0.5
+    ds = stamped(make, stamps)
+    assert len(findings_of(ds)) == 2
+    (found,) = findings_of(window(ds, (2.0, 4.5)))
+    assert found.start_s == pytest.approx(stamps[1499])
+
+
 def test_window__that_is_empty_is_refused(make):
     with pytest.raises(SpecError, match=r"window_s = \[10, 20\]: holds 0 samples; .* goes from 0 to 3.998 s"):
         window(make.recorded(), (10.0, 20.0))
