@@ -166,6 +166,21 @@ def specification() -> str:
     return "\n\n".join(_keys(*part) for part in parts)
 
 
+def identification() -> str:
+    """Keys of the specification of an identification, table by table."""
+    from pipeline.rig.identify import specification as tables
+    from pipeline.rig.identify.unknowns import Identified
+
+    parts = [
+        ("[identify] NAME = {...}", Identified, "NAME is a parameter of the model."),
+        ("[sensors]", tables.SensorsTable, ""),
+        ("[[recordings]]", tables.RecordingTable, ""),
+        ("[fit]", tables.FitTable, ""),
+        ("[search]", tables.SearchTable, ""),
+    ]
+    return "\n\n".join(_keys(*part) for part in parts)
+
+
 _STATES = "Beside these: each state of the model by name, or with `_deg` if it is an angle or its rate: {}."
 
 
@@ -306,6 +321,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "exit codes": exit_codes,
     "workflows": workflows,
     "specification": specification,
+    "identification": identification,
     "products": products,
     "mapping": mapping,
     "findings": findings,
