@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.spec.problems import SpecError
+
+_INSTANT = re.compile(
+    r"(?:(?P<date>\d{4}-\d\d-\d\d)[T ])?(?P<time>\d\d:\d\d:\d\d(?:\.\d{1,9})?)(?P<zone>Z|[+-]\d\d:?\d\d)?"
+)
 
 
 def read_text(path: Path) -> str:
@@ -103,14 +108,15 @@ def instants(fields: Sequence[str]) -> np.ndarray | None:
         In the order of ISO 8601, with a blank or a T between date and time, and a point or a comma before the
         parts of a second.
     """
-    plain = [f.strip().strip('"').replace("/", "-").replace(",", ".") for f in fields]
-    if plain and "-" not in plain[0]:
-        plain = [f"1970-01-01T{f}" for f in plain]
-    try:
-        found = np.array(plain, dtype="datetime64[ns]")
-    except ValueError:
+    found = [_INSTANT.fullmatch(f.strip().strip('"').replace("/", "-").replace(",", ".")) for f in fields]
+    known = [m for m in found if m is not None]
+    if len(known) < len(found) or not known or len({m["zone"] for m in known}) > 1:
         return None
-    return np.asarray((found - found[0]).astype(np.float64) * 1e-9) if found.size else None
+    try:
+        stamps = np.array([f"{m['date'] or '1970-01-01'}T{m['time']}" for m in known], dtype="datetime64[ns]")
+    except ValueError:  # the 31st of February
+        return None
+    return np.asarray((stamps - stamps[0]).astype(np.float64) * 1e-9)
 
 
 def unique(names: Sequence[str]) -> list[str]:
