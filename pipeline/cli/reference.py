@@ -203,7 +203,7 @@ def mapping() -> str:
         _keys("MAPPING.toml", found.Mapping, "", top),
         _keys("time = {...}", found.TimeMap, "", ()),
         _keys("piece = {...}", found.PieceMap, "", ()),
-        _keys("[channels.NAME]", found.ChannelMap, "NAME is a state of the model.", ()),
+        _keys("[channels.NAME]", found.ChannelMap, "NAME is a state of the model, or a quantity.", ()),
         _keys("[drive]", found.DriveMap, 'Or `drive = "none"`.', ()),
         _keys("[csv]", found.CsvMap, "For CSV files alone; what is not stated is found out.", ()),
     ]

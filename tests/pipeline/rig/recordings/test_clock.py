@@ -129,6 +129,18 @@ def test_clock__stated_rate_that_is_not_the_files(make):
     assert ds.attrs["sampling_rate_hz"] == 250.0
 
 
+def test_clock__stated_rate_beside_time_stamps_is_noted(make):
+    """A gap in stamps that are not used cannot be found: that much is said."""
+    a, b = make.swing()
+    stamps = make.time + 0.5 * (make.time > 2.0)
+    channels = {n: Channel(n, v, time=stamps) for n, v in (("a", a), ("b", b))}
+    stated = make.mapping().model_copy(update={"sampling_rate_hz": 500.0})
+    ds = recording_of(make.raw(channels), stated)
+    assert {(f.kind, f.severity) for f in findings_of(ds)} == {("rate", "note")}
+    np.testing.assert_allclose(ds["time"], make.time, atol=1e-12)
+    assert [f.kind for f in findings_of(recording_of(make.raw(channels), make.mapping()))] == ["gap"]
+
+
 def test_clock__unequal_lengths(make):
     a, b = make.swing()
     ds = recording_of(make.raw(make.channels({"a": a, "b": b[:1900]})), make.mapping())
@@ -195,6 +207,22 @@ def test_clock__piece_channel_begins_new_pieces(make):
     })  # fmt: skip
     ds = recording_of(raw, mapping)
     np.testing.assert_array_equal(ds["piece"], number)
+
+
+@pytest.mark.parametrize(("axis", "key"), [("t", "time"), ("k", "piece")])
+@pytest.mark.parametrize("n", [1500, 2500])
+def test_timed__stamps_or_numbers_of_another_length_are_a_finding(make, axis, key, n):
+    a, b = make.swing()
+    values = np.arange(n) * make.step_s if axis == "t" else (np.arange(n) > 700).astype(float)
+    mapping = parse_mapping({
+        "model": "pendulum", key: {"channel": axis},
+        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+    })  # fmt: skip
+    ds = recording_of(make.raw(make.channels({axis: values, "a": a, "b": b})), mapping)
+    assert ds.sizes["sample"] == min(n, make.n)
+    told = {(f.kind, f.channel) for f in findings_of(ds)}
+    assert told == ({("length", "psi1"), ("length", "psi2")} if n < make.n else {("length", key)})
+    assert len(np.unique(ds["piece"])) == (1 if axis == "t" else 2)
 
 
 def test_resolved__missing_channels_are_named_with_the_nearest(make):
