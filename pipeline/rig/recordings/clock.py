@@ -190,7 +190,8 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
     for name, channel in stretches[0].items():
         step = step_of(channel)
         if math.isfinite(step) and abs(step / stated - 1.0) > 1e-6:
-            text = f"the file says {1.0 / step:.8g} Hz, the mapping {1.0 / stated:.8g} Hz; the mapping's is used."
+            rates = f"the file says {1.0 / step:.8g} Hz, the mapping {1.0 / stated:.8g} Hz"
+            text = f"{rates}; the mapping's is used."
             findings.append(Finding("rate", name, math.nan, math.nan, "warning", text))
         if channel.time is not None:
             text = "the file's time stamps are not used, nor gaps in them seen: the mapping states a rate."
