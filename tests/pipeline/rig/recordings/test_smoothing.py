@@ -170,12 +170,23 @@ def test_smooth__spans_no_gap_and_no_piece(make):
 
 
 def test_smooth__stretches_shorter_than_the_window(make):
+    """They have a window of their own; one or two samples are none."""
     a, _ = make.swing()
     a[20:1990] = np.nan
-    a[1993:1996] = np.nan
+    a[[1993, 1996]] = np.nan
     found = smooth(make.recorded(a, a), window_s=0.1)
     assert np.isfinite(found["psi1"].values[:20]).all()
-    assert np.isnan(found["psi1"].values[1990:1993]).all()  # three samples: no cubic
+    assert np.isfinite(found["psi1_dot"].values[1990:1993]).all()
+    assert np.isnan(found["psi1_dot"].values[1994:1996]).all()
+
+
+def test_smooth__short_stretches_have_lower_order(make):
+    """A third of the window: a cubic's rates there would be twice as far off."""
+    ds, _, rates = noisy(make, 1e-3)
+    edges = np.arange(1, 1000) * 0.021
+    error = smooth(ds, window_s=0.061, edges_s=edges)["psi1_dot"].values - rates[0]
+    cubic = smooth(ds, window_s=0.021, edges_s=edges)["psi1_dot"].values - rates[0]
+    assert error.std() < 0.6 * cubic.std()
 
 
 def test_smooth__measured_rates_are_kept(make):
