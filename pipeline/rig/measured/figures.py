@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
@@ -243,10 +244,19 @@ class _Met:
 
 
 def _met(compared: xr.Dataset, computed: Computed) -> _Met:
-    cast = palette.cast_of(computed.attractors)
-    ids = [int(i) for i in np.unique(compared["winner"].values) if i >= 0]
-    colours = {i: palette.COLOURS[k % len(palette.COLOURS)] for k, i in enumerate(ids)}
-    return _Met(colours, {i: cast.names[i] for i in ids}, len(ids) < computed.attractors.sizes["attractor"])
+    """Give the first attractor of each side that side's colour, so that all panels say the same."""
+    cast, motions = palette.cast_of(computed.attractors), motions_of(compared)
+    winners, sides = compared["winner"].values, compared["computed_side"].values
+    ids = [int(i) for i in np.unique(winners) if i >= 0]
+    spare = sorted((c for c in palette.COLOURS if c not in motions.colours), key=lambda c: sum(to_rgb(c)))
+    colours: dict[int, str] = {}
+    for i in sorted(ids, key=lambda i: -int((winners == i).sum())):
+        side = int(np.bincount(sides[winners == i].astype(np.int64)).argmax())
+        own = motions.colours[side]
+        free = bool(side) and own not in colours.values() and own != style.GREY
+        colours[i] = own if free else spare[len(colours) % len(spare)]
+    names = {i: cast.names[i] for i in ids}
+    return _Met(colours, names, len(ids) < computed.attractors.sizes["attractor"])
 
 
 def _draw_attractors(ax: Axes, computed: Computed, measure: labels.Measure, met: _Met) -> None:
