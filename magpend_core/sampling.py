@@ -32,6 +32,7 @@ class Drive:
     names : tuple of str
         Parameters that change with the interval.
     values : ndarray, (interval, name)
+        NaN leaves what the trajectory has.
     start_s : float
         Where in the first interval the trajectory starts [s].
     """

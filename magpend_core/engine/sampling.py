@@ -51,7 +51,7 @@ class Samples(NamedTuple):
     times: Any  # (time,) s since the piece's start, rising within a piece
     first_time: Any  # int64 (piece + 1,)
     durations: Any  # (interval,) s
-    values: Any  # (interval, n_changed)
+    values: Any  # (interval, n_changed); NaN leaves what the trajectory has
     first_interval: Any  # int64 (piece + 1,)
     changed: Any  # int64 (n_changed,): the parameters that `values` are of
     start: Any  # (piece,) s, of a piece within its first interval
@@ -86,7 +86,8 @@ def begin_interval(samples: Samples, seats: Seats, lane: int, scratch: Any) -> N
     for i in range(len(p)):
         p[i] = samples.parameters[seats.trajectory[lane], i]
     for i in range(len(samples.changed)):
-        p[samples.changed[i]] = samples.values[at, i]
+        if samples.values[at, i] == samples.values[at, i]:
+            p[samples.changed[i]] = samples.values[at, i]
     frequency = 1.0 / samples.durations[at]
     load_cell(w, base, column, frequency, p, samples.slack, scratch, seats.edge_table[lane])
     seats.edge[lane] = begin_period(w, base, column, seats.edge_table[lane])

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pipeline.cli.common import EXIT_HELP, Json
+from pipeline.cli.common import EXIT_HELP, Csv, Json
 from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import completing, speaking
 
@@ -19,19 +19,21 @@ RUN = "spec"
 
 
 class IdentifyGroup(TyperGroup):
-    """``magpend identify SPEC`` beside ``magpend identify check DIR RECORDING``."""
+    """``magpend identify SPEC`` beside ``magpend identify check`` and ``compare``."""
+
+    default = RUN
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the command that is meant before what is no command's name."""
         known = (*self.list_commands(ctx), "--help", "-h", "--install-completion", "--show-completion")
-        meant = [RUN, *args] if args and args[0] not in known else args
+        meant = [self.default, *args] if args and args[0] not in known else args
         return list(super().parse_args(ctx, meant))
 
 
 identify_app = typer.Typer(
     cls=IdentifyGroup,
     help="Identify parameters from recordings: magpend identify SPEC --out DIR; judge a result on another "
-    "recording: magpend identify check DIR RECORDING.",
+    "recording: magpend identify check DIR RECORDING; compare results: magpend identify compare DIR DIR.",
     no_args_is_help=True,
     rich_markup_mode=None,
     context_settings=SETTINGS,
@@ -99,5 +101,19 @@ def check(
         console.result(f"piece {piece['piece']}: {values}")
 
 
+def compare(
+    directories: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Finished identifications.")],
+    as_json: Json = False,
+    csv: Csv = None,
+) -> None:
+    """Put identifications side by side, best first: laws are compared by held-out pieces, not by the fit."""
+    from pipeline.cli.common import check_csv, tell
+    from pipeline.rig.identify.comparison import compare as comparing
+
+    check_csv(csv)
+    tell(comparing(directories), csv, as_json)
+
+
 identify_app.command(RUN, epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(identify))
 identify_app.command("check", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(check))
+identify_app.command("compare", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(compare))

@@ -182,7 +182,7 @@ def test_with_recorded_drive__refuses_a_system_without_a_drive():
 
 
 def test_with_parameter_tangent__of_a_linear_oscillator_is_the_closed_form():
-    """By the drive's amplitude the response is itself over it; by the start it is the free motion."""
+    """By the drive's amplitude: the response over it; by the start: the free motion."""
     from magpend_core.engine.variational import with_parameter_tangent
 
     values = DUFFING.load(damping=0.3, linear=4.0, cubic=0.0, amplitude=0.7)
@@ -207,7 +207,7 @@ def test_with_parameter_tangent__of_a_linear_oscillator_is_the_closed_form():
 
 @pytest.mark.parametrize("name", ["e1", "mu", "c0", "q", "duty_cycle"])
 def test_with_parameter_tangent__is_that_of_differences(name):
-    """Of the pendulum with load-dependent friction and a square wave: central differences, tight tolerances."""
+    """Of the pendulum with load-dependent friction and a square wave: central differences, tightly."""
     from magpend_core.engine.variational import with_parameter_tangent
 
     values, times = PENDULUM.load(), np.linspace(0, 2, 101)
@@ -220,8 +220,18 @@ def test_with_parameter_tangent__is_that_of_differences(name):
         with_parameter_tangent(PENDULUM.system), given[None], [[*start, 0, 0, 0, 0]], [times], drives=drive
     ).states[0, :, 4:]
     sides = sample(
-        PENDULUM.system, np.array([p + step, p - step]), np.array([start, start]), [times], piece=np.zeros(2, int),
-        drives=drive, rtol=1e-12, atol=1e-12,
+        PENDULUM.system, np.array([p + step, p - step]), np.array([start, start]), [times],
+        piece=np.zeros(2, int), drives=drive, rtol=1e-12, atol=1e-12,
     ).states  # fmt: skip
     difference = (sides[0] - sides[1]) / (2 * h)
     np.testing.assert_allclose(tangent, difference, atol=1e-4 * np.abs(difference).max())
+
+
+def test_sample__keeps_its_own_values_where_the_drive_gives_none():
+    drive = Drive(np.array([1.0, 1.0]), ("amplitude", "damping"), np.array([[0.0, np.nan], [np.nan, 0.3]]))
+    times = np.array([0.5, 1.0, 1.9])
+    found = sample(DUFFING.system, LINEAR.pack()[None], [[0.2, 0.0]], [times], drives=[drive])
+    same = Drive(np.array([1.0, 1.0]), ("amplitude",), np.array([[0.0], [0.7]]))
+    other = sample(DUFFING.system, LINEAR.pack()[None], [[0.2, 0.0]], [times], drives=[same])
+    np.testing.assert_array_equal(found.states, other.states)
+    assert np.isfinite(found.states).all()

@@ -14,6 +14,7 @@ from magpend_core.models.model import Model
 from magpend_core.sampling import Drive
 from pipeline.rig.edges import find_edges
 from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
+from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
 from pipeline.rig.recordings import load_mapping, read_recording, smooth
 from pipeline.spec.problems import SpecError
@@ -105,6 +106,8 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         raise SpecError(problems)
     if not kept:
         raise SpecError(["recordings: all pieces are held out; leave some to be fitted."])
+    both = apply_settings([*kept, *held], {i: t.parameters for i, t in enumerate(spec.recordings)})
+    kept, held = both[: len(kept)], both[len(kept) :]
     problem = Problem(
         model=spec.model, fixed=spec.values, free=free_of(spec, channels, len(recordings)), channels=channels,
         pieces=tuple(kept), tied=spec.tied, loss=spec.fit.loss,
@@ -161,11 +164,18 @@ def drive_problems(
                 '(kind = "torque").'
             )
     kinds = {table.drive for table in tables}
-    if "edges" in kinds and len(kinds) > 1:
+    if {"edges", "recorded"} <= kinds:
         problems.append(
-            f'{where}: drive = "edges" cannot stand beside others in one identification; give all recordings '
-            '"edges", or none.'
+            f'{where}: drive = "edges" cannot stand beside "recorded" in one identification; take '
+            "one of them for all driven recordings."
         )
+    if "edges" in kinds:
+        problems += [
+            f'{where}[{i}]: beside drive = "edges" of others, say what switches its drive off: parameters = '
+            "{ NAME = 0.0 } with the name of the drive's amplitude."
+            for i, table in enumerate(tables)
+            if table.drive == "none" and not table.parameters
+        ]
     if "edges" in kinds and DUTY not in model.parameter_names:
         problems.append(
             f'{where}: drive = "edges" asks for a model with a parameter {DUTY}; {model.name} has none.'

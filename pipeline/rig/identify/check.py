@@ -14,6 +14,7 @@ from pipeline.rig.identify.directory import Info, read_info, read_result
 from pipeline.rig.identify.identification import require_starts
 from pipeline.rig.identify.judging import judge
 from pipeline.rig.identify.problem import Free, Problem
+from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.rig.recordings import parse_mapping, read_recording, smooth
 from pipeline.spec.problems import SpecError
@@ -53,7 +54,9 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
     tables = info.identity["spec"]["recordings"]
     if not 0 <= like < len(tables):
         raise SpecError([f"like = {like}: there are recordings 0 to {len(tables) - 1}."])
-    table = RecordingTable(file=str(recording), mapping="", drive=tables[like]["drive"])
+    table = RecordingTable.model_validate(
+        {"file": str(recording), "mapping": "", **{k: tables[like][k] for k in ("drive", "parameters")}}
+    )
     ds = read_recording(recording, parse_mapping(info.mappings[like], f"mapping of recording {like}"))
     model = load_model(result["model"])
     channels = tuple(result["channels"])
@@ -65,6 +68,7 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
     if problems:
         raise SpecError(problems)
     pieces = pieces_of(model, channels, (ds, smooth(ds)), table, like)
+    pieces = apply_settings(pieces, {like: table.parameters})
     zeros = result["zeros"]
     free = tuple(Free(name, value) for name, value in zeros.items())
     problem = Problem(

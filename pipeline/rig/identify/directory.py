@@ -49,7 +49,9 @@ IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES = (
 )  # fmt: skip
 _OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK})
 _ROOM = Path(__file__).parent
-_NOT_NUMBERS = ("check.py", "directory.py", "figures.py", "reports.py", "residuals.py")
+_NOT_NUMBERS = (
+    "check.py", "comparison.py", "directory.py", "figures.py", "reports.py", "residuals.py",
+)  # fmt: skip
 """Modules that decide no number."""
 
 

@@ -25,6 +25,9 @@ MOST_PIECES = 4
 MOST_DOTS = 3000
 """Residuals against the rate that are drawn; the means in bins are those of all."""
 
+VIEWS = 4
+"""Of residuals: autocorrelation, by piece, against the rate, histogram."""
+
 MILLI = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "rad/s": ("mrad/s", 1e3)}
 """In what residuals are drawn."""
 
@@ -192,9 +195,9 @@ def plot_residuals(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     views = residual_views(ds, channels)
     title = _title(ds.attrs, "residuals")
     fig = style.new_figure(8.2, views.assign_attrs({**ds.attrs, "title": title}), frame)
-    grid = fig.add_gridspec(4, len(channels))
+    grid = fig.add_gridspec(VIEWS, len(channels))
     for c, channel in enumerate(channels):
-        column = [fig.add_subplot(grid[r, c]) for r in range(4)]
+        column = [fig.add_subplot(grid[row, c]) for row in range(VIEWS)]
         for ax in column:
             style.style_axes(ax, minor=False)
         unit, factor = _milli(ds, channel)

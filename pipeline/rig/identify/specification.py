@@ -18,6 +18,7 @@ from magpend_core.models.parameters import (
     near_names,
 )
 from magpend_core.models.presets import is_file
+from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
 from pipeline.spec.files import read_toml
 from pipeline.spec.parsing import IDENTIFICATION
@@ -28,40 +29,75 @@ from pipeline.spec.tables import Table
 class SensorsTable(Table):
     """What of the sensors is identified as well."""
 
-    zero: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    zero: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        (), description="Channels whose zero is unknown: one offset per recording"
+    )
 
 
 class RecordingTable(Table):
     """A recording, what its drive did, and what of it is used."""
 
-    file: str
-    mapping: str
-    drive: Literal["none", "recorded", "edges"] = "none"
-    piece_s: Annotated[float, Field(gt=0)] | None = None
-    window_s: Pair | None = None
-    hold_out: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = ()
+    file: str = Field(description="The recording, seen from the specification")
+    mapping: str = Field(description="Its mapping file, likewise")
+    drive: Literal["none", "recorded", "edges"] = Field(
+        "none",
+        description="`none`: the drive was off; `recorded`: the torque is what was measured; `edges`: the "
+        "instants of switching are what was measured, shape and size are the model's",
+    )
+    parameters: dict[str, float] = Field(
+        default_factory=dict,
+        description="Values of parameters in this recording alone, such as a drive's amplitude of 0",
+    )
+    piece_s: Annotated[float, Field(gt=0)] | None = Field(
+        None, description="Cut pieces into equal stretches of about this length [s], each with a free start"
+    )
+    window_s: Pair | None = Field(None, description="Part that is used [s since the first sample]")
+    hold_out: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = Field(
+        (), description="Numbers of pieces (of stretches, with `piece_s`) that are judged, not fitted"
+    )
 
 
 class FitTable(Table):
     """The criterion."""
 
-    channels: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
-    continuity: Literal["free"] | Annotated[float, Field(gt=0, strict=False)] = "free"
-    noise: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
-    decimate: Annotated[int, Field(ge=1)] = 1
-    rtol: Annotated[float, Field(gt=0, le=1e-3)] = 1e-8
+    channels: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        (), description="States that are compared; by default all that are measured in all recordings, rates "
+        "left out where their angles are measured",
+    )  # fmt: skip
+    loss: Literal["linear", "soft_l1", "huber", "cauchy"] = Field(
+        "linear", description="Of residuals in units of their scale; `linear` is least squares"
+    )
+    continuity: Literal["free"] | Annotated[float, Field(gt=0, strict=False)] = Field(
+        "free",
+        description="Of stretches cut by `piece_s`: `free`, or the weight of the gaps between the end of one "
+        "and the start of the next, in units of the noise",
+    )
+    noise: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        default_factory=dict,
+        description="Standard deviation that channels are weighted with; by default as estimated, the same "
+        "for all channels of one unit",
+    )
+    decimate: Annotated[int, Field(ge=1)] = Field(1, description="Take every so many samples")
+    rtol: Annotated[float, Field(gt=0, le=1e-3)] = Field(1e-8, description="Tolerance of the integration")
 
 
 class SearchTable(Table):
     """The global stage, and what is done after it."""
 
-    n_starts: Annotated[int, Field(ge=1, le=10_000)] = 8
-    seed: Annotated[int, Field(ge=0)] = 1
-    spread: Annotated[float, Field(ge=0, lt=1)] = 0.3
-    method: Literal["sobol", "cma"] = "sobol"
-    n_samples: Annotated[int, Field(ge=1, le=1_000_000)] = 256
-    profiles: bool = True
+    n_starts: Annotated[int, Field(ge=1, le=10_000)] = Field(
+        8, description="First guesses that are followed to an optimum, the specification's own first"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(1, description="Of the guesses")
+    spread: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.3, description="How far from the specification's starts they lie, as a share of these"
+    )
+    method: Literal["sobol", "cma"] = Field(
+        "sobol", description="`sobol`: the best of many points; `cma`: CMA-ES over short stretches"
+    )
+    n_samples: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
+        256, description="Points that are looked at for the best `n_starts`"
+    )
+    profiles: bool = Field(True, description="Take profile likelihoods")
 
 
 @dataclass(frozen=True)
@@ -183,6 +219,8 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     if model is None:
         raise SpecError(problems)
     problems += _channel_problems(model, sensors, fit)
+    for i, table in enumerate(recordings):
+        problems += setting_problems(model, table.parameters, f"recordings[{i}].parameters")
     own = ParameterTables(data, model, _found(preset, folder), problems)
     if problems:
         raise SpecError(problems)

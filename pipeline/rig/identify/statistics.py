@@ -249,9 +249,9 @@ def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.nda
     Returns
     -------
     weight : ndarray
-        psi(r)/r.
+        The derivative of half the loss, over the residual.
     slope : ndarray
-        psi'(r), at least 0.
+        Of that derivative, at least 0.
     """
     z = residuals**2
     if loss == "linear":

@@ -42,9 +42,11 @@ class Prior(Table):
 class Identified(Table):
     """A parameter that is identified."""
 
-    start: float | None = None
-    bounds: Pair | None = None
-    prior: Prior | None = None
+    start: float | None = Field(None, description="First guess; by default the preset's value")
+    bounds: Pair | None = Field(None, description="[low, high]; by default those of the model")
+    prior: Prior | None = Field(
+        None, description="An independent measurement, { mean = ..., sd = ... }: a weight, a length"
+    )
 
 
 @dataclass(frozen=True)

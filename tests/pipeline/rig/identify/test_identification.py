@@ -298,3 +298,46 @@ def test_refuse_invisible__names_what_the_data_cannot_see(bench):
     assert [p.split(":")[0] for p in caught.value.problems] == [
         "identify.damping", "identify.linear", "identify.cubic",
     ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def without_cubic(bench):
+    """The same recording with a law that lacks something."""
+    folder, _, _ = bench
+    text = SPEC.replace("[identify.cubic]\n", "").replace("amplitude = 0.0", "amplitude = 0.0\ncubic = 0.0")
+    (folder / "linear.toml").write_text(text.replace("profiles = true", "profiles = false"))
+    identification.identify(folder / "linear.toml", folder / "linear", figures=False, echo=lambda _: None)
+    return folder / "linear"
+
+
+def test_compare__goes_by_held_out_pieces(bench, without_cubic, main):
+    folder, _, _ = bench
+    code, out, _ = main("identify", "compare", without_cubic, folder / "out", "--json")
+    assert code == 0
+    rows = json.loads(out)
+    assert [r["directory"] for r in rows] == [str(folder / "out"), str(without_cubic)]
+    assert rows[0]["held_out_x"] < 0.5 * rows[1]["held_out_x"]
+    assert [r["unknowns"] for r in rows] == [4, 3]
+    code, out, _ = main("identify", "compare", without_cubic, folder / "out")
+    assert out.splitlines()[0].startswith(f"{folder / 'out'}: held out x 0.00")
+
+
+def test_compare__refuses_other_data(bench, tmp_path):
+    from pipeline.rig.identify.comparison import compare
+
+    folder, _, _ = bench
+    shutil.copytree(folder / "out", tmp_path / "other")
+    path = tmp_path / "other" / d.RESULT
+    result = json.loads(path.read_text())
+    result["held_out"] = None
+    path.write_text(json.dumps(result))
+    with pytest.raises(SpecError, match="other held-out pieces"):
+        compare([folder / "out", tmp_path / "other"])
+
+
+def test_identify__what_the_model_lacks_is_found_in_the_residuals(without_cubic):
+    """The residuals of a law that lacks something are autocorrelated, and the intervals say so."""
+    result = d.read_result(without_cubic)
+    assert "the residuals are autocorrelated" in result["covariance"]["why"]
+    assert result["covariance"]["estimator"] == "newey-west"
+    assert result["covariance"]["n_effective"]["x"] < 0.3 * result["covariance"]["n_samples"]

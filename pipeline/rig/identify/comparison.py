@@ -1,0 +1,102 @@
+"""Identifications side by side: laws are compared by the pieces that were held out, not by the fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.products.product import Table
+from pipeline.rig.identify.directory import read_info, read_result
+from pipeline.spec.problems import SpecError
+
+
+def compare(directories: Sequence[str | Path]) -> Table:
+    """Put finished identifications side by side, the one that predicts best first.
+
+    Parameters
+    ----------
+    directories
+        Of identifications of the same recordings, with the same pieces held out.
+
+    Returns
+    -------
+    Table
+        A row for each: its directory, title and number of unknowns; the root mean square over all channels
+        of fitted and of held-out pieces, ``fit`` and ``held_out``, each channel in units of the noise that it
+        is weighted with in the first; and those of each channel [SI]. Without held-out pieces the last are
+        NaN, and the order is that of the fit.
+
+    Raises
+    ------
+    SpecError
+        If they are of different recordings, channels or held-out pieces: their residuals are no measure then.
+    RefusedError
+        If one is not finished.
+    """
+    found = [(Path(d), read_info(d), read_result(d)) for d in directories]
+    _require_alike(found)
+    noise = found[0][2]["noise"]
+    rows = [_row(directory, result, noise) for directory, _, result in found]
+    rows.sort(key=lambda r: r["fit"] if math.isnan(r["held_out"]) else r["held_out"])
+    return Table(rows, _lines(rows, found[0][2]))
+
+
+def _require_alike(found: Sequence[tuple[Path, Any, Any]]) -> None:
+    first, problems = found[0], []
+    for directory, info, result in found[1:]:
+        for what, a, b in (
+            ("recordings", _recordings(first[1]), _recordings(info)),
+            ("channels", first[2]["channels"], result["channels"]),
+            ("held-out pieces", _held(first[2]), _held(result)),
+        ):
+            if a != b:
+                problems.append(
+                    f"{directory}: has other {what} than {first[0]}; compare identifications of the same "
+                    "data, with the same pieces held out."
+                )
+    if problems:
+        raise SpecError(problems)
+
+
+def _recordings(info: Any) -> list[str]:
+    return [r["sha256"] for r in info.identity["spec"]["recordings"]]
+
+
+def _held(result: Any) -> list[tuple[int, int]]:
+    pieces = result["held_out"]["pieces"] if result["held_out"] is not None else []
+    return [(p["recording"], p["piece"]) for p in pieces]
+
+
+def _row(directory: Path, result: Any, noise: dict[str, float]) -> dict[str, Any]:
+    held = result["held_out"]
+    row: dict[str, Any] = {
+        "directory": str(directory),
+        "title": result["title"],
+        "unknowns": len(result["names"]),
+        "fit": _overall(result["rms"], noise),
+        "held_out": _overall(held["rms"], noise) if held is not None else math.nan,
+    }
+    for channel in result["channels"]:
+        row[f"fit_{channel}"] = result["rms"][channel]
+        row[f"held_out_{channel}"] = held["rms"][channel] if held is not None else math.nan
+    return row
+
+
+def _overall(rms: dict[str, float], noise: dict[str, float]) -> float:
+    return math.sqrt(sum((rms[c] / noise[c]) ** 2 for c in rms) / len(rms))
+
+
+def _lines(rows: Sequence[dict[str, Any]], result: Any) -> list[str]:
+    lines = []
+    for row in rows:
+        parts = []
+        for what, words in (("held_out", "held out"), ("fit", "fit")):
+            values = [(c, row[f"{what}_{c}"]) for c in result["channels"]]
+            if not math.isnan(row[what]):
+                parts.append(f"{words} " + ", ".join(f"{c} {v:.4g} {result['units'][c]}" for c, v in values))
+        lines.append(f"{row['directory']}: {'; '.join(parts)}; {row['unknowns']} unknowns")
+    if math.isnan(rows[0]["held_out"]):
+        lines.append("no pieces were held out (hold_out): the fit alone favours whatever has more unknowns")
+    return lines

@@ -1,0 +1,65 @@
+"""What was set otherwise in one recording than in others: values of parameters that go with its pieces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import near_names
+from magpend_core.sampling import Drive
+from pipeline.rig.identify.problem import Piece
+
+
+def setting_problems(model: Model, values: Mapping[str, float], where: str) -> list[str]:
+    """Say which settings are no parameters of the model, or out of their bounds."""
+    found = []
+    for name, value in values.items():
+        if name not in model.parameter_names:
+            hint = near_names(name, model.parameter_names, "parameters")
+            found.append(f"{where}.{name}: is not a parameter of {model.name}; {hint}")
+            continue
+        problem = model.parameter(name).problem(value)
+        if problem:
+            found.append(f"{where}.{problem}")
+    return found
+
+
+def apply_settings(pieces: Sequence[Piece], settings: Mapping[int, Mapping[str, float]]) -> list[Piece]:
+    """Give each piece the settings of its recording, as values that its drive brings along.
+
+    Parameters
+    ----------
+    pieces
+        Of any recordings.
+    settings
+        Values of parameters by number of the recording.
+
+    Returns
+    -------
+    list of Piece
+        Their drives all bring values of the same parameters; NaN leaves a parameter as it is for all.
+    """
+    names: dict[str, None] = {}
+    for piece in pieces:
+        names |= dict.fromkeys(piece.drive.names if piece.drive is not None else ())
+        names |= dict.fromkeys(settings.get(piece.recording, {}))
+    if not names:
+        return list(pieces)
+    return [_with(piece, tuple(names), settings.get(piece.recording, {})) for piece in pieces]
+
+
+def _with(piece: Piece, names: tuple[str, ...], own: Mapping[str, float]) -> Piece:
+    drive = piece.drive
+    if drive is None:
+        time = piece.time
+        drive = Drive(np.array([2 * time[-1] - time[-2]]))
+    values = np.full((len(drive.durations_s), len(names)), np.nan)
+    for k, name in enumerate(names):
+        if name in own:
+            values[:, k] = own[name]
+        elif name in drive.names:
+            values[:, k] = drive.values[:, drive.names.index(name)]
+    return replace(piece, drive=replace(drive, names=names, values=values))
