@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.common import EXIT_HELP, Csv, Directory, Json, check_csv, read_pairs, tell
+from pipeline.cli.common import EXIT_HELP, Csv, Directory, Json, check_csv, json_rows, read_pairs, tell
 from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import speaking
 
@@ -241,7 +241,7 @@ def compare(
         written = write_comparison(compared, computed, out, state=state, degrees=degrees, frame=Frame(width))
     steps_of, ends = steps_table(compared), edges_table(compared)
     if as_json:
-        console.result(json.dumps({"steps": _plain(steps_of.rows), "edges": _plain(ends.rows)}, indent=1))
+        console.result(json.dumps({"steps": json_rows(steps_of), "edges": json_rows(ends)}, indent=1))
         return
     tell(steps_of, csv, as_json=False)
     if csv == "-":
@@ -250,11 +250,6 @@ def compare(
         console.result(line)
     for path in written:
         console.note(f"written: {path}")
-
-
-def _plain(rows: Any) -> list[dict[str, Any]]:
-    """NaN is no JSON."""
-    return [{k: None if v != v else v for k, v in row.items()} for row in rows]
 
 
 @measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)

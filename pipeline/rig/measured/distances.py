@@ -114,6 +114,18 @@ class Cloud:
         return one.reshape(-1, both.shape[-1]), two.reshape(-1, both.shape[-1])
 
 
+def cloud_of(points: Floats, noise: Floats, orbit_period: int) -> Cloud:
+    """Return the sections of a step; a cycle of which one is missing (NaN) is left out as a whole."""
+    known = np.asarray(np.isfinite(points).all(axis=1), np.bool_)
+    last = int(np.flatnonzero(known)[-1]) + 1
+    cycle = max(orbit_period, 1)
+    if last >= cycle:
+        n = last // cycle * cycle
+        whole = np.repeat(known[:n].reshape(-1, cycle).all(axis=1), cycle)
+        known = np.concatenate([whole, np.zeros(known.size - n, np.bool_)]) if whole.any() else known
+    return Cloud(points[known], noise[known], orbit_period)
+
+
 def floor_of(cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> float:
     """Wasserstein-1 between the halves of one recording: what noise, and being a sample, amount to.
 

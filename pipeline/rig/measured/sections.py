@@ -171,9 +171,7 @@ def _fits(
     instants = np.sort(np.concatenate([edges.rising, edges.falling]))
     found = []
     for number, at in enumerate(edges.rising):
-        # an edge that was placed by a line may differ from the one that was seen
-        others = instants[np.abs(instants - at) > 0.25 * window_s]
-        half = min(0.5 * window_s, float(np.abs(others - at).min()) if others.size else math.inf)
+        half = min(0.5 * window_s, _nearest(instants, at, 0.25 * window_s))
         first, last = np.searchsorted(time, [at - half, at + half])
         own = piece[first:last]
         if own.size and (own == own[0]).all():
@@ -181,6 +179,17 @@ def _fits(
             if fit is not None:
                 found.append((number, *fit))
     return found
+
+
+def _nearest(instants: Floats, at: float, beyond: float) -> float:
+    """Distance of the nearest instant that is more than `beyond` away, infinite without one.
+
+    An edge that was placed by a line differs a little from the one that was seen.
+    """
+    low, high = np.searchsorted(instants, [at - beyond, at + beyond])
+    before = at - instants[low - 1] if low else math.inf
+    after = instants[high] - at if high < instants.size else math.inf
+    return float(min(before, after))
 
 
 def _fit(
