@@ -1,7 +1,7 @@
 """How often 95 % intervals hold the truth: a virtual double pendulum, identified for each seed of the noise.
 
 Free swings with potentiometers of 12 bits, white noise and a dead band that the second link passes through.
-``python tests/bench/coverage.py 200`` prints the share of seeds for each parameter.
+``python tests/bench/intervals.py 200`` prints the share of seeds for each parameter.
 """
 
 from __future__ import annotations
