@@ -93,6 +93,35 @@ def _at(kind: str, n_out: int, t: Any, state: Any, parameters: Parameters, frequ
     return out.reshape((*leading, n_out))
 
 
+def evaluate_packed(
+    system: System,
+    t: np.ndarray,
+    states: np.ndarray,
+    packed: np.ndarray,
+    frequency_hz: float,
+    out: np.ndarray,
+) -> None:
+    """Fill `out` with all quantities of a system, for callers that have checked what they give.
+
+    Parameters
+    ----------
+    system
+        Whose quantities they are.
+    t
+        Times since the start of the drive's period [s], within it; shape (n,).
+    states
+        Shape (n, n_states).
+    packed
+        Parameters, shape (n_parameters,).
+    frequency_hz
+        Drive frequency [Hz].
+    out
+        Shape (n, len(system.quantity_names)).
+    """
+    times, rows = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(states, np.float64)
+    _evaluator(system, "quantities")(times, rows, float(frequency_hz), packed, out)
+
+
 def rates(t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
     """Time derivatives of the states.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -112,6 +112,45 @@ def simulate(
     console.result(f"mapping: {beside}")
 
 
+def drive(
+    file: File,
+    mapping: Annotated[Path, typer.Option(help="Mapping (TOML): which channel is the drive.")],
+    kind: Annotated[
+        Literal["edges", "torque"],
+        typer.Option(help="What is kept: the instants at which the drive switches, or its values."),
+    ] = "edges",
+    out: Annotated[Path, typer.Option(help="Drive file, .csv.")] = Path("drive.csv"),
+    window: Window = None,
+    tolerance: Annotated[
+        float,
+        typer.Option(help="Leave out samples of a torque that lie this close to the lines left [N m]."),
+    ] = 0.0,
+) -> None:
+    """Write what the drive did as a file that ``magpend run`` and ``simulate`` take for their drive.
+
+    Says its frequency, jitter and duty cycle. With edges, shape and amplitude stay the model's own.
+    """
+    from pipeline.cli import console
+    from pipeline.rig.driving import drive_file
+    from pipeline.rig.recordings.writing import check_target
+
+    check_target(out, (".csv",))
+    made = drive_file(_read(file, mapping, window), kind, tolerance=tolerance)
+    out.write_text(made.text, encoding="utf-8")
+    if made.timing is not None:
+        t = made.timing
+        console.result(
+            f"frequency: {t.frequency_hz:.8g} +- {t.frequency_error_hz:.2g} Hz, {t.n_periods} periods"
+        )
+        console.result(f"jitter: {t.jitter_s:.3g} s")
+        console.result(f"duty cycle: {t.duty_cycle:.6g} +- {t.duty_cycle_error:.2g}")
+    if kind == "torque":
+        console.result(
+            f"samples: {made.n_rows} of {made.n_samples} kept; the others lie within {made.error:.3g} N m"
+        )
+    console.result(f"drive: {out}")
+
+
 def _read(file: Path, mapping: Path, window: tuple[float, float] | None) -> xr.Dataset:
     from pipeline.rig.recordings import read_recording
 
@@ -151,5 +190,5 @@ def _draw(ds: xr.Dataset, out: Path, as_json: bool) -> None:
     say(f"figure: {save_figure(plot_recording(ds), out)}")
 
 
-for _command in (show, convert, simulate):
+for _command in (show, convert, drive, simulate):
     recordings_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(_command))

@@ -194,10 +194,45 @@ def products() -> str:
     )
 
 
-def _keys(head: str, model: Any, more: str) -> str:
+def mapping() -> str:
+    """Keys of a recording's mapping."""
+    from pipeline.rig.recordings import mapping as found
+
+    top = ("csv", "channels", "drive")
+    parts = [
+        _keys("MAPPING.toml", found.Mapping, "", top),
+        _keys("time = {...}", found.TimeMap, "", ()),
+        _keys("piece = {...}", found.PieceMap, "", ()),
+        _keys("[channels.NAME]", found.ChannelMap, "NAME is a state of the model.", ()),
+        _keys("[drive]", found.DriveMap, 'Or `drive = "none"`.', ()),
+        _keys("[csv]", found.CsvMap, "For CSV files alone; what is not stated is found out.", ()),
+    ]
+    return "\n\n".join(parts)
+
+
+def findings() -> str:
+    """What can be found in a recording."""
+    from pipeline.rig.recordings.findings import KINDS
+
+    return table(("finding", "meaning"), ((f"`{kind}`", meaning) for kind, meaning in KINDS.items()))
+
+
+def virtual_rig() -> str:
+    """Keys of a virtual rig."""
+    from pipeline.rig import simulation
+
+    parts = [
+        _keys("RIG.toml", simulation.RigTable, "", ("drive", "sensors")),
+        _keys("[drive]", simulation.DriveTable, 'Or `drive = "none"`.', ()),
+        _keys("[sensors.STATE]", simulation.SensorTable, "", ()),
+    ]
+    return "\n\n".join(parts)
+
+
+def _keys(head: str, model: Any, more: str, left_out: Sequence[str] = ("kind",)) -> str:
     rows = []
     for name, info in model.model_fields.items():
-        if name == "kind":
+        if name in left_out:
             continue
         extra: Any = info.json_schema_extra or {}
         unit = f" [{extra['unit']}]" if extra.get("unit") else ""
@@ -287,6 +322,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "specification": specification,
     "identification": identification,
     "products": products,
+    "mapping": mapping,
+    "findings": findings,
+    "virtual rig": virtual_rig,
     "variables": variables,
     "statuses": statuses,
     "models": models,

@@ -16,6 +16,8 @@ from pipeline.cli.plot import check_figure_path
 if TYPE_CHECKING:
     import xarray as xr
 
+DEFAULT_HZ = 2.2
+
 EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
 """States are options by their own names, which the model decides."""
 
@@ -26,8 +28,15 @@ def simulate(
         str, typer.Option(help="Which one; see magpend models.", autocompletion=completing(names))
     ] = DEFAULT,
     frequency_hz: Annotated[
-        float, typer.Option("--frequency-hz", "--frequency", help="Drive frequency [Hz].")
-    ] = 2.2,
+        float | None,
+        typer.Option(
+            "--frequency-hz", "--frequency", help=f"Drive frequency [Hz]; by default {DEFAULT_HZ:g}."
+        ),
+    ] = None,
+    drive: Annotated[
+        Path | None,
+        typer.Option(help="Drive file (see magpend recordings drive): the drive is a recording."),
+    ] = None,
     preset: Annotated[
         str | None,
         typer.Option(help="Parameter preset, or a file of one: FILE.toml; by default the model's first."),
@@ -36,7 +45,10 @@ def simulate(
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")
     ] = None,
     transient: Annotated[int, typer.Option(help="Drive periods before the series begins.")] = 0,
-    periods: Annotated[int, typer.Option(help="Drive periods of the series.")] = 10,
+    periods: Annotated[
+        int | None,
+        typer.Option(help="Drive periods of the series; by default 10, or all that a drive file has."),
+    ] = None,
     samples: Annotated[int, typer.Option(help="Samples per period.")] = 200,
     rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = 1e-8,
     atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = 1e-8,
@@ -49,7 +61,8 @@ def simulate(
     """Integrate one trajectory: states and the model's quantities as CSV or NetCDF, and a figure.
 
     The initial state is given by the model's names: --NAME VALUE, or --NAME-deg VALUE of an angle or its
-    rate; what is not given is 0. Time 0 is the instant of a section.
+    rate; what is not given is 0. Time 0 is the instant of a section. With --drive it is the state where the
+    recording begins, and time is the recording's own.
     """
     from pipeline.cli import console
     from pipeline.compute import simulate as simulation
@@ -61,8 +74,10 @@ def simulate(
         check_figure_path(target)
     overrides = read_pairs("--set", settings or [], "q=1.5")
     frequency = overrides.pop("frequency_hz", overrides.pop("frequency", frequency_hz))
+    if frequency is None and drive is None:
+        frequency = DEFAULT_HZ
     ds = simulation.simulate(
-        frequency, simulation.start_of(model, _states(context.args)), model=model, preset=preset,
+        frequency, simulation.start_of(model, _states(context.args)), drive=drive, model=model, preset=preset,
         overrides=overrides, n_transient=transient, n_periods=periods, samples_per_period=samples,
         rtol=rtol, atol=atol,
     )  # fmt: skip

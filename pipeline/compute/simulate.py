@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from magpend_core.models import DEFAULT, load_model
-from magpend_core.models.model import Model
+from magpend_core.models.model import Model, Quantity, State
 from magpend_core.models.presets import Preset
+from pipeline.spec.drives import RecordedDrive, load_drive
 from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.spec.recorded import model_problems
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,17 +26,30 @@ if TYPE_CHECKING:
 SUFFIXES = (".csv", ".nc")
 MAX_SAMPLES = 100_000_000
 DEGREES = "_deg"
+DEFAULT_PERIODS = 10
+
+
+@dataclass(frozen=True)
+class Series:
+    """Which series is wanted: drive periods before it and in it (None: all of them), density, tolerances."""
+
+    n_transient: int
+    n_periods: int | None
+    samples_per_period: int
+    rtol: float
+    atol: float
 
 
 def simulate(
-    frequency_hz: float,
+    frequency_hz: float | None,
     initial_state: Sequence[float],
     *,
+    drive: str | Path | None = None,
     model: str = DEFAULT,
     preset: str | Path | Preset | None = None,
     overrides: Mapping[str, float] | None = None,
     n_transient: int = 0,
-    n_periods: int = 10,
+    n_periods: int | None = None,
     samples_per_period: int = 200,
     rtol: float = 1e-8,
     atol: float = 1e-8,
@@ -43,9 +59,11 @@ def simulate(
     Parameters
     ----------
     frequency_hz
-        Drive frequency [Hz].
+        Drive frequency [Hz]; None under a recorded drive.
     initial_state
-        The model's states at time 0, in their units.
+        The model's states at time 0, or where the recorded drive begins, in their units.
+    drive
+        A drive file (see `pipeline.spec.drives`): the drive is a recording.
     model
         Name of a model, see `magpend_core.load_model`.
     preset, overrides
@@ -53,15 +71,16 @@ def simulate(
     n_transient
         Drive periods before the series begins.
     n_periods, samples_per_period
-        Length and density of the series; both ends are included.
+        Length and density of the series; both ends are included. By default 10 periods, or all
+        that a recorded drive has.
     rtol, atol
         Tolerances.
 
     Returns
     -------
     xarray.Dataset
-        The states and the model's quantities over ``time`` [s since the first section]; angles are not
-        wrapped.
+        The states and the model's quantities over ``time`` [s since the first section; by the clock of the
+        drive file if there is one]; angles are not wrapped.
 
     Raises
     ------
@@ -70,12 +89,12 @@ def simulate(
     ArithmeticError
         If the trajectory diverges or meets the step limit.
     """
-    from magpend_core import trajectory
     from magpend_core.models.parameters import ParameterError
 
     chosen = load_model(model)
-    problems = _problems(frequency_hz, n_transient, n_periods, samples_per_period, rtol, atol)
-    problems += _state_problems(chosen, initial_state)
+    series = Series(n_transient, n_periods, samples_per_period, rtol, atol)
+    problems = _problems(series) + _state_problems(chosen, initial_state)
+    recording = _recording(drive, frequency_hz, chosen, series, problems)
     try:
         found = chosen.preset(preset)
         parameters = chosen.load(found, **(overrides or {}))
@@ -83,11 +102,12 @@ def simulate(
         problems += error.problems
     if problems:
         raise SpecError(problems)
-    count = n_periods * samples_per_period + 1
-    time = (n_transient + np.arange(count) / samples_per_period) / frequency_hz
     state = np.array(initial_state, dtype=np.float64)
-    series = trajectory(parameters, frequency_hz, state, time, rtol=rtol, atol=atol)
-    ds = _labelled(parameters, frequency_hz, time, series)
+    if recording is None:
+        assert frequency_hz is not None
+        ds = _at_frequency(parameters, frequency_hz, state, series)
+    else:
+        ds = _under_recording(parameters, recording, state, series)
     origin = {**found.provenance, **dict.fromkeys(overrides or {}, "given")}
     sources = "\n".join(f"{name}: {origin.get(name, '')}" for name in parameters)
     return ds.assign_attrs(
@@ -95,31 +115,91 @@ def simulate(
     )
 
 
+def _recording(
+    drive: str | Path | None, frequency_hz: float | None, model: Model, series: Series, problems: list[str]
+) -> RecordedDrive | None:
+    """Read the recorded drive, if there is one; add what is wrong with it, or with the frequency."""
+    if drive is None:
+        if frequency_hz is None or not (math.isfinite(frequency_hz) and frequency_hz > 0):
+            problems.append(f"frequency_hz = {frequency_hz!r}: must be a finite number greater than 0.")
+        return None
+    if frequency_hz is not None:
+        problems.append(
+            f"frequency_hz = {frequency_hz!r}: the drive is the recording {drive}, which has its own; drop "
+            "one of the two."
+        )
+    try:
+        found = load_drive(drive)
+    except SpecError as error:
+        problems += error.problems
+        return None
+    problems += model_problems(found, model)
+    wanted = series.n_transient + (series.n_periods or 1)
+    if wanted > found.n_periods and (series.n_transient or series.n_periods):
+        problems.append(
+            f"n_transient = {series.n_transient} and n_periods = {series.n_periods or 1} are {wanted} drive "
+            f"periods, and {found.file} has {found.n_periods}; lower them, or record longer."
+        )
+    return found
+
+
+def _at_frequency(
+    parameters: Parameters, frequency_hz: float, state: np.ndarray, series: Series
+) -> xr.Dataset:
+    """Integrate under the model's own drive."""
+    from magpend_core import evaluate, trajectory
+
+    n, samples = series.n_periods or DEFAULT_PERIODS, series.samples_per_period
+    time = (series.n_transient + np.arange(n * samples + 1) / samples) / frequency_hz
+    states = trajectory(parameters, frequency_hz, state, time, rtol=series.rtol, atol=series.atol)
+    names = [q.name for q in parameters.model.quantities]
+    values = evaluate(names, time, states, parameters, frequency_hz)
+    ds = _labelled(parameters, time, f"time since {parameters.model.section}", states, values)
+    return ds.assign_attrs(frequency_hz=float(frequency_hz))
+
+
+def _under_recording(
+    parameters: Parameters, drive: RecordedDrive, state: np.ndarray, series: Series
+) -> xr.Dataset:
+    """Integrate under a recorded drive, from its start."""
+    from magpend_core.recorded import evaluate_recorded, recorded_trajectory
+
+    marks = np.append(drive.start_s, drive.sections_s)
+    begin = float(marks[series.n_transient])
+    end = drive.end_s if series.n_periods is None else float(marks[series.n_transient + series.n_periods])
+    n = max(1, round((end - begin) * drive.frequency_hz * series.samples_per_period))
+    since = np.minimum(np.linspace(begin, end, n + 1) - drive.start_s, drive.end_s - drive.start_s)
+    states = recorded_trajectory(
+        parameters, drive.intervals, state, since, rtol=series.rtol, atol=series.atol
+    )
+    names = [q.name for q in parameters.model.quantities]
+    values = evaluate_recorded(names, since, states, parameters, drive.intervals)
+    ds = _labelled(parameters, since + drive.start_s, f"time by the clock of {drive.file}", states, values)
+    inside = marks[(marks >= begin) & (marks <= end)]
+    attrs = {"units": "s", "long_name": "instants of the sections"}
+    return ds.assign_coords(section_times=("section", inside, attrs)).assign_attrs(
+        frequency_hz=drive.frequency_hz, drive=drive.kind, drive_file=drive.file, drive_sha256=drive.sha256
+    )
+
+
 def _labelled(
-    parameters: Parameters, frequency_hz: float, time: np.ndarray, series: np.ndarray
+    parameters: Parameters, time: np.ndarray, clock: str, states: np.ndarray, values: np.ndarray
 ) -> xr.Dataset:
     """States and quantities of a series, with names, units and what was integrated."""
     import xarray as xr
 
-    from magpend_core import evaluate
-
     model = parameters.model
+    both: tuple[State | Quantity, ...] = (*model.states, *model.quantities)
     variables: dict[str, Any] = {
-        s.name: ("time", series[:, i], {"units": s.unit, "long_name": s.meaning})
-        for i, s in enumerate(model.states)
+        v.name: ("time", column, {"units": v.unit, "long_name": v.meaning})
+        for v, column in zip(both, np.hstack([states, values]).T, strict=True)
     }
-    if model.quantities:
-        names = [q.name for q in model.quantities]
-        values = evaluate(names, time, series, parameters, frequency_hz)
-        for i, q in enumerate(model.quantities):
-            variables[q.name] = ("time", values[:, i], {"units": q.unit, "long_name": q.meaning})
-    axis = ("time", time, {"units": "s", "long_name": f"time since {model.section}"})
     attrs = {
         "title": f"trajectory of the {model.title}",
         "model": model.name,
         "parameters": "\n".join(f"{name} = {value!r}" for name, value in parameters.as_dict().items()),
-        "frequency_hz": float(frequency_hz),
     }
+    axis = ("time", time, {"units": "s", "long_name": clock})
     return xr.Dataset(variables, coords={"time": axis}, attrs=attrs)
 
 
@@ -165,29 +245,24 @@ def _state_problems(model: Model, state: Sequence[float]) -> list[str]:
     ]
 
 
-def _problems(
-    frequency_hz: float,
-    n_transient: int,
-    n_periods: int,
-    samples: int,
-    rtol: float,
-    atol: float,
-) -> list[str]:
+def _problems(series: Series) -> list[str]:
     found = []
-    for name, value in {"frequency_hz": frequency_hz, "rtol": rtol, "atol": atol}.items():
+    for name, value in {"rtol": series.rtol, "atol": series.atol}.items():
         if not (math.isfinite(value) and value > 0):
             found.append(f"{name} = {value!r}: must be a finite number greater than 0.")
-    if 0 < rtol < 1e-13:
-        found.append(f"rtol = {rtol!r}: must be at least 1e-13.")
-    for name, number, least in (
-        ("n_transient", n_transient, 0), ("n_periods", n_periods, 1), ("samples_per_period", samples, 1),
-    ):  # fmt: skip
+    if 0 < series.rtol < 1e-13:
+        found.append(f"rtol = {series.rtol!r}: must be at least 1e-13.")
+    n_periods = DEFAULT_PERIODS if series.n_periods is None else series.n_periods
+    counts = {
+        "n_transient": (series.n_transient, 0), "n_periods": (n_periods, 1),
+        "samples_per_period": (series.samples_per_period, 1),
+    }  # fmt: skip
+    for name, (number, least) in counts.items():
         if number < least:
             found.append(f"{name} = {number!r}: must be at least {least}.")
-    if n_periods * samples > MAX_SAMPLES:
-        found.append(
-            f"n_periods * samples_per_period = {n_periods * samples}: must be at most {MAX_SAMPLES}."
-        )
+    samples = n_periods * series.samples_per_period
+    if samples > MAX_SAMPLES:
+        found.append(f"n_periods * samples_per_period = {samples}: must be at most {MAX_SAMPLES}.")
     return found
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from magpend_core import Sections, Status, kernel_version, run_branches
 from magpend_core.engine.system import System
+from pipeline.compute.recorded import under_recording
 from pipeline.compute.refinement import infer
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import differences, digest_of, identity_of
@@ -73,9 +74,16 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
     keywords: dict[str, Any] = spec.integration.model_dump()
     for name, options in spec.products.items():
         keywords |= CELL_PRODUCTS[name].integrate(options)
-    cells = run_branches(
-        inputs.parameters, inputs.frequency_hz, inputs.initial_states, system=spec.model.system, **keywords
-    )
+    if spec.recorded is not None:
+        cells = under_recording(spec.recorded, inputs, system=spec.model.system, **keywords)
+    else:
+        cells = run_branches(
+            inputs.parameters,
+            inputs.frequency_hz,
+            inputs.initial_states,
+            system=spec.model.system,
+            **keywords,
+        )
     values = {v.name: np.asarray(getattr(cells, v.name), dtype=v.dtype) for v in base_variables(spec.model)}
     job = Job(spec, inputs, cells)
     for name, options in spec.products.items():

@@ -149,8 +149,11 @@ def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
         for a in parameter_axes(spec)
     ]
     if FREQUENCY not in spec.axes:
-        value = np.array(spec.parameters.frequency_hz, dtype=np.float64)
-        found.append(Coordinate(FREQUENCY_DIM, (), value, _parameter_attrs(FREQUENCY, model)))
+        attrs = _parameter_attrs(FREQUENCY, model)
+        if spec.recorded is not None:
+            attrs = {**attrs, "long_name": "mean frequency of the recorded drive"}
+        value = np.array(spec.frequency_hz, dtype=np.float64)
+        found.append(Coordinate(FREQUENCY_DIM, (), value, attrs))
     states = initial_states(spec.initial_conditions)
     return (*found, *(_branch_coords(spec, states) if spec.continuation else _start_coords(model, states)))
 
@@ -230,7 +233,7 @@ class CellMap:
         base = spec.values
         self._names = base.names
         self._packed = base.pack()
-        self._fixed_hz = spec.parameters.frequency_hz
+        self._fixed_hz = spec.frequency_hz
         self._axes = parameter_axes(spec)
         self._states = initial_states(spec.initial_conditions)
         self._walk = spec.continuation

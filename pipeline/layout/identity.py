@@ -32,6 +32,8 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
     coordinates as numbers: what a range or a seed stands for.
     """
     tables = {k: v for k, v in spec.as_dict().items() if k not in ("title", "execution")}
+    if spec.drive is not None:  # what the file is called does not matter, and its digest speaks for its text
+        tables["drive"] = {k: v for k, v in tables["drive"].items() if k not in ("file", "text")}
     return {
         **({} if spec.refine is None else {"refinement": REFINEMENT}),
         "format": FORMAT,
@@ -60,7 +62,8 @@ def code_of(spec: Spec) -> list[str]:
     """Modules of the pipeline that decide the numbers of a run's tasks."""
     products = [CELL_PRODUCTS[name].compute.partition(":")[0] for name in spec.products]
     refined = ["compute.refinement"] if spec.refine is not None else []
-    return [*CODE, *refined, *(module.removeprefix("pipeline.") for module in products)]
+    driven = ["compute.recorded", "spec.drives"] if spec.drive is not None else []
+    return [*CODE, *refined, *driven, *(module.removeprefix("pipeline.") for module in products)]
 
 
 @lru_cache

@@ -171,7 +171,7 @@ def seconds_per_period(frequency_hz: np.ndarray, rtol: float) -> np.ndarray:
 
 def mean_seconds_per_period(spec: Spec) -> float:
     """`seconds_per_period`, in the mean over the run's frequencies [s]."""
-    frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else spec.parameters.frequency_hz
+    frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else spec.frequency_hz
     return float(np.mean(seconds_per_period(np.asarray(frequency), spec.integration.rtol)))
 
 

@@ -97,7 +97,10 @@ def _draw_path(ax: Axes, ds: xr.Dataset, drawing: Drawing, motion: Motion) -> li
 
 def _place(ds: xr.Dataset) -> str:
     frequency = ds.attrs.get("frequency_hz")
-    return f"$f$ = {float(frequency):.6g}\u00a0Hz" if frequency is not None else ""
+    if frequency is None:
+        return ""
+    head = "recorded drive, mean " if "drive_file" in ds.attrs else ""
+    return f"{head}$f$ = {float(frequency):.6g}\u00a0Hz"
 
 
 def _grids(fig: style.DataFigure, n_rows: int, n_panels: int) -> tuple[list[SubplotSpec], list[SubplotSpec]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -65,16 +65,24 @@ class Edges:
     resolution_s : float
         Sampling interval if the signal switches from one sample to the next, so that an instant is only known
         to lie between two samples; 0 if samples lie on the flanks.
+    noise_s : float
+        Standard error of an instant [s] that the signal's noise leaves on its flanks.
     """
 
     rising: Floats
     falling: Floats
     resolution_s: float = 0.0
+    noise_s: float = 0.0
+
+    @property
+    def error_s(self) -> float:
+        """Standard error of an instant [s], of sampling and the signal's noise: not of the drive itself."""
+        return math.hypot(self.resolution_s / math.sqrt(12), self.noise_s)
 
     def between(self, start_s: float, end_s: float) -> Edges:
         """Edges in ``start_s <= t < end_s``."""
         rising, falling = ((t[(t >= start_s) & (t < end_s)]) for t in (self.rising, self.falling))
-        return Edges(rising, falling, self.resolution_s)
+        return replace(self, rising=rising, falling=falling)
 
     def frequency(self) -> Timing:
         """Fit a line through the rising edges against their number: frequency, jitter and duty cycle.
@@ -121,13 +129,25 @@ class Edges:
         errors = [self._error(t, even, each) for t in (fitted[before], fitted[before] + mean)]
         return mean / period, math.hypot(*errors) / period
 
-    def _error(self, fitted: Floats, weights: Floats, scatter: float) -> float:
+    def common_error(self, fitted: Floats, scatter: float) -> float:
+        """Standard error [s] that all instants on a line through the edges have in common.
+
+        Parameters
+        ----------
+        fitted
+            Instants of the rising edges on the line [s].
+        scatter
+            Root mean square of the edges about it [s].
+        """
+        return self._error(fitted, np.full(fitted.size, 1 / fitted.size), scatter, drifts=1)
+
+    def _error(self, fitted: Floats, weights: Floats, scatter: float, drifts: int = _DRIFTS) -> float:
         """Standard error [s] of a weighted sum of instants.
 
         An instant known to a sample is rounded to its middle: a sawtooth of the instant, which is not
         independent from edge to edge. Its harmonics, of unknown phase, are added up as they are, damped by
         the jitter that blurs them; the rest of the scatter is independent. Since the line itself is known to
-        about a sample only, drifts of up to one over the whole are averaged.
+        about a sample only, `drifts` of up to one over the whole are averaged.
         """
         step = self.resolution_s
         if not step:
@@ -137,7 +157,7 @@ class Edges:
         power = 0.5 * (step / (math.pi * k)) ** 2 * np.exp(-4 * (math.pi * k * blur) ** 2)
         place = (fitted - fitted[0]) / step
         share = np.linspace(-0.5, 0.5, fitted.size)
-        turns = place + share * np.linspace(-1, 1, _DRIFTS)[:, None]
+        turns = place + share * (np.linspace(-1, 1, drifts) if drifts > 1 else np.zeros(1))[:, None]
         sums = np.array([abs(np.exp(2j * np.pi * i * turns) @ weights) ** 2 for i in k]).mean(axis=1)
         rest = max(scatter**2 - float(power.sum()), 0.0)
         return math.sqrt(rest * float(weights @ weights) + float(power @ sums))
@@ -202,11 +222,12 @@ def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges
 
 @dataclass(frozen=True)
 class _Switch:
-    """Middle and distance of the levels, and the width of the band about the middle."""
+    """Middle and distance of the levels, the width of the band about the middle, the noise of a sample."""
 
     middle: float
     span: float
     band: float
+    noise: float
 
 
 def _switch(x: Floats, hysteresis: float | None) -> _Switch:
@@ -215,7 +236,7 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
     span = high - low
     if span <= _LEAST_CONTRAST * noise or span <= 0:
         raise SpecError([
-            f"drive: no edges; its levels {low:.4g} and {high:.4g} do not stand out of noise, {noise:.2g}: "
+            f"drive: no edges; its levels {low:.4g} and {high:.4g} are within noise, {noise:.2g}: "
             'map the channel that switches, choose a window in which it runs, or say drive = "none".'
         ])  # fmt: skip
     band = 0.5 * span if hysteresis is None else hysteresis
@@ -223,12 +244,12 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
         raise SpecError([
             f"hysteresis = {band:g}: must be greater than 0 and less than the levels' distance, {span:g}."
         ])  # fmt: skip
-    return _Switch(0.5 * (low + high), span, band)
+    return _Switch(0.5 * (low + high), span, band, noise)
 
 
 def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
     """Edges of stretches of samples, in their order."""
-    instants, rises, sharp, steps = [], [], [], [0.0]
+    instants, rises, sharp, slopes, steps = [], [], [], [], [0.0]
     for t, x in parts:
         above = x - switch.middle
         state = np.where(above > switch.band / 2, 1, np.where(above < -switch.band / 2, -1, 0))
@@ -240,9 +261,13 @@ def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
             if np.diff(t[a : b + 1]).max() < _GAP * step:
                 instants.append(_crossing(t[a : b + 1], above[a : b + 1]))
                 rises.append(above[b] > 0)
+                slopes.append(abs(above[b] - above[a]) / (t[b] - t[a]))
                 sharp.append(b == a + 1 and min(abs(above[a]), abs(above[b])) > 0.4 * switch.span)
     at, up = np.array(instants, np.float64), np.array(rises, bool)
-    return Edges(at[up], at[~up], max(steps) if sharp and np.mean(sharp) > 0.5 else 0.0)
+    if not sharp or np.mean(sharp) > 0.5:
+        return Edges(at[up], at[~up], max(steps) if sharp else 0.0)
+    # of two noisy samples on a flank, at a random place between them: sqrt(2/3) of one's noise
+    return Edges(at[up], at[~up], 0.0, math.sqrt(2 / 3) * switch.noise / float(np.median(slopes)))
 
 
 def _checked(time: npt.ArrayLike, drive: npt.ArrayLike) -> tuple[Floats, Floats]:
@@ -260,13 +285,13 @@ def _checked(time: npt.ArrayLike, drive: npt.ArrayLike) -> tuple[Floats, Floats]
 
 
 def _levels(x: Floats) -> tuple[float, float, float]:
-    """Lower and upper level, and the noise from sample to sample, which slow flanks do not touch."""
+    """Lower and upper level, and a sample's noise, from second differences, which flanks hardly touch."""
     ends = np.percentile(x, [2, 98])
     middle = ends.mean()
     if ends[0] == ends[1]:
         return float(ends[0]), float(ends[0]), 0.0
     low, high = np.median(x[x <= middle]), np.median(x[x > middle])
-    noise = 1.4826 * np.median(np.abs(np.diff(x))) / math.sqrt(2)
+    noise = 1.4826 * np.median(np.abs(np.diff(x, 2))) / math.sqrt(6) if x.size > 2 else 0.0
     return float(low), float(high), float(noise)
 
 

@@ -22,11 +22,6 @@ from pipeline.spec.problems import SpecError, problems_of, unknown_key, unknown_
 from pipeline.spec.starts import degrees_key, state_keys, state_of_key
 from pipeline.spec.tables import Table
 
-KEYS = (
-    "model", "preset", "parameters", "initial_state", "sampling_rate_hz", "duration_s", "seed", "drive",
-    "sensors",
-)  # fmt: skip
-
 
 class SensorTable(Table):
     """``[sensors.STATE]``."""
@@ -51,12 +46,26 @@ class DriveTable(Table):
     )
 
 
-class _Numbers(Table):
-    """Keys that are numbers by themselves."""
+class RigTable(Table):
+    """What stands at the top of the file."""
 
-    sampling_rate_hz: float = Field(gt=0.0)
-    duration_s: float | None = Field(default=None, gt=0.0)
-    seed: int = Field(default=0, ge=0)
+    model: str = Field(description="Name of the model.")
+    preset: str | None = Field(default=None, description="Of the model's parameters; by default its first.")
+    parameters: dict[str, float] = Field(default={}, description="Values that differ from the preset [SI].")
+    initial_state: dict[str, float] = Field(
+        default={}, description="States by name, angles and rates also with _deg; the others are 0."
+    )
+    sampling_rate_hz: float = Field(gt=0.0, description="Of all channels [Hz].")
+    duration_s: float | None = Field(
+        default=None, gt=0.0, description="Length [s]; by default that of the drive's steps."
+    )
+    seed: int = Field(default=0, ge=0, description="Of the noise.")
+    drive: DriveTable | Literal["none"] = Field(default="none", description="The drive.")
+    sensors: dict[str, SensorTable] = Field(default={}, description="By state.")
+
+
+NUMBERS = ("sampling_rate_hz", "duration_s", "seed")
+"""Keys that stand for themselves."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +112,9 @@ def parse_rig(data: AnyMapping[str, Any]) -> Rig:
     SpecError
         With all problems at once.
     """
-    problems = [unknown_key(key, key, KEYS) for key in data if key not in KEYS]
-    numbers = _checked(_Numbers, {k: v for k, v in data.items() if k in _Numbers.model_fields}, "", problems)
+    keys = tuple(RigTable.model_fields)
+    problems = [unknown_key(key, key, keys) for key in data if key not in keys]
+    numbers = _checked(RigTable, {"model": "-", **{k: data[k] for k in NUMBERS if k in data}}, "", problems)
     drive = None
     if data.get("drive", "none") != "none":
         drive = _checked(DriveTable, data["drive"], DRIVE, problems)

@@ -118,6 +118,7 @@ def derive(
     analysis = ANALYSES[name]
     wanted = options if isinstance(options, Options) else validated(analysis.options, options or {})
     run = AnalysedRun.of(source, echo)
+    _refuse_recorded(run, name)
     wanted = prepared(run, analysis, wanted)
     key = _key(run, analysis, wanted)
     path = run.directory / DERIVED / f"{name}-{key['derived_key'][:8]}.zarr"
@@ -131,6 +132,17 @@ def derive(
     except DamagedError as error:
         run.echo(f"{name}: damaged ({error}); computing it again")
     return _kept(run, path, _compute(run, analysis, wanted).assign_attrs(key))
+
+
+def _refuse_recorded(run: Run, name: str) -> None:
+    """Refuse a run under a recorded drive: an analysis runs cells on, under a drive that goes on."""
+    if run.spec.recorded is not None:
+        raise SpecError([
+            f"{run.directory}: its drive is the recording {run.spec.recorded.file}, and {name} goes on where "
+            "it ends. For attractors and what rests on them make a run at its mean frequency (frequency_hz = "
+            f"{run.spec.frequency_hz:.6g} instead of [drive]); this one's sections can be drawn: magpend "
+            "plot bifurcation, or section."
+        ])  # fmt: skip
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:

@@ -23,8 +23,10 @@ from magpend_core.models.parameters import ParameterError, Parameters, unknown_n
 from magpend_core.models.presets import Preset, is_file
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.spec.drives import RecordedDrive
 from pipeline.spec.files import merged, nested, read_toml
 from pipeline.spec.problems import SpecError, problems_of, unknown_choice, unknown_key
+from pipeline.spec.recorded import DriveTable, recorded, run_problems, with_drive
 from pipeline.spec.starts import STARTS, GridStarts, Starts, starts_model
 from pipeline.spec.tables import (
     FREQUENCY,
@@ -57,6 +59,17 @@ class Spec:
     integration: Integration
     products: dict[str, Options]
     execution: Execution
+    drive: DriveTable | None = None
+
+    @cached_property
+    def recorded(self) -> RecordedDrive | None:
+        """The recording that is the drive; None for the model's own at a frequency."""
+        return recorded(self.drive, [])
+
+    @property
+    def frequency_hz(self) -> float | None:
+        """Drive frequency [Hz], the mean one of a recording; None if it is an axis."""
+        return self.parameters.frequency_hz if self.recorded is None else self.recorded.frequency_hz
 
     @property
     def refine(self) -> int | None:
@@ -81,8 +94,7 @@ class Spec:
             table = getattr(self, name)
             if table is not None:
                 tables[name] = table.model_dump(mode="json", exclude_none=True)
-        starts = self.initial_conditions
-        tables["initial_conditions"] = starts.model_dump(mode="json", exclude_none=True)
+        tables["initial_conditions"] = self.initial_conditions.model_dump(mode="json", exclude_none=True)
         tables["products"] = {name: options.plain() for name, options in self.products.items()}
         tables["axes"] = {
             name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()
@@ -95,10 +107,11 @@ _TABLES: dict[str, type[Table]] = {
     "continuation": Continuation,
     "integration": Integration,
     "execution": Execution,
+    "drive": DriveTable,
 }
 _KEYS = (
     "kind", "title", "model", "parameters", "axes", "initial_conditions", "continuation", "integration",
-    "products", "execution",
+    "products", "execution", "drive",
 )  # fmt: skip
 
 
@@ -154,7 +167,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path = ".") -> Spec:
 
     Every table is validated by itself, so that one with errors does not hide those of the others;
     then whatever can be checked between the valid ones is. The file of a preset is read here, and its
-    content takes the place of its name: what a run keeps needs the file no more.
+    content takes the place of its name, and so is that of a drive: what a run keeps needs the files no more.
 
     Parameters
     ----------
@@ -171,7 +184,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path = ".") -> Spec:
     if data.get("kind") == IDENTIFICATION:
         raise SpecError([f'kind = "{IDENTIFICATION}": is no run; use magpend identify SPEC --out DIR.'])
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
-    data = _with_preset(data, folder, problems)
+    data = with_drive(_with_preset(data, folder, problems), folder, problems)
     kind, title, model = _kind(data, problems), _title(data, problems), _model(data, problems)
     tables = {name: _table(data, name, table, problems) for name, table in _TABLES.items()}
     axes = _axes(data, problems)
@@ -181,15 +194,16 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path = ".") -> Spec:
     starts = _starts(data, model, problems)
     problems += _refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
+    problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
-    complete = not any(p.startswith(("axes", "parameters")) for p in problems)
+    complete = "drive" not in data and not any(p.startswith(("axes", "parameters")) for p in problems)
     problems += _parameter_problems(known, model, _declared(data), axes, complete)
     if problems:
         raise SpecError(problems)
     assert starts is not None
     return Spec(
         kind, title, model.name, tables["parameters"], axes, starts, walk, tables["integration"], products,
-        tables["execution"],
+        tables["execution"], tables["drive"],
     )  # fmt: skip
 
 
@@ -290,7 +304,7 @@ def _validate(model: type[BaseModel], value: Any, path: str, problems: list[str]
 
 
 def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: list[str]) -> Any:
-    if not _is_table(data, name, problems):
+    if not _is_table(data, name, problems) or (name not in data and name == "drive"):
         return None
     return _validate(model, data.get(name, {}), name, problems)
 

@@ -11,6 +11,7 @@ from typing import Any
 from pipeline.layout.identity import digest_of
 from pipeline.layout.schema import FORMAT
 from pipeline.spec.parsing import Spec
+from pipeline.spec.recorded import is_whole
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, is_there, local_path, unreadable, write_atomically
 from pipeline.store.provenance import provenance, versions
@@ -82,7 +83,7 @@ def read_run(directory: str | Path) -> RunInfo:
                 "into another directory."
             )
         info = RunInfo(directory=directory, **data)
-        fits = digest_of(info.identity) == info.digest
+        fits = digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise DamagedError(f"{path}: damaged ({error}); {_remedy(directory)}") from None
     if not fits:

@@ -19,6 +19,7 @@ from pipeline.products.reporting import report
 from pipeline.rig.identify.local import Echo, Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
+from pipeline.rig.identify.starts import fit_starts
 
 Array = NDArray[np.float64]
 
@@ -179,7 +180,7 @@ def refine(
         )
         if np.isfinite(fit.cost):
             theta = fit.theta
-    return fit_local(problem, theta, echo=echo)
+    return fit_local(problem, theta, starts=fit_starts(problem, theta, problem.starts), echo=echo)
 
 
 def _stages(problem: Problem) -> list[Problem]:

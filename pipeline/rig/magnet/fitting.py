@@ -2,8 +2,8 @@
 
 Wojna et al., J. Sound Vib. 430 (2018), section 3, Eq. 16-19. Standard errors come from the residuals'
 variance. Where the law and not noise is what is missing, residuals of neighbouring readings are alike, and
-such errors are too small; so the joint fit also has errors from the scatter of whole curves (a sandwich
-estimate with each curve as a cluster), which hold whatever the residuals within a curve are like.
+such errors are too small; so the joint fit also has errors from the scatter of whole curves (a jackknife over
+them), which hold whatever the residuals within a curve are like.
 """
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ class JointFit:
     values : dict
         All of `laws.FITTED`.
     errors, errors_by_curve : dict
-        Standard errors of `free`: from the residuals' variance, and from the scatter of whole curves.
+        Standard errors of `free`: from the residuals' variance, and from the scatter of whole curves; the
+        latter are NaN if one curve alone determines a parameter.
     correlation : ndarray
         Of `free`.
     quality : Quality
@@ -316,7 +317,7 @@ def _judged(
     correlation = found.correlation
     clusters = [curve.rows for curve in measured.curves]
     by_curve = dict(zip(free, map(float, errors_by_cluster(found, clusters)), strict=True))
-    doubtful = [n for n in free if max(errors[n], by_curve[n]) > LARGE_ERROR * _scale(n, values)]
+    doubtful = [n for n in free if np.fmax(errors[n], by_curve[n]) > LARGE_ERROR * _scale(n, values)]
     off = np.abs(correlation) * [name not in doubtful for name in free]
     return JointFit(
         free, values, errors, by_curve, correlation, Quality.of(measured.torque, found.residuals),

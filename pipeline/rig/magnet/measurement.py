@@ -127,6 +127,10 @@ class Header(Table):
     title: str = Field(description="What was measured, in a line.")
     synthetic: bool = Field(False, description="Whether the readings were computed; all results say so.")
     file: str = Field(description="The table, CSV with names in its first row, seen from the header.")
+    delimiter: Literal[",", ";", "\t"] = Field(
+        ",", description="What stands between two fields of the table."
+    )
+    decimal: Literal[".", ","] = Field(".", description="Decimal sign of the table.")
     model: str = Field(laws.MODEL, description="Model whose torque is fitted.")
     preset: str | None = Field(None, description="Preset, or a file of one, with what is not fitted.")
     columns: Columns = Field(description="Where what stands in the table.")
@@ -139,6 +143,12 @@ class Header(Table):
         (), description="Parameters that the joint fit leaves as they are."
     )
     synthesis: dict[str, Any] = Field({}, description="How synthetic readings were made; for people.")
+
+    @model_validator(mode="after")
+    def _signs(self) -> Header:
+        if self.delimiter == self.decimal:
+            raise ValueError('delimiter and decimal are both ","; say which of them is something else.')
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +331,7 @@ def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, lis
         return {}, b"", [f"file = {header.file!r}: cannot be read ({error.strerror or error})."]
     except UnicodeDecodeError:
         return {}, b"", [f"file = {header.file!r}: is not text in UTF-8; write the table as CSV."]
-    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    rows = list(csv.reader((line for line in lines if not line.startswith("#")), delimiter=header.delimiter))
     if len(rows) < 2:
         return (
             {},
@@ -357,7 +367,7 @@ def _numbers(header: Header, table: Mapping[str, list[str]], problems: list[str]
     before, found = len(problems), {}
     where = header.file
     for key in (name for name in table if name != "side"):
-        found[key] = values = np.array([_number(text) for text in table[key]])
+        found[key] = values = np.array([_number(text, header.decimal) for text in table[key]])
         bad = np.flatnonzero(~np.isfinite(values)) + 1
         if bad.size:
             problems.append(f"{where}: {key}: {_places(bad)}: no finite number; mend it or drop the row.")
@@ -382,9 +392,9 @@ def _numbers(header: Header, table: Mapping[str, list[str]], problems: list[str]
     return found if len(problems) == before else {}
 
 
-def _number(text: str) -> float:
+def _number(text: str, decimal: str) -> float:
     try:
-        return float(text)
+        return float(text.replace(decimal, "."))
     except ValueError:
         return math.nan
 

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from magpend_core.models import load_model
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.presets import Preset, find_preset, write_preset
@@ -57,10 +59,12 @@ def report_of(outcome: Outcome) -> dict[str, Any]:
 
 def _joint(fit: JointFit) -> dict[str, Any]:
     line = laws.transition(fit.values)
+    by_curve = {n: e if math.isfinite(e) else None for n, e in fit.errors_by_curve.items()}
     return {
         "values": {name: fit.values[name] for name in laws.FITTED},
         "held": [name for name in laws.FITTED if name not in fit.free],
-        "standard_errors": fit.errors, "standard_errors_by_curve": fit.errors_by_curve,
+        "standard_errors": fit.errors,
+        "standard_errors_by_curve": by_curve,
         "correlation": {"names": list(fit.free), "matrix": fit.correlation.tolist()},
         "transition": {"slope": line.slope, "offset_rad": line.offset},
         "r2": fit.quality.r2, "rms_Nm": fit.quality.rms, "neighbours_correlate": fit.neighbours,
@@ -118,7 +122,7 @@ def _base(measured: Measurement, model: str) -> str | Preset:
 
 def _error(fit: JointFit, name: str, measured: Measurement) -> str:
     """Standard error of a value, the larger of the two, in words."""
-    error, unit = max(fit.errors[name], fit.errors_by_curve[name]), _unit(name, measured)
+    error, unit = np.fmax(fit.errors[name], fit.errors_by_curve[name]), _unit(name, measured)
     return f"standard error {error:.2g} {unit}".rstrip()
 
 

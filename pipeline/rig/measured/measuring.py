@@ -14,6 +14,7 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.sides import UNKNOWN, flags_of
 from pipeline.rig.edges import Edges, edges_of
+from pipeline.rig.measured.phase import section_phase
 from pipeline.rig.measured.regimes import LIMIT, MAX_PERIOD, Regime, find_period
 from pipeline.rig.measured.sections import ORDER, WINDOW_S, find_sections, name_of
 from pipeline.rig.measured.steps import LEAST, TRANSIENT, Stretch, cut
@@ -73,17 +74,20 @@ def measure(
     way
         How they are cut and judged.
     parameters
-        Of the model, which its classifier needs to tell motions apart; without them no words are given.
+        Of the model, which its classifier needs to tell motions apart; without them no words are given. The
+        model's forcing says where in the drive's period sections are.
 
     Returns
     -------
     Dataset
         Dims ``step``, ``period_index`` (NaN beyond a step's own), ``state``. ``section`` and
         ``section_noise`` (step, period_index, state), angles not wrapped; by step ``frequency_error_hz``,
-        ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``n_sections``, ``orbit_period`` (0: closes at no
-        period that was looked at), ``confidence``, ``closure``, ``margin`` (`regimes.Regime`), ``side``
-        (codes of the model's classifier; absent without one or without parameters). Coordinates of ``step``:
-        ``frequency`` [Hz], ``direction`` (up, down, none), ``recording``, ``start_s``, ``end_s``.
+        ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``instant_error_s`` (of all its sections in
+        common: it moves angles by their rates and is no part of ``section_noise``), ``n_sections``,
+        ``orbit_period`` (0: closes at no period that was looked at), ``confidence``, ``closure``, ``margin``
+        (`regimes.Regime`), ``side`` (codes of the model's classifier; absent without one or without
+        parameters). Coordinates of ``step``: ``frequency`` [Hz], ``direction`` (up, down, none),
+        ``recording``, ``start_s``, ``end_s``.
 
     Raises
     ------
@@ -99,16 +103,18 @@ def measure(
             "recordings whose mappings name the same model."
         ])  # fmt: skip
     model = load_model(models[0])
-    steps = [step for i, r in enumerate(recordings) for step in _steps(r, i, way, model)]
+    known = model.load() if parameters is None else parameters
+    steps = [step for i, r in enumerate(recordings) for step in _steps(r, i, way, known)]
     _check(steps, recordings)
     found = _dataset(steps, model, recordings)
     return found if parameters is None else with_sides(found, parameters)
 
 
-def _steps(recording: xr.Dataset, number: int, way: Way, model: Model) -> list[_Step]:
+def _steps(recording: xr.Dataset, number: int, way: Way, parameters: Parameters) -> list[_Step]:
+    model = parameters.model
     edges = edges_of(recording, hysteresis=way.hysteresis)
     stretches = cut(edges, transient=way.transient, window=way.window)
-    instants = Edges(np.concatenate([s.edges.rising for s in stretches]), edges.falling, edges.resolution_s)
+    instants = _instants(edges, stretches, section_phase(parameters, stretches[0].timing.frequency_hz))
     sections = find_sections(recording, instants, window_s=way.window_s, order=way.order)
     names = tuple(str(n) for n in sections["state"].values)
     scale = np.array([model.state(n).scale for n in names])
@@ -122,10 +128,18 @@ def _steps(recording: xr.Dataset, number: int, way: Way, model: Model) -> list[_
             continue
         inner = slice(own.start + int(kept[0]), own.start + int(kept[-1]) + 1)
         points = section[inner]
-        blur = _with_instants(points, noise[inner], names, model, stretch.instant_error_s)
+        blur = _with_instants(points, noise[inner], names, model, stretch.instant_scatter_s)
         regime = find_period(points / scale, blur / scale, limit=way.limit, max_period=way.max_period)
         found.append(_Step(stretch, number, names, points, blur, regime))
     return found
+
+
+def _instants(edges: Edges, stretches: Sequence[Stretch], phase: float) -> Edges:
+    """Instants of the sections of all stretches: their rising edges, or a share of the period later."""
+    later = [s.edges.rising + phase / s.timing.frequency_hz for s in stretches]
+    # windows end at the drive's other edges; where sections are elsewhere, at all of them
+    others = np.sort(np.concatenate([edges.rising, edges.falling])) if phase else edges.falling
+    return Edges(np.concatenate(later), others, edges.resolution_s)
 
 
 def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
@@ -136,14 +150,14 @@ def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
 
 
 def _with_instants(
-    points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, error_s: float
+    points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, scatter_s: float
 ) -> np.ndarray:
-    """Noise of sections, that of their instants included where the rate is known."""
+    """Noise of sections, the scatter of their instants included where the rate is known."""
     both = noise.copy()
     for i, name in enumerate(names):
         rate = model.state(name).rate
         if rate in names:
-            both[:, i] = np.hypot(noise[:, i], points[:, names.index(rate)] * error_s)
+            both[:, i] = np.hypot(noise[:, i], points[:, names.index(rate)] * scatter_s)
     return both
 
 
@@ -180,6 +194,11 @@ def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Datas
         "jitter_s": ([t.jitter_s for t in timing], "s", "scatter of the rising edges"),
         "duty_cycle": ([t.duty_cycle for t in timing], "1", "share of the period in the high state"),
         "duty_cycle_error": ([t.duty_cycle_error for t in timing], "1", "standard error of the duty cycle"),
+        "instant_error_s": (
+            [s.stretch.instant_error_s for s in steps],
+            "s",
+            "error that the instants of all sections share",
+        ),
         "n_sections": ([len(s.section) for s in steps], "1", "sections"),
         "orbit_period": ([r.orbit_period for r in regime], "1", "period in drive periods, 0: unclosed"),
         "confidence": ([r.confidence for r in regime], "1", "share of resamples with this period"),

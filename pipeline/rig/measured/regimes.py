@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 
-LIMIT = 3.0
+LIMIT = 2.5
 """Second differences below so many units of noise are a closed motion's."""
 MAX_PERIOD = 16
 _LEAST = 6

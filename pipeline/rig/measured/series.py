@@ -10,6 +10,7 @@ import xarray as xr
 
 from magpend_core.models.parameters import Parameters
 from pipeline.rig.edges import DRIVE, Edges, edges_of
+from pipeline.rig.measured.phase import section_phase
 from pipeline.rig.measured.sections import ORDER, WINDOW_S, find_sections, name_of
 from pipeline.rig.measured.steps import constant_spans
 from pipeline.spec.problems import SpecError
@@ -74,7 +75,10 @@ def series_of(
     if n_periods < 1:
         raise SpecError([f"periods = {n_periods}: must be at least 1."])
     edges = edges_of(recording, hysteresis=hysteresis)
-    sections = find_sections(recording, edges, window_s=window_s, order=order)
+    timing = _first_timing(edges)
+    later = section_phase(parameters, timing) / timing
+    at = Edges(edges.rising + later, edges.falling, edges.resolution_s) if later else edges
+    sections = find_sections(recording, at, window_s=window_s, order=order)
     missing = [n for n in model.state_names if n not in sections["state"].values]
     if missing:
         raise SpecError([
@@ -87,7 +91,7 @@ def series_of(
     part = int(np.flatnonzero(sections["number"].values == first)[0])
     start = sections["section"].values[part]
     # the section was taken at the edge that was seen; the line through many knows its instant better
-    start_time = float(edges.rising[first])
+    start_time = float(edges.rising[first]) + later
     return _dataset(recording, parameters, edges, start, start_time, 1 / period, last - first)
 
 
@@ -107,6 +111,13 @@ def _part(
         f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
         f"{edges.rising[-1]:.3f} s."
     ])  # fmt: skip
+
+
+def _first_timing(edges: Edges) -> float:
+    """Frequency of the drive, roughly [Hz]."""
+    if edges.rising.size < _LEAST:
+        raise SpecError([f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them."])
+    return 1 / float(np.median(np.diff(edges.rising)))
 
 
 def _fitted(edges: Edges, first: int, last: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ TRANSIENT, WINDOW, LEAST = 20, 40, 8
 """Periods dropped after a step; periods of a window of a slow sweep; least periods of a stretch."""
 _OFF = 5.0
 """An edge so many standard deviations off the line through those before it, and the next as well: a step."""
+_BENT = 4.0
+"""Curvature of a stretch, in standard errors, that is no chance."""
 _AROUND = 16
 """Edges on either side of a step by which it is placed."""
 
@@ -28,14 +30,15 @@ class Stretch:
     Attributes
     ----------
     edges : Edges
-        Those at which sections are taken, transient dropped. Where their scatter is that of sampling, rising
+        Those at which sections are taken, transient dropped. Where their scatter is that of measuring, rising
         ones are those of the line through all edges of the stretch, which is nearer the drive's instants.
     timing : Timing
         Of all edges of the stretch.
     start_s, end_s : float
         Its first and last edge [s], the transient included.
-    instant_error_s : float
-        Standard error of a rising edge [s].
+    instant_scatter_s, instant_error_s : float
+        Standard error of a rising edge [s]: what differs from edge to edge, and what all have in common,
+        which is up to half a sample where edges fall on the same place between two samples.
     direction : int
         1 if the frequency rose to this stretch, -1 if it fell, 0 if there is no other.
     """
@@ -44,6 +47,7 @@ class Stretch:
     timing: Timing
     start_s: float
     end_s: float
+    instant_scatter_s: float
     instant_error_s: float
     direction: int
 
@@ -59,7 +63,7 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
         Periods that are dropped at the begin of each constant stretch.
     window
         Periods of a window of a slow sweep, of which none are dropped; 0 never cuts into windows. By default
-        windows of 40 are taken if most of the recording has no stretch that is long enough.
+        windows of 40 are taken if stretches are a few periods long or bend all the same way.
 
     Returns
     -------
@@ -87,12 +91,8 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
         return _directed(_windows(edges, window))
     spans = constant_spans(edges)
     kept = [(a, b) for a, b in spans if b - a >= transient + LEAST]
-    if window is None and sum(b - a for a, b in kept) < 0.5 * (edges.rising.size - 1):
-        swept = _windows(edges, WINDOW) if edges.rising.size > WINDOW else []
-        if swept and not kept:
-            return _directed(swept)
-        if swept and len(spans) > 2 * len(kept) + 2:
-            return _directed(swept)
+    if window is None and edges.rising.size > WINDOW and _is_swept(edges, spans):
+        return _directed(_windows(edges, WINDOW))
     if not kept:
         longest = max(b - a for a, b in spans)
         raise SpecError([
@@ -101,6 +101,22 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
             "is swept slowly."
         ])  # fmt: skip
     return _directed([_constant(edges, a, b, transient) for a, b in kept])
+
+
+def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
+    """Whether the frequency changes all along: stretches are a few periods long, or most bend one way."""
+    if len(spans) > 3 and np.median([b - a for a, b in spans]) < LEAST:
+        return True
+    bends = np.array([_bend(edges.rising[a : b + 1], _noise(edges)) for a, b in spans if b - a >= LEAST])
+    clear = np.sign(bends[np.abs(bends) > _BENT])
+    return bool(clear.size >= 3 and clear.size > 0.5 * bends.size and abs(clear.sum()) > 0.9 * clear.size)
+
+
+def _bend(rising: Floats, noise: float) -> float:
+    """Curvature of edges against their number, in units of its standard error."""
+    n = np.arange(rising.size) - 0.5 * (rising.size - 1)
+    square = n**2 - (n**2).mean()
+    return float(square @ rising / (noise * math.sqrt(square @ square)))
 
 
 def constant_spans(edges: Edges) -> list[tuple[int, int]]:
@@ -123,7 +139,7 @@ def _noise(edges: Edges) -> float:
     second = np.diff(edges.rising, 2)
     own = 1.4826 * float(np.median(np.abs(second))) / math.sqrt(6) if second.size else 0.0
     period = float(np.median(np.diff(edges.rising)))
-    return max(own, edges.resolution_s / math.sqrt(12), 1e-7 * period)
+    return max(own, edges.error_s, 1e-7 * period)
 
 
 def _reach(t: Floats, first: int, noise: float) -> int:
@@ -199,14 +215,15 @@ def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
     rising = own.rising
     # a falling edge is shifted as its place between rising ones says
     falling = own.falling - np.interp(own.falling, rising, curve)
-    timing = Edges(rising - curve, falling, own.resolution_s).frequency()
+    timing = replace(own, rising=rising - curve, falling=falling).frequency()
     line = _line(rising - curve) + curve
-    sampled = own.resolution_s / math.sqrt(12)
-    by_sampling = timing.jitter_s < 1.5 * sampled
+    by_sampling = timing.jitter_s < 1.5 * own.error_s
     instants = line if by_sampling else rising
-    error = timing.jitter_s * math.sqrt(2 / rising.size) if by_sampling else sampled
-    kept = Edges(instants[transient:], own.falling[own.falling > instants[transient]], own.resolution_s)
-    return Stretch(kept, timing, float(rising[0]), float(rising[-1]), error, 0)
+    scatter = timing.jitter_s * math.sqrt(2 / rising.size) if by_sampling else own.error_s
+    common = own.common_error(line - curve, timing.jitter_s)
+    falling = own.falling[own.falling > instants[transient]]
+    kept = replace(own, rising=instants[transient:], falling=falling)
+    return Stretch(kept, timing, float(rising[0]), float(rising[-1]), scatter, common, 0)
 
 
 def _line(rising: Floats) -> Floats:
@@ -228,7 +245,4 @@ def _directed(stretches: list[Stretch]) -> list[Stretch]:
         signs[i] = int(np.sign(change)) if abs(change) > slack else signs[i - 1]
     known = next((s for s in signs if s), 0)
     signs = [s or known for s in signs]
-    return [
-        Stretch(s.edges, s.timing, s.start_s, s.end_s, s.instant_error_s, sign)
-        for s, sign in zip(stretches, signs, strict=True)
-    ]
+    return [replace(s, direction=sign) for s, sign in zip(stretches, signs, strict=True)]

@@ -19,7 +19,8 @@ FAR = 5.0
 def steps_table(measured: xr.Dataset) -> Table:
     """Table of the steps: frequency, jitter, duty cycle, period, how sure it is; compared ones have more."""
     rows = [_row(measured, i) for i in range(measured.sizes["step"])]
-    return Table(rows, [f"{len(rows)} steps", *aligned([_words(r) for r in rows])])
+    plural = "s" * (len(rows) != 1)
+    return Table(rows, [f"{len(rows)} step{plural}", *aligned([_words(r) for r in rows])])
 
 
 def _row(measured: xr.Dataset, step: int) -> Row:
@@ -93,7 +94,8 @@ def edges_table(compared: xr.Dataset) -> Table:
         for n in ("measured", "computed", "shift"):
             row |= {f"{n}_hz": float(one[f"edge_{n}_hz"]), f"{n}_error_hz": float(one[f"edge_{n}_error_hz"])}
         rows.append(row | {"note": str(one["edge_note"].values)})
-    lines = [f"{len(rows)} edges of windows", *aligned([_edge_words(r) for r in rows])]
+    plural = "s" * (len(rows) != 1)
+    lines = [f"{len(rows)} window edge{plural}", *aligned([_edge_words(r) for r in rows])]
     return Table(rows, lines)
 
 

@@ -18,6 +18,12 @@ CLIPPED_RISE = 8.0
 JUMP_TURNS = 0.6
 """A step between neighbouring samples of an angle that is a wrap [turns]."""
 
+LEAP_TURNS = 0.1
+"""Deviation of a step between neighbouring samples from those around it that is no motion [turns]."""
+
+LEAP_AROUND = 9
+"""Steps of which the median is what a step should be."""
+
 
 class Signal:
     """One channel on the recording's clock.
@@ -183,3 +189,36 @@ def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarra
     for i in places:
         findings.append(signal.found("wrap", int(known[i]), int(known[i + 1]) + 1, severity, text))
     return result, findings
+
+
+def leaps(signal: Signal, angle: np.ndarray) -> list[Finding]:
+    """Find steps of an angle that are no motion and no wrap.
+
+    Such as a wrap whose flank was sampled: it cannot be told from a motion any more, and a turn is lost.
+
+    Parameters
+    ----------
+    signal
+        The channel.
+    angle
+        (n,) [rad], unwrapped if that was asked for; NaN where it is not measured.
+    """
+    from scipy.ndimage import median_filter
+
+    step = np.diff(angle)
+    step[signal.piece[1:] != signal.piece[:-1]] = np.nan
+    known = np.isfinite(step)
+    if not known.any():
+        return []
+    usual = median_filter(step[known], size=LEAP_AROUND, mode="nearest")
+    off = np.zeros(len(step))
+    off[known] = np.abs(step[known] - usual) / (2.0 * math.pi)
+    is_leap = (off > LEAP_TURNS) & (off <= JUMP_TURNS)
+    return [
+        signal.found(
+            "leap", i, k + 1, "error",
+            f"leaps by {off[i:k].max():.2g} turns within a sample; if the sensor wraps here, state its dead "
+            "band, so that what it reads there is left out.",
+        )
+        for i, k in runs(is_leap)
+    ]  # fmt: skip

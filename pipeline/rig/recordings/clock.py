@@ -18,6 +18,12 @@ MIXED = 1e-3
 GAP_STEPS = 1.5
 """Distance of two time stamps from which on there is a gap [sampling intervals]."""
 
+SHAKY = 0.05
+"""Median deviation of neighbouring time stamps from even steps from which on a late one may be no gap."""
+
+AROUND = 8
+"""Time stamps on either side of a late one that tell jitter from a gap."""
+
 REPEATING = 0.01
 """Share of equal neighbouring time stamps from which on they are coarser than the sampling."""
 
@@ -264,21 +270,58 @@ def _cut(
     time: np.ndarray, forced: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
     """Cut the samples at gaps and where it is asked for, and make time even within each piece."""
-    distance = np.diff(time)
-    # stamps coarser than the sampling repeat, and then leap by a grain of theirs
-    repeats = bool(np.mean(distance == 0.0) >= REPEATING) if distance.size else False
-    grain = float(distance[distance > 0.0].min(initial=np.inf)) if repeats else 0.0
-    is_gap = np.concatenate([[False], distance > GAP_STEPS * step + grain])
+    is_gap = _missing(time, step) > 0
     piece = np.cumsum(is_gap | np.concatenate([[False], forced[1:]])).astype(np.int64)
     even, own_step, residual = _even(time, piece, step, stated)
     findings = [
         Finding(
             "gap", "", float(time[i - 1]), float(time[i]), "warning",
-            f"{round((time[i] - time[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
+            f"{round((even[i] - even[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
         )
         for i in np.flatnonzero(is_gap)
     ]  # fmt: skip
     return even, piece, own_step, findings + _jitter_findings(even, residual, own_step)
+
+
+def _missing(time: np.ndarray, step: float) -> np.ndarray:
+    """Samples that are missing before each.
+
+    Where stamps jitter, a late one is no gap if those after it are in time again: their mean phase tells.
+    """
+    result = np.zeros(len(time), dtype=np.int64)
+    distance = np.diff(time)
+    if not distance.size:
+        return result
+    # stamps coarser than the sampling repeat, and then leap by a grain of theirs
+    repeats = bool(np.mean(distance == 0.0) >= REPEATING)
+    grain = float(distance[distance > 0.0].min(initial=np.inf)) if repeats else 0.0
+    late = np.flatnonzero(distance > GAP_STEPS * step + grain) + 1
+    skipped = np.round(distance[late - 1] / step) - 1.0
+    if float(np.median(np.abs(distance / step - 1.0))) > SHAKY:
+        skipped = _skipped(time, step, late, skipped >= 2.0)
+    result[late] = np.maximum(skipped, 0.0).astype(np.int64)
+    return result
+
+
+def _skipped(time: np.ndarray, step: float, late: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
+    """Samples missing at late stamps that may be jitter: by how much those after are later than those before.
+
+    Stamps beyond another gap say nothing; of two doubtful ones side by side the one with the larger shift is
+    taken.
+    """
+    phase = np.concatenate([[0.0], np.cumsum(time / step - np.arange(len(time)))])
+    walls = np.concatenate([[0], late[is_sure], [len(time)]])
+    place = np.searchsorted(walls, late)
+    before = np.maximum(late - AROUND, walls[place - 1])
+    after = np.minimum(late + AROUND, walls[place + is_sure])
+    shift = (phase[after] - phase[late]) / (after - late) - (phase[late] - phase[before]) / (late - before)
+    skipped = np.round(shift)
+    doubtful = np.flatnonzero(~is_sure & (skipped >= 1.0))
+    for i in doubtful:
+        beside = doubtful[np.abs(late[doubtful] - late[i]) < AROUND]
+        if shift[beside].max() > shift[i]:
+            skipped[i] = 0.0
+    return np.asarray(skipped)
 
 
 def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:

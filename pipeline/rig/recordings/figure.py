@@ -22,10 +22,15 @@ MOST_DOTS = 6000
 
 LINES = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE)
 MARKS = {
-    "gap": "0.75", "dead-band": style.ORANGE, "saturated": style.VERMILLION, "missing": "0.55",
-    "wrap": style.SKY, "jitter": style.PURPLE, "start": style.GREEN, "length": style.GREEN,
+    "gap": "0.7", "dead-band": style.ORANGE, "saturated": style.VERMILLION, "missing": style.PURPLE,
+    "wrap": "0.25", "start": style.GREEN, "leap": style.BLUE,
 }  # fmt: skip
-"""Colour by kind of finding; kinds that have no place are in the caption."""
+"""Colour by kind of finding; kinds that concern a whole recording are in the caption."""
+
+INSTANTS = ("wrap", "start", "leap")
+"""Kinds that happen at an instant: lines, which are seen beside a shaded stretch."""
+
+SHADE = 0.4
 
 LEAST_MARK = 0.003
 """Least width of a mark [width of the axes]."""
@@ -62,9 +67,7 @@ def plot_recording(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     kinds = _mark(axes, rows, ds, span)
     style.label_axes(axes[-1], labels.with_unit("time", "s"), None)
     fig.align_ylabels(axes)
-    handles = _line_handles(ds, rows) + [
-        Patch(color=MARKS[k], alpha=0.5, linewidth=0.0, label=k) for k in kinds
-    ]
+    handles = [*_line_handles(ds, rows), *map(_mark_handle, kinds)]
     style.complete(fig, axes[0], _caption(ds), handles)
     return fig
 
@@ -133,17 +136,24 @@ def _mark(
         if f.kind not in MARKS or np.isnan(f.start_s) or f.end_s < span[0] or f.start_s > span[1]:
             continue
         kinds[f.kind] = None
-        middle, half = 0.5 * (f.start_s + f.end_s), 0.5 * max(f.end_s - f.start_s, least)
-        for ax, names in zip(axes, rows, strict=True):
-            if f.channel in ("", *names):
-                ax.axvspan(
-                    middle - half, middle + half, color=MARKS[f.kind], alpha=0.35, linewidth=0.0, zorder=0
-                )
+        colour, middle = MARKS[f.kind], 0.5 * (f.start_s + f.end_s)
+        half = 0.5 * max(f.end_s - f.start_s, least)
+        for ax in (a for a, names in zip(axes, rows, strict=True) if f.channel in ("", *names)):
+            if f.kind in INSTANTS:
+                ax.axvline(middle, color=colour, linewidth=0.9, linestyle=(0, (2, 2)), zorder=1)
+            else:
+                ax.axvspan(middle - half, middle + half, color=colour, alpha=SHADE, linewidth=0.0, zorder=0)
     time, piece = ds["time"].values, ds["piece"].values
     for i in np.flatnonzero(np.diff(piece)):
         for ax in axes:
             ax.axvline(0.5 * (time[i] + time[i + 1]), color="0.8", linewidth=0.5, zorder=0.5)
     return list(kinds)
+
+
+def _mark_handle(kind: str) -> Any:
+    if kind in INSTANTS:
+        return Line2D([], [], color=MARKS[kind], linewidth=1.2, linestyle=(0, (2, 2)), label=kind)
+    return Patch(color=MARKS[kind], alpha=SHADE, linewidth=0.0, label=kind)
 
 
 def _line_handles(ds: xr.Dataset, rows: Sequence[Sequence[str]]) -> list[Any]:
@@ -158,7 +168,7 @@ def _caption(ds: xr.Dataset) -> str:
     """File, rate, pieces, and what has no place in time."""
     n_pieces = len(np.unique(ds["piece"].values))
     parts = [
-        Path(str(ds.attrs.get("file", ""))).name.replace("_", "\\_").replace("\\_", "_"),
+        Path(str(ds.attrs.get("file", ""))).name,
         f"{float(ds.attrs['sampling_rate_hz']):.6g} Hz",
         f"{n_pieces} pieces" if n_pieces > 1 else "",
         "simulated" if ds.attrs.get("simulated") else "",

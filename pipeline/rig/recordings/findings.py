@@ -55,6 +55,7 @@ KINDS = {
     "saturated": "samples lie at the end of the sensor's range",
     "dead-band": "samples lie where the sensor does not measure",
     "wrap": "the angle jumps by a turn",
+    "leap": "the angle leaps from one sample to the next as nothing moves",
     "unit": "the file states another unit than the mapping",
 }
 """All kinds of findings."""

@@ -156,9 +156,10 @@ def _instants(segment: _Segment, style: _Style) -> dict[int, float]:
             year, month, day = (int(part) for part in _key(segment, "Date", j).split("/"))
             hour, minute, second = _key(segment, "Time", j).replace(",", ".").split(":")
             of_day = 3600.0 * int(hour) + 60.0 * int(minute) + float(second)
+            days = date(year, month, day).toordinal()
         except ValueError:
             continue
-        found[j] = 86400.0 * date(year, month, day).toordinal() + of_day
+        found[j] = 86400.0 * days + of_day
     return found
 
 
@@ -166,7 +167,7 @@ def _channels(segment: _Segment, style: _Style, zero: float) -> dict[str, Channe
     columns = _columns(segment)
     names = dict(zip(columns, unique([segment.names[j] for j in columns]), strict=True))
     # a name alone at the end of a line is a comment's
-    values = table(segment.lines, max(columns) + 1, style.separator, style.decimal)
+    values = table(segment.lines, max(columns, default=-1) + 1, style.separator, style.decimal)
     starts = _instants(segment, style)
     found = {}
     for j, x in columns.items():

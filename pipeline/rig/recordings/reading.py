@@ -195,7 +195,7 @@ def _converted(signal: checks.Signal, mapping: Mapping) -> tuple[np.ndarray, lis
     value[dead] = np.nan
     if mapping.unit_of(signal.name) == "rad":
         value, wraps = checks.unwrapped(signal, value, entry.wraps)
-        found += wraps
+        found += wraps + checks.leaps(signal, value)
     return value, found
 
 

@@ -33,6 +33,9 @@ GROWTH = 1.25
 ENOUGH = 1.5
 """A window whose score is so many times the least ends the search for a longer one."""
 
+LONG = 63
+"""Windows longer than this go through Fourier transforms [samples]."""
+
 MOST_SAMPLES = 200_000
 """Samples from which the window is chosen; of longer recordings, the first."""
 
@@ -184,12 +187,42 @@ def _fit(values: np.ndarray, parts: np.ndarray, width: int | None, order: int, s
     return _smoothed(values, parts, width, order, step)
 
 
+def _first_samples(parts: np.ndarray, count: int) -> np.ndarray:
+    """Stretches up to a number of samples; the last is cut."""
+    if not len(parts):
+        return parts
+    lengths = np.diff(parts, axis=1).ravel()
+    before = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    used = parts[before < count].copy()
+    used[-1, 1] = min(used[-1, 1], used[-1, 0] + count - before[len(used) - 1])
+    return used
+
+
+def _filtered(y: np.ndarray, width: int, order: int, derivative: int = 0, step: float = 1.0) -> np.ndarray:
+    """Values or slopes of the local polynomials of a stretch, one-sided at its ends.
+
+    What `scipy.signal.savgol_filter` gives; long windows go through Fourier transforms, whose time does not
+    grow with the window.
+    """
+    from scipy.signal import oaconvolve, savgol_coeffs, savgol_filter
+
+    if width <= LONG:
+        return np.asarray(savgol_filter(y, width, order, deriv=derivative, delta=step, mode="interp"))
+    half = width // 2
+    inner = oaconvolve(y, savgol_coeffs(width, order, deriv=derivative, delta=step), mode="valid")
+    x = np.linspace(-1.0, 1.0, width)
+    ends = []
+    for part, places in ((y[:width], x[:half]), (y[-width:], x[width - half :])):
+        fit = np.polynomial.Legendre.fit(x, part, order, domain=[-1.0, 1.0])
+        ends.append(fit.deriv(derivative)(places) / (half * step) ** derivative)
+    return np.concatenate([ends[0], inner, ends[1]])
+
+
 def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
     """Window with the least error of prediction."""
     first = _least(order)
-    lengths = np.diff(parts, axis=1).ravel()
-    used = parts[np.concatenate([[0], np.cumsum(lengths)[:-1]]) < MOST_SAMPLES] if len(parts) else parts
-    longest = int(lengths.max(initial=first))
+    used = _first_samples(parts, MOST_SAMPLES)
+    longest = int(np.diff(used, axis=1).max(initial=first))
     best, best_score, width = first, math.inf, first
     while width <= longest:
         score = _smoothed(values, used, width, order, 1.0).score
@@ -203,8 +236,6 @@ def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
 
 def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, step: float) -> _Fit:
     """Fit all stretches with one window, or a shorter one where a stretch is shorter."""
-    from scipy.signal import savgol_filter
-
     smooth_values, rates = np.full(len(values), np.nan), np.full(len(values), np.nan)
     squares = freedom = predicted = 0.0
     count = 0
@@ -216,9 +247,9 @@ def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, ste
         y = values[begin:end]
         mean = float(y.mean())
         centred = y - mean
-        fitted = savgol_filter(centred, own, order, mode="interp")
+        fitted = _filtered(centred, own, order)
         smooth_values[begin:end] = fitted + mean
-        rates[begin:end] = savgol_filter(centred, own, order, deriv=1, delta=step, mode="interp")
+        rates[begin:end] = _filtered(centred, own, order, 1, step)
         leverage = _along(own, order, n)
         residual = centred - fitted
         free = 1.0 - leverage

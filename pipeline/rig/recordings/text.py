@@ -74,6 +74,8 @@ def table(lines: Sequence[str], n_columns: int, delimiter: str, decimal: str) ->
     ndarray
         (n_lines, n_columns).
     """
+    if not lines or n_columns == 0:
+        return np.empty((len(lines), n_columns))
     text = "\n".join(lines)
     if decimal == ",":
         text = text.replace(",", ".")

@@ -138,6 +138,15 @@ def test_frequency__what_sampling_hides_is_in_the_error():
         assert timing.frequency_error_hz > 1e-6
 
 
+def test_common_error__is_that_of_a_sample_where_all_edges_share_their_place():
+    """0.29 ms where sampling always hides the same; next to none where edges fall anywhere in a sample."""
+    time = np.arange(40_000) / 1000
+    shared, spread = (find_edges(time, square(time, f, start_s=0.1003)) for f in (2.5, 2.237))
+    assert shared.common_error(shared.rising, 0.0) == pytest.approx(1e-3 / np.sqrt(12), rel=0.02)
+    n = np.arange(spread.rising.size)
+    assert spread.common_error(0.1003 + n / 2.237, 1e-3 / np.sqrt(12)) < 5e-5
+
+
 def test_frequency__a_missing_edge_is_counted():
     rising = np.delete(0.3 + np.arange(50) / 2.5, 20)
     timing = Edges(rising, rising + 0.2).frequency()

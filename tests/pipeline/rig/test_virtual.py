@@ -78,6 +78,19 @@ def test_record__steps_of_the_drive_carry_the_state_on(parameters):
             begin, state = end, found.y[:, -1]
 
 
+def test_record__drive_signal_follows_the_steps(parameters):
+    """Each step's edges count from its own beginning, which is no whole period of its frequency."""
+    steps = [Step(2.0, 1), Step(3.7, 4, {"duty_cycle": 0.3}), Step(1.0, 1, {"q": 0.0})]
+    times = np.arange(1000) / 500.0
+    sensors = {"psi1": Sensor(), "drive": DriveSensor("signal")}
+    signal = record(parameters, steps, START, times, sensors=sensors, seed=0)["drive"].values
+    wanted = np.where(np.mod(times * 2.0, 1.0) < 0.4927, 1.0, -1.0)
+    second = (times >= 0.5) & (times < 0.5 + 4 / 3.7)
+    wanted[second] = np.where(np.mod((times[second] - 0.5) * 3.7 + 1e-9, 1.0) < 0.3, 1.0, -1.0)
+    wanted[times >= 0.5 + 4 / 3.7] = 0.0
+    np.testing.assert_array_equal(signal, wanted)
+
+
 def test_record__free_swing_of_another_model():
     model = load_model("double-pendulum")
     parameters = model.load(q=0.0)
@@ -145,8 +158,8 @@ def test_readings__through_a_file_are_the_recording(tmp_path, parameters, suffix
 def test_record__refuses_all_at_once(parameters):
     with pytest.raises(SpecError) as caught:
         record(
-            parameters, [Step(2.2, 2, {"duty": 0.5}), Step(0.0, 1)], START, TIMES,
-            sensors={"psi_1": Sensor(), "psi1_dot": Sensor("potentiometer"), "psi2": Sensor(noise=-1.0)}, seed=0,
+            parameters, [Step(2.2, 2, {"duty": 0.5}), Step(0.0, 1)], START, TIMES, seed=0,
+            sensors={"psi_1": Sensor(), "psi1_dot": Sensor("potentiometer"), "psi2": Sensor(noise=-1.0)},
         )  # fmt: skip
     text = "\n".join(caught.value.problems)
     assert "unknown state 'psi_1'; did you mean psi1" in text

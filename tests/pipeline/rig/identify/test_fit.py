@@ -16,6 +16,7 @@ from pipeline.rig.identify.local import fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Free, Piece, Problem
 from pipeline.rig.identify.search import cut, refine, search, slowest_period, sobol
+from pipeline.rig.identify.starts import fit_starts
 
 MODEL = load_model("duffing")
 TRUTH = {"damping": 0.15, "linear": 3.0, "cubic": 0.8, "amplitude": 1.2}
@@ -170,6 +171,17 @@ def test_fit_local__holds_what_is_fixed():
     some = fit_local(problem, problem.start, fixed={"cubic": 0.9, "zero.x": ZERO})
     assert some.theta[problem.names.index("cubic")] == 0.9
     assert some.cost > 100 * fit.cost
+
+
+def test_fit_starts__finds_each_start_by_itself():
+    """One piece's guess is far off: the others do not wait for it, and it gets there."""
+    problem = make_problem()
+    guess = problem.starts.copy()
+    guess[1] += [0.8, -1.5]
+    found = fit_starts(problem, truth_of(problem), guess)
+    np.testing.assert_allclose(found, STARTS, atol=1e-5)
+    alone = replace(problem, pieces=problem.pieces[1:2])
+    np.testing.assert_allclose(fit_starts(alone, truth_of(problem), guess[1:2])[0], found[1], atol=1e-9)
 
 
 def test_fit_local__withstands_outliers_with_a_robust_loss():

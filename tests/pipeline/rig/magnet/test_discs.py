@@ -147,3 +147,21 @@ def test_discs__the_fitted_law_holds_and_dipoles_fail():
     for first, second, sign in (("alpha1", "alpha2", -1), ("r1", "r2", -1), ("c1", "c2", 1), ("p1", "p2", 1)):
         error = np.hypot(found.joint.errors_by_curve[first], found.joint.errors_by_curve[second])
         assert abs(p[first] - sign * p[second]) < 3 * error
+
+
+def test_discs__the_force_along_the_magnets_line_shares_the_torque_among_the_joints(make_discs):
+    """Eq. 20 makes joint torques of M_M by a force along the line between the magnets; discs have more."""
+    m = read_measurement(ROOM / "discs.toml")
+    p, psi1, psi2 = m.parameters, m.angle, m.angle + m.locked
+    force, moment = make_discs.loads(psi1, psi2, p, DISC)
+    lower_joint = p["l1"] * np.stack([np.sin(psi1), -np.cos(psi1)], axis=-1)
+    second = moment - (lower_joint[:, 0] * force[:, 1] - lower_joint[:, 1] * force[:, 0])
+    dx = p["l1"] * np.sin(psi1) + p["l2"] * np.sin(psi2)
+    dy = p["h"] - p["l1"] * np.cos(psi1) - p["l2"] * np.cos(psi2)
+    along = moment / p["h"]
+    upwards = along * dy * dx / (dx**2 + p["delta"] ** 2)
+    computed = p["l2"] * (along * np.cos(psi2) + upwards * np.sin(psi2))
+    left = computed - second
+    assert 1.0 - left.var() / second.var() > 0.97
+    straight = m.locked == 0.0
+    assert 1.0 - left[straight].var() / second[straight].var() > 0.998

@@ -72,6 +72,17 @@ def test_read_measurement__takes_off_readings_without_the_magnets(rig):
     assert "set weights = false and drop tie" in problems_of(rig.path)[0]
 
 
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_read_measurement__decimal_commas_and_other_delimiters(rig, delimiter):
+    text = rig.table.read_text().replace(",", delimiter).replace(".", ",")
+    rig.table.write_text("\ufeff" + text, encoding="utf-8")
+    sign = "\\t" if delimiter == "\t" else delimiter
+    change(rig.path, ("[columns]", f'delimiter = "{sign}"\ndecimal = ","\n[columns]'))
+    np.testing.assert_allclose(read_measurement(rig.path).torque, rig.magnets, rtol=0, atol=1e-14)
+    change(rig.path, (f'delimiter = "{sign}"\n', ""))
+    assert 'delimiter and decimal are both ","' in problems_of(rig.path)[0]
+
+
 def test_read_measurement__angles_in_radians_and_words_for_sides(rig):
     table = rig.table.read_text().replace("right", "R").replace("left", "L")
     lines = [line.split(",") for line in table.splitlines()]

@@ -67,6 +67,21 @@ def test_write_results__the_preset_may_rest_on_a_preset_from_a_file(rig, tmp_pat
     load_model("pendulum-dipole").load(second / "preset-dipoles.toml")
 
 
+def test_write_results__what_is_held_keeps_its_own_origin(rig, tmp_path):
+    text = rig.path.read_text().replace("[columns]", 'hold = ["eps_mag"]\n[columns]', 1)
+    text = text.replace("[parameters]", "[parameters]\neps_mag = 60.0")
+    rig.path.write_text(text.replace("[provenance]", '[provenance]\neps_mag = "an older rig"'))
+    outcome = fit_measurement(read_measurement(rig.path))
+    write_results(outcome, tmp_path)
+    found = load_model("pendulum").preset(tmp_path / "preset.toml")
+    assert (found.values["eps_mag"], found.provenance["eps_mag"]) == (60.0, "an older rig")
+    assert found.values["alpha1"] == outcome.joint.values["alpha1"] != pytest.approx(TRUE["alpha1"], rel=1e-3)
+    report = json.loads((tmp_path / "fit.json").read_text())
+    assert report["joint"]["held"] == ["eps_mag"]
+    assert report["joint_with_nothing_held"]["values"] == pytest.approx(TRUE, rel=1e-8)
+    assert any(line.startswith("all at once, nothing held") for line in summary_of(outcome))
+
+
 def test_report__holds_curves_joint_fit_and_dipoles(rig, tmp_path):
     outcome = fit_measurement(read_measurement(rig.path))
     write_results(outcome, tmp_path)

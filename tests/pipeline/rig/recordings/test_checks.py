@@ -122,6 +122,30 @@ def test_wrap__that_is_stated_is_unwrapped_and_noted(make):
     np.testing.assert_allclose(ds["psi1"], angle, atol=1e-12)
 
 
+def test_leaps__flank_of_a_wrap_that_was_sampled(make):
+    """A filter before the converter makes a ramp of the wrap: half a turn and half a turn, none of them told."""
+    angle = 2.0 * make.time
+    volts, _ = pot(angle, dead=0.0)
+    smeared = np.convolve(np.pad(volts, (2, 0), mode="edge"), np.ones(3) / 3, mode="valid")
+    scale = 2.0 * math.pi / 4.5
+    ds = make.recorded(smeared, unit="V", zero=2.5, scale=scale, wraps=True)
+    found = [f for f in findings_of(ds) if f.kind == "leap"]
+    assert [(f.channel, f.severity) for f in found] == [("psi1", "error")]
+    assert found[0].start_s == pytest.approx(math.pi / 2.0, abs=4 * make.step_s)
+    assert "state its dead band" in found[0].text
+    assert abs(float(ds["psi1"][-1]) - angle[-1]) > 6.0  # a turn is lost: that is why it is an error
+
+
+def test_leaps__none_in_a_fast_and_coarsely_sampled_turn(make):
+    """20 rad/s at 50 Hz, a third of a rad per sample, and 200 rad/s2."""
+    t = np.arange(500) / 50.0
+    angle = 20.0 * t + 2.0 * np.sin(10.0 * t)
+    folded = np.mod(angle + math.pi, 2.0 * math.pi) - math.pi
+    ds = make.recorded(folded, folded, wraps=True)
+    assert {f.kind for f in findings_of(ds) if f.channel == "psi1"} == {"wrap"}
+    np.testing.assert_allclose(ds["psi1"], angle, atol=1e-9)
+
+
 def test_unwrapped__begins_anew_in_each_piece(make):
     """How often a sensor turned while nobody looked is not known."""
     from pipeline.rig.recordings.reading import recording_of

@@ -67,6 +67,21 @@ def test_clock__jitter_is_told_and_time_is_even(make):
     np.testing.assert_allclose(ds["time"], make.time - make.time[0], atol=0.3 * make.step_s)
 
 
+def test_clock__late_stamps_are_no_gap_and_gaps_are_found_among_them(make):
+    """Jitter so strong that neighbours stand more than one and a half steps apart."""
+    rng = np.random.default_rng(1)
+    stamps = make.time + rng.uniform(-0.35, 0.35, make.n) * make.step_s
+    assert np.diff(stamps).max() > 1.6 * make.step_s
+    stamps[900:] += 0.7
+    stamps[1400:] += make.step_s  # a single sample
+    ds = stamped(make, stamps)
+    found = findings_of(ds)
+    assert [f.kind for f in found] == ["gap", "gap", "jitter"]
+    assert "350 samples" in found[0].text
+    assert "1 samples" in found[1].text
+    assert ds.attrs["sampling_rate_hz"] == pytest.approx(500.0, rel=1e-4)
+
+
 def test_clock__uneven_sampling_is_a_warning(make):
     """A clock that runs two samples ahead in the middle of the recording."""
     stamps = make.time + 2.0 * make.step_s * np.sin(np.pi * np.arange(make.n) / make.n)

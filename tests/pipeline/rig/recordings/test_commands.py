@@ -94,10 +94,8 @@ def test_recordings_convert__is_read_with_its_mapping(main, swing):
 def test_recordings_show__real_pendulum(main, tmp_path):
     for name in ("multiarm_free_swings.mat", "multiarm_free_swings.toml"):
         shutil.copy(FOLDER / name, tmp_path)
-    code, out, err = main(
-        "recordings", "show", "multiarm_free_swings.mat", "--mapping", "multiarm_free_swings.toml", "--smooth",
-        "--out", "x.png",
-    )  # fmt: skip
+    words = ("--mapping", "multiarm_free_swings.toml", "--smooth", "--out", "x.png")
+    code, out, err = main("recordings", "show", "multiarm_free_swings.mat", *words)
     assert code == 0, err
     assert "69342 samples at 1000 Hz, 69.341 s in 26 pieces" in out
     assert "findings: none" in out

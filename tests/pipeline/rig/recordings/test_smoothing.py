@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.rig.recordings import recording_of, smooth
 from pipeline.rig.recordings.mapping import parse_mapping
-from pipeline.rig.recordings.smoothing import _switches
+from pipeline.rig.recordings.smoothing import _along, _filtered, _first_samples, _switches
 from pipeline.spec.problems import SpecError
 
 
@@ -206,3 +206,30 @@ def test_smooth__leaves_its_argument_alone(make):
 def test_smooth__refuses(make, more, sentence):
     with pytest.raises(SpecError, match=sentence):
         smooth(make.recorded(), **more)
+
+
+@pytest.mark.parametrize(("width", "order"), [(5, 1), (9, 3), (15, 2)])
+def test_along__is_the_weight_of_a_sample_in_its_own_value(width, order):
+    """Against the smoothing of unit vectors, sample by sample, up to both ends."""
+    from scipy.signal import savgol_filter
+
+    operator = savgol_filter(np.eye(24), width, order, axis=0, mode="interp")
+    np.testing.assert_allclose(_along(width, order, 24), np.diag(operator), atol=1e-12)
+
+
+@pytest.mark.parametrize("derivative", [0, 1])
+@pytest.mark.parametrize("width", [65, 201, 999])
+def test_filtered__long_windows_are_those_of_scipy(width, derivative):
+    from scipy.signal import savgol_filter
+
+    y = np.random.default_rng(0).standard_normal(1500).cumsum()
+    wanted = savgol_filter(y, width, 3, deriv=derivative, delta=0.01, mode="interp")
+    found = _filtered(y, width, 3, derivative, 0.01)
+    np.testing.assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
+
+
+def test_first_samples__cuts_the_last_stretch():
+    parts = np.array([[0, 10], [20, 50], [60, 90]])
+    assert _first_samples(parts, 25).tolist() == [[0, 10], [20, 35]]
+    assert _first_samples(parts, 1000).tolist() == parts.tolist()
+    assert _first_samples(parts[:0], 5).size == 0

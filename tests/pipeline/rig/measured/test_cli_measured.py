@@ -1,0 +1,124 @@
+"""``magpend measured``: from files on the disk to tables and figures."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.rig.recordings import write_raw
+from pipeline.rig.virtual import DriveSensor, Sensor, Step, readings
+
+RIGHT = [0.05208, 0.13572, -3.01085, 3.20903]
+FREQUENCIES = (2.46, 2.48, 2.54, 2.56)
+FEW = ("--transient", 50)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory, pendulum):
+    """A TDMS file of a sweep with potentiometers of 12 bits, and its mapping."""
+    folder = tmp_path_factory.mktemp("rig")
+    steps = [Step(f, 90) for f in FREQUENCIES]
+    times = np.arange(0.0, sum(s.duration_s for s in steps) - 1e-3, 1e-3)
+    angle = Sensor("potentiometer", noise=1e-3, bits=12, dead_band=0.1)
+    sensors = {"psi1": angle, "psi2": angle, "drive": DriveSensor("signal", 0.02)}
+    raw, mapping = readings(pendulum, steps, RIGHT, times, sensors=sensors, seed=4)
+    write_raw(raw, folder / "up.tdms")
+    (folder / "rig.toml").write_text(mapping.toml(), "utf-8")
+    (folder / "no_drive.toml").write_text(mapping.toml().split("[drive]")[0].replace(
+        "[channels.psi1]", 'drive = "none"\n[channels.psi1]', 1), "utf-8")  # fmt: skip
+    return folder
+
+
+def test_measured_steps__prints_a_table_and_json(main, files):
+    code, out, err = main("measured", "steps", files / "up.tdms", "--mapping", files / "rig.toml", *FEW)
+    assert code == 0, err
+    assert out.splitlines()[0] == "4 steps"
+    code, out, _ = main(
+        "measured", "steps", files / "up.tdms", "--mapping", files / "rig.toml", *FEW, "--json"
+    )
+    rows = json.loads(out)
+    assert code == 0
+    assert [r["orbit_period"] for r in rows] == [2, 2, 1, 1]
+    assert {r["side"] for r in rows} == {"right"}
+    assert [r["frequency_hz"] for r in rows] == pytest.approx(FREQUENCIES, abs=2e-4)
+
+
+def test_measured_compare__writes_figures_tables_and_numbers(main, files, run_directory, tmp_path):
+    words = ("measured", "compare", run_directory, files / "up.tdms", "--mapping", files / "rig.toml", *FEW)
+    code, out, err = main(*words, "--out", tmp_path / "out")
+    assert code == 0, err
+    assert "sides agree at 100 % of the 4 steps that are sure" in out
+    assert "1 window edge" in out
+    names = {p.name for p in (tmp_path / "out").iterdir()}
+    assert names == {f"{n}.{s}" for n in ("comparison", "beside", "over") for s in ("png", "nc")} | {
+        "steps.csv", "edges.csv",
+    }  # fmt: skip
+    with (tmp_path / "out" / "steps.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [r["computed_side"] for r in rows] == ["right"] * 4
+    code, out, _ = main(*words, "--out", tmp_path / "out", "--json")
+    told = json.loads(out)
+    assert set(told) == {"steps", "edges"}
+    assert told["edges"][0]["before"] == "period 2, right"
+    assert told["steps"][0]["distance_in_noise"] < 2.5
+
+
+def test_measured_diagram__alone_and_with_a_run(main, files, run_directory, tmp_path):
+    words = ("measured", "diagram", files / "up.tdms", "--mapping", files / "rig.toml", *FEW)
+    for name, more in (("a.png", ()), ("b.svg", ("--run", run_directory, "--layout", "over", "--degrees"))):
+        code, out, err = main(*words, "--out", tmp_path / name, *more)
+        assert code == 0, err
+        assert (tmp_path / name).stat().st_size > 1000
+        assert (tmp_path / name).with_suffix(".nc").exists()
+        assert out.startswith(f"figure: {tmp_path / name}")
+
+
+def test_measured_series__prints_how_far_off_it_is(main, files, tmp_path):
+    code, out, err = main(
+        "measured", "series", files / "up.tdms", "--mapping", files / "rig.toml", "--out", tmp_path / "s.png",
+        "--start-s", 100, "--periods", 4,
+    )  # fmt: skip
+    assert code == 0, err
+    assert out.startswith("rms of psi1: 0.0")
+    assert (tmp_path / "s.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"mapping": "no_drive.toml"}, "no drive channel"),
+        ({"more": ("--transient", 500)}, "lower transient"),
+        ({"more": ("--window-s", 0.002)}, "window_s = 0.002"),
+        ({"more": ("--window", 3)}, "window = 3"),
+        ({"more": ("--max-period", 0)}, "--max-period 0"),
+        ({"recording": "gone.tdms"}, "gone.tdms"),
+        ({"more": ("--csv", "/nowhere/at/all.csv")}, "--csv"),
+    ],
+)
+def test_measured_steps__bad_input_exits_with_2(main, files, change, says):
+    code, _, err = main(
+        "measured", "steps", files / change.get("recording", "up.tdms"),
+        "--mapping", files / change.get("mapping", "rig.toml"), *change.get("more", ()),
+    )  # fmt: skip
+    assert code == 2
+    assert says in err
+    assert "Traceback" not in err
+
+
+def test_measured__two_mappings_for_three_recordings_are_refused(main, files):
+    code, _, err = main(
+        "measured", "steps", *[files / "up.tdms"] * 3, *["--mapping", files / "rig.toml"] * 2
+    )  # fmt: skip
+    assert code == 2
+    assert "2 for 3 recordings" in err
+
+
+def test_measured_diagram__refuses_a_state_and_a_folder_that_are_not_there(main, files, tmp_path):
+    words = ("measured", "diagram", files / "up.tdms", "--mapping", files / "rig.toml", *FEW)
+    code, _, err = main(*words, "--out", tmp_path / "a.png", "--state", "psi3")
+    assert (code, "unknown state 'psi3'" in err) == (2, True)
+    code, _, err = main(*words, "--out", tmp_path / "gone" / "a.png")
+    assert (code, "no such folder" in err) == (2, True)

@@ -1,0 +1,123 @@
+"""Slow sweeps, other models, single series: measured diagrams beyond steps of the pendulum."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from magpend_core.models import load_model
+from magpend_core.sections import run_branches
+from pipeline.rig.measured.measuring import Way, measure
+from pipeline.rig.measured.overlays import plot_series
+from pipeline.rig.measured.phase import section_phase
+from pipeline.rig.measured.series import series_of
+from pipeline.rig.virtual import DriveSensor, Sensor, Step, record
+from pipeline.spec.problems import SpecError
+
+RIGHT = [0.05208, 0.13572, -3.01085, 3.20903]
+
+
+def test_measure__a_slow_sweep_is_cut_into_windows(pendulum, record_steps):
+    """From 2.46 to 2.56 Hz, 0.2 mHz a period: the right motion's doubling, where it is without noise."""
+    frequencies = np.arange(2.46, 2.56, 2e-4)
+    ds, truth = record_steps(pendulum, [(f, 1) for f in frequencies], RIGHT)
+    found = measure([ds], parameters=pendulum)
+    assert found.sizes["step"] == len(frequencies) // 40
+    middles = frequencies[: found.sizes["step"] * 40].reshape(-1, 40).mean(axis=1)
+    # the recording begins within the first period
+    np.testing.assert_allclose(found["frequency"].values, middles, atol=3e-4)
+    assert set(found["direction"].values) == {"up"}
+    assert set(found["side"].values.tolist()) == {2}
+    sure = found["confidence"].values > 0.8
+    periods, f = found["orbit_period"].values[sure], found["frequency"].values[sure]
+    assert periods[0] == 2
+    assert periods[-1] == 1
+    edge = 0.5 * (f[periods == 2].max() + f[periods == 1].min())
+    # the sweep drags the doubling along, from 2.5 Hz where it is infinitely slow; a window is 8 mHz wide
+    split = np.abs(np.diff([t[0, 0] for t in truth]))
+    ended = frequencies[np.flatnonzero(split > 1e-3)[-1]]
+    assert edge == pytest.approx(ended, abs=0.008)
+
+
+@pytest.mark.parametrize(
+    ("model", "phase"),
+    [("pendulum", 0.0), ("pendulum-sine", 0.0), ("duffing", 0.25), ("double-pendulum", 0.0)],
+)
+def test_section_phase__is_what_the_model_says(model, phase):
+    """The rising edge, the rising zero, the maximum; and a drive that does nothing."""
+    assert section_phase(load_model(model).load(), 1.3) == pytest.approx(phase, abs=1e-4)
+
+
+def test_measure__sections_of_another_model_are_where_it_takes_them():
+    """A hardening Duffing oscillator driven by a cosine: sections at its maximum, against the engine's."""
+    parameters = load_model("duffing").load("hardening")
+    steps = [Step(f, 70) for f in (0.16, 0.18, 0.2)]
+    times = np.arange(0.0, sum(s.duration_s for s in steps) - 0.02, 0.02)
+    sensors = {"x": Sensor(noise=1e-3), "drive": DriveSensor("torque", 1e-3)}
+    ds = record(parameters, steps, [0.1, 0.0], times, sensors=sensors, seed=3)
+    found = measure([ds], Way(transient=45, window_s=0.8), parameters=parameters)
+    assert "side" not in found
+    np.testing.assert_allclose(found["frequency"].values, [0.16, 0.18, 0.2], rtol=1e-4)
+    assert found["orbit_period"].values.tolist() == [1, 1, 1]
+    f = np.array([0.16, 0.18, 0.2])
+    packed = np.broadcast_to(parameters.pack(), (1, 3, len(parameters.names)))
+    exact = run_branches(
+        packed, f[None], np.array([[0.1, 0.0]]), n_transient=65, n_keep=1, rtol=1e-9, atol=1e-9,
+        system=parameters.model.system,
+    ).section[0, :, 0]  # fmt: skip
+    mean = np.nanmean(found["section"].values, axis=1)
+    # a mean of 20 sections, and what is left of the transient
+    np.testing.assert_allclose(mean, exact, atol=6e-3)
+
+
+def test_series_of__the_model_follows_the_rig_from_the_same_state(pendulum, swept):
+    ds = series_of(swept[0][0], pendulum, start_s=30.0, n_periods=5)
+    assert float(ds.attrs["frequency_hz"]) == pytest.approx(2.46, abs=5e-5)
+    assert ds["time"].values[-1] == pytest.approx(5 / 2.46, abs=2e-3)
+    rms = json.loads(ds.attrs["rms"])
+    # the start is known to 0.25 mrad and 50 mrad/s; over 80 ms the latter is 4 mrad, and motions part slowly
+    assert rms["psi1"] < 0.015
+    assert rms["psi2"] < 0.015
+    assert rms["psi1_dot"] < 0.2
+
+
+def test_series_of__another_parameter_is_seen(pendulum, swept):
+    """With 10 % more drive the model leaves the rig's motion."""
+    off = series_of(swept[0][0], pendulum.replace(q=1.1 * pendulum["q"]), start_s=30.0, n_periods=5)
+    own = series_of(swept[0][0], pendulum, start_s=30.0, n_periods=5)
+    ratio = json.loads(off.attrs["rms"])["psi1"] / json.loads(own.attrs["rms"])["psi1"]
+    assert ratio > 3
+
+
+def test_series_of__ends_where_the_frequency_changes(pendulum, swept):
+    """The first step ends after 110 periods; 200 are asked for from the 100th on."""
+    ds = series_of(swept[0][0], pendulum, start_s=99.5 / 2.46, n_periods=200)
+    assert ds["time"].values[-1] == pytest.approx(10 / 2.46, abs=0.5 / 2.46)
+
+
+def test_series_of__what_does_not_fit_is_refused(pendulum, swept):
+    recording = swept[0][0]
+    with pytest.raises(SpecError, match="mapped to the model pendulum, while duffing"):
+        series_of(recording, load_model("duffing").load())
+    with pytest.raises(SpecError, match="psi2, psi2_dot at the start is not known"):
+        series_of(recording.drop_vars("psi2"), pendulum)
+    with pytest.raises(SpecError, match="start_s = 1e\\+06"):
+        series_of(recording, pendulum, start_s=1e6)
+    with pytest.raises(SpecError, match="periods = 0"):
+        series_of(recording, pendulum, n_periods=0)
+    with pytest.raises(SpecError, match="no drive channel"):
+        series_of(recording.drop_vars("drive"), pendulum)
+
+
+@pytest.mark.parametrize("degrees", [False, True])
+def test_plot_series__a_panel_for_each_state_and_portrait(pendulum, swept, degrees):
+    ds = series_of(swept[0][0], pendulum, start_s=30.0, n_periods=3)
+    fig = plot_series(ds, degrees=degrees)
+    assert len(fig.axes) == 6
+    unit = "deg" if degrees else "rad"
+    assert fig.axes[0].get_ylabel().endswith(f"[{unit}]")
+    gids = [line.get_gid() for line in fig.axes[0].lines]
+    assert gids == ["series:psi1", "series:psi1_computed"]
+    assert fig.legends[0].get_texts()[0].get_text() == "simulated rig"

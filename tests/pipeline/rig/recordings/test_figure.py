@@ -1,0 +1,105 @@
+"""The figure of a recording shows its samples, its pieces and its findings; the tables count them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.plots import style
+from pipeline.rig.recordings import recording_of, smooth
+from pipeline.rig.recordings.figure import MOST_DOTS, plot_recording
+from pipeline.rig.recordings.mapping import parse_mapping
+from pipeline.rig.recordings.overview import describe_file, describe_recording
+
+
+def line_of(figure, name):
+    (line,) = [x for ax in figure.axes for x in ax.lines if x.get_gid() == f"recording-{name}"]
+    return line
+
+
+def texts_of(figure):
+    return [t.get_text() for legend in figure.legends for t in legend.get_texts()]
+
+
+@pytest.fixture
+def broken(make):
+    """Two pieces, samples that are none, and a drive."""
+    a, b = make.swing()
+    a[100:120] = np.nan
+    stamps = make.time + 0.5 * (make.time > 2.0)
+    mapping = parse_mapping({
+        "model": "pendulum", "time": {"channel": "t"}, "drive": {"channel": "m", "kind": "torque"},
+        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+    })  # fmt: skip
+    columns = {"t": stamps, "a": a, "b": b, "m": np.cos(3.0 * make.time)}
+    return recording_of(make.raw(make.channels(columns, step_s=np.nan)), mapping)
+
+
+def test_plot_recording__draws_what_was_measured(broken):
+    figure = plot_recording(broken)
+    assert len(figure.axes) == 2
+    assert [ax.get_ylabel() for ax in figure.axes] == [r"$\psi_1$, $\psi_2$ [rad]", "drive [N m]"]
+    drawn = line_of(figure, "psi2").get_ydata()
+    np.testing.assert_array_equal(drawn[np.isfinite(drawn)], broken["psi2"])
+    assert np.isnan(drawn).sum() == 1  # the gap
+    assert figure.data is broken
+
+
+def test_plot_recording__marks_what_was_found(broken):
+    figure = plot_recording(broken)
+    angles, drive = figure.axes
+    assert texts_of(figure)[-2:] == ["gap", "missing"]
+    assert len(angles.patches) == 2
+    assert len(drive.patches) == 1  # the missing samples are those of an angle
+    assert "simulated" not in angles.get_title(loc="left")
+
+
+def test_plot_recording__smoothed_has_a_panel_of_rates(broken):
+    figure = plot_recording(smooth(broken))
+    assert figure.axes[1].get_ylabel() == r"$\dot{\psi}_1$, $\dot{\psi}_2$ [rad/s]"
+
+
+def test_plot_recording__long_recordings_keep_their_extremes(make):
+    n = 50_000
+    a, b = make.swing(n)
+    a[33_333] = 9.0
+    figure = plot_recording(make.recorded(a, b))
+    drawn = line_of(figure, "psi1").get_ydata()
+    assert drawn.max() == 9.0
+    assert drawn.min() == a.min()
+    assert len(drawn) <= 1.1 * MOST_DOTS
+
+
+def test_plot_recording__says_that_it_is_simulated(make):
+    figure = plot_recording(make.recorded().assign_attrs(simulated=1), frame=style.Frame(85.0))
+    assert "simulated" in figure.axes[0].get_title(loc="left")
+
+
+def test_describe_recording__counts(broken):
+    quantities, findings = describe_recording(broken)
+    rows = {row["quantity"]: row for row in quantities.rows}
+    assert rows["psi1"]["not_measured"] == 20
+    assert rows["psi2"]["greatest"] == float(broken["psi2"].max())
+    assert np.isnan(rows["drive"]["noise"])
+    assert [row["kind"] for row in findings.rows] == ["gap", "missing"]
+    assert "3.998" not in quantities.lines[0]
+    assert "in 2 pieces" in quantities.lines[0]
+
+
+def test_describe_recording__findings_of_one_kind_share_a_line(make):
+    a, _ = make.swing()
+    _, findings = describe_recording(make.recorded(np.clip(a, -0.9, 0.9), range=[-0.9, 0.9]))
+    assert len(findings.rows) > 2
+    (line,) = findings.lines
+    assert line.startswith(f"warning: saturated of psi1 ({len(findings.rows)} times, first at ")
+
+
+def test_describe_file__lists_stretches_and_empty_fields(make):
+    a, b = make.swing()
+    a[3] = np.nan
+    halves = [make.channels({"a": a[s], "b": b[s]}) for s in (slice(0, 800), slice(800, None))]
+    table = describe_file(make.raw(*halves))
+    assert table.lines[0].endswith("2 channels in 2 stretches")
+    assert table.rows[0]["no_numbers"] == 1
+    assert table.rows[1]["samples"] == 2000
+    assert table.rows[1]["sampling_rate_hz"] == 500.0
