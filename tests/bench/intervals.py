@@ -14,8 +14,8 @@ import numpy as np
 from magpend_core.models import load_model
 from pipeline.rig.identify.build import pieces_of
 from pipeline.rig.identify.linearise import linearise
-from pipeline.rig.identify.local import fit_local
 from pipeline.rig.identify.problem import Free, Problem
+from pipeline.rig.identify.search import refine
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.rig.identify.statistics import covariance_of
 from pipeline.rig.recordings import smooth
@@ -25,7 +25,7 @@ MODEL = load_model("double-pendulum")
 TRUTH = MODEL.load(None, T1=4e-4, T2=2e-4, c1=2e-4, c2=2e-5, k1=0.03, k2=0.01, eps=50.0)
 UNKNOWN = ("l1", "e1", "J1", "J2", "T1", "T2", "c1", "c2", "k1", "k2")
 SENSOR = Sensor("potentiometer", noise=2e-3, bits=12, dead_band=0.15)
-N_PIECES, LENGTH_S, RATE_HZ = 10, 2.0, 200.0
+N_PIECES, LENGTH_S, RATE_HZ = 12, 1.5, 200.0
 CHANNELS = MODEL.angles
 
 
@@ -65,7 +65,7 @@ def outcome(seed: int) -> Outcome:
         If the fit did not converge.
     """
     problem = problem_of(seed)
-    fit = fit_local(problem, problem.start)
+    fit = refine(problem, problem.start)
     if not fit.converged:
         raise ArithmeticError(f"seed {seed}: {fit.message}")
     covariance = covariance_of(linearise(problem, fit), np.array([TRUTH[name] for name in UNKNOWN]))

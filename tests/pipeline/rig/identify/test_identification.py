@@ -341,3 +341,36 @@ def test_identify__what_the_model_lacks_is_found_in_the_residuals(without_cubic)
     assert "the residuals are autocorrelated" in result["covariance"]["why"]
     assert result["covariance"]["estimator"] == "newey-west"
     assert result["covariance"]["n_effective"]["x"] < 0.3 * result["covariance"]["n_samples"]
+
+
+def test_check__long_pieces_of_other_numbers_and_lengths(bench, tmp_path):
+    """Starts are found over stretches that grow; one short piece and two long ones, each its own length."""
+    folder, _, _ = bench
+    parts = []
+    for k, (seed, n) in enumerate([(11, 40), (12, 700), (13, 1000)]):
+        write_ringdowns(tmp_path / "one.csv", seed, n_pieces=1, n=n)
+        rows = (tmp_path / "one.csv").read_text().split()[1:]
+        parts += [f"{float(r.split(',')[0]) + 200 * k:.3f},{r.split(',')[1]}" for r in rows]
+    (tmp_path / "long.csv").write_text("\n".join(["time,x", *parts]) + "\n")
+    found = checking.check(folder / "out", tmp_path / "long.csv")
+    assert len(found["pieces"]) == 3
+    for piece in found["pieces"]:
+        assert piece["rms"]["x"] == pytest.approx(NOISE, rel=0.25)
+
+
+def test_judge__a_piece_that_went_astray_is_found_alone(bench):
+    """A first guess of a start that is off by much: the others do not suffer."""
+    from dataclasses import replace
+
+    from pipeline.rig.identify.build import build, read_all
+    from pipeline.rig.identify.judging import judge
+    from pipeline.rig.identify.specification import load_identification
+
+    folder, result, _ = bench
+    spec = load_identification(folder / "spec.toml")
+    problem = build(spec, read_all(spec)).problem
+    far = replace(problem.pieces[1], start=np.array([-4.0, 9.0]))
+    pieces = [problem.pieces[0], far, problem.pieces[2]]
+    judged, fit = judge(problem, result["values"], result["zeros"], pieces)
+    assert fit.converged
+    assert judged.rms["x"] == pytest.approx(NOISE, rel=0.15)
