@@ -4,6 +4,7 @@ import importlib
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 TINY = ["--trajectories", "8", "--periods", "1", "--rounds", "1"]
@@ -106,3 +107,14 @@ def test_intervals__hold_the_truth(bench):
     assert share.mean() >= 0.9
     assert found[0].n_missing > 0
     assert {o.estimator for o in found} <= {"white", "pieces"}
+
+
+def test_identification__compares_the_same_residuals(bench, capsys):
+    identification = bench("identification")
+    problem = identification.shipped_problem(2)
+    apart = np.abs(identification.by_scipy(problem) - identification.by_lanes(problem)) * problem.noise.max()
+    assert apart.max() < 1e-4
+    identification.main(["--rounds", "1", "--pieces", "1"])
+    printed = capsys.readouterr().out
+    for name in ("solve_ivp", "variational equations", "normal matrices"):
+        assert name in printed

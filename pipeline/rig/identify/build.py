@@ -166,7 +166,7 @@ def drive_problems(
     kinds = {table.drive for table in tables}
     if {"edges", "recorded"} <= kinds:
         problems.append(
-            f'{where}: drive = "edges" cannot stand beside "recorded" in one identification; take one of them '
+            f'{where}: drive = "edges" cannot stand beside "recorded" in one identification; take '
             "one of them for all driven recordings."
         )
     if "edges" in kinds:
