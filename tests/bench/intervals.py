@@ -49,8 +49,8 @@ def problem_of(seed: int) -> Problem:
         start = [*rng.uniform(-1.8, 1.8, 1), *rng.uniform(-2.9, 2.9, 1), *rng.uniform(-3.0, 3.0, 2)]
         ds = record(TRUTH, None, start, times, sensors=dict.fromkeys(CHANNELS, SENSOR), seed=100 * seed + k)
         pieces += pieces_of(MODEL, CHANNELS, (ds, smooth(ds)), table, k)
-    lower = {name: -np.inf if name in ("c1", "c2") else 0.0 for name in UNKNOWN}
-    free = tuple(Free(name, 1.02 * TRUTH[name], lower[name], np.inf) for name in UNKNOWN)
+    lower = {name: -3 * TRUTH[name] if name in ("c1", "c2") else 0.0 for name in UNKNOWN}
+    free = tuple(Free(name, 1.1 * TRUTH[name], lower[name], 5 * TRUTH[name]) for name in UNKNOWN)
     return Problem(
         model=MODEL, fixed=TRUTH, free=free, channels=CHANNELS, pieces=tuple(pieces), noise=np.full(2, 2e-3)
     )

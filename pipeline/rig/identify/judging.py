@@ -11,16 +11,11 @@ import numpy as np
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.problem import Piece, Problem
 from pipeline.rig.identify.search import slowest_period
+from pipeline.rig.identify.starts import fit_starts
 
 FIRST_PERIODS = 0.7
-"""Of the slowest oscillation, over which starts are fitted first. The stretch is doubled until pieces are whole:
-a long piece forgives no bad guess."""
-
-LOOSELY = 1e-5
-"""Tolerance over stretches."""
-
-BAD = 5.0
-"""A piece whose root mean square is so many times the median is tried alone once more."""
+"""Of the slowest oscillation, over which starts are fitted first; then twice that, and so on up to the piece: a
+long piece forgives no bad guess."""
 
 
 @dataclass(frozen=True)
@@ -124,34 +119,13 @@ def judge(
         Of the starts; whether it converged counts.
     """
     known = known_problem(problem, values, zeros, pieces)
-    fit = _fit_starts(known)
-    sizes = [float(np.sqrt(np.nanmean((r / problem.noise) ** 2))) for r in fit.residuals]
-    bad = [k for k, size in enumerate(sizes) if not size <= BAD * float(np.median(sizes))]
-    if len(pieces) > 1 and (bad or not fit.converged):
-        # one piece that went astray keeps the others from their optimum, and is found by itself, if at all
-        starts = fit.starts.copy()
-        for k in bad if fit.converged else range(len(pieces)):
-            alone = _fit_starts(replace(known, pieces=(known.pieces[k],)))
-            if alone.cost < _cost(fit.residuals[k], problem.noise):
-                starts[k] = alone.starts[0]
-        fit = fit_local(known, np.zeros(0), starts=starts)
-    return Judgement(problem.channels, tuple(pieces), fit.residuals), fit
-
-
-def _cost(residuals: np.ndarray, noise: np.ndarray) -> float:
-    cost = 0.5 * float(np.nansum((residuals / noise) ** 2))
-    return cost if np.isfinite(residuals).any() else np.inf
-
-
-def _fit_starts(known: Problem) -> Fit:
-    """Fit the starts over stretches that are doubled until they are the pieces."""
     longest = max(float(p.time[-1]) for p in known.pieces)
     length, starts = FIRST_PERIODS * slowest_period(known), known.starts
     while length < longest:
-        fit = fit_local(_beginning(known, length), np.zeros(0), starts=starts, tolerance=LOOSELY)
-        starts = np.where(np.isfinite(fit.starts), fit.starts, starts)
+        starts = fit_starts(_beginning(known, length), np.zeros(0), starts)
         length *= 2
-    return fit_local(known, np.zeros(0), starts=starts)
+    fit = fit_local(known, np.zeros(0), starts=fit_starts(known, np.zeros(0), starts))
+    return Judgement(problem.channels, tuple(pieces), fit.residuals), fit
 
 
 def _beginning(problem: Problem, length_s: float) -> Problem:

@@ -42,19 +42,15 @@ def forced():
     return parameters, ds
 
 
-@pytest.fixture(scope="module")
-def switched():
-    """A pendulum under a square wave of two frequencies, whose switching was measured."""
+CHANNELS = ("psi1", "psi2")
+
+
+def switched(steps, sensor, rate_hz):
+    """A pendulum under a square wave, whose switching was measured."""
     parameters = load_model("pendulum-free").load(None)
-    ds = record(
-        parameters, [Step(1.3, 5, {"duty_cycle": 0.45}), Step(1.5, 8, {"duty_cycle": 0.52})],
-        [0.1, 0.0, 0.0, 0.0], 0.002 * np.arange(4400),
-        sensors={
-            "psi1": Sensor(noise=NOISE), "psi2": Sensor(noise=NOISE), "drive": DriveSensor("signal", 0.02),
-        },
-        seed=4,
-    )  # fmt: skip
-    return parameters, ds
+    sensors = {**dict.fromkeys(CHANNELS, Sensor(noise=NOISE)), "drive": sensor}
+    times = np.arange(int(8.0 * rate_hz)) / rate_hz
+    return parameters, record(parameters, steps, [0.1, 0.0, 0.0, 0.0], times, sensors=sensors, seed=4)
 
 
 def test_pieces_of__a_recorded_torque_drives_the_model(forced):
@@ -68,22 +64,37 @@ def test_pieces_of__a_recorded_torque_drives_the_model(forced):
     assert judged.rms["x"] == pytest.approx(NOISE, rel=0.05)
 
 
-@pytest.mark.parametrize("piece_s", [None, 2.5])
-def test_pieces_of__measured_edges_drive_the_model(switched, piece_s):
-    """Two frequencies and duty cycles, neither of them stated anywhere but in the drive's signal."""
-    parameters, ds = switched
-    channels = ("psi1", "psi2")
-    options = {} if piece_s is None else {"piece_s": piece_s}
-    pieces = b.pieces_of(parameters.model, channels, (ds, smooth(ds)), table(drive="edges", **options), 0)
+@pytest.mark.parametrize(
+    ("steps", "sensor", "rate_hz"),
+    [
+        # one frequency: edges between samples of 2 ms are known by the line through all of them
+        ([Step(1.3, 12, {"duty_cycle": 0.45})], DriveSensor("signal", 0.02), 500.0),
+        # two frequencies and duty cycles: samples lie on the torque's flanks
+        (
+            [Step(1.3, 5, {"duty_cycle": 0.45}), Step(1.5, 8, {"duty_cycle": 0.52})],
+            DriveSensor("torque"),
+            2000.0,
+        ),
+    ],
+)
+def test_pieces_of__measured_edges_drive_the_model(steps, sensor, rate_hz):
+    """The drive is stated nowhere but in its own channel; with it the noise is nearly all that is left."""
+    parameters, ds = switched(steps, sensor, rate_hz)
+    pieces = b.pieces_of(parameters.model, CHANNELS, (ds, smooth(ds)), table(drive="edges", piece_s=3.0), 0)
     # nothing is known of the drive before its first rising edge and after its last
-    assert sum(len(p.time) for p in pieces) < len(ds["time"])
-    judged, fit = judge(problem_of(parameters, channels, pieces), {}, {}, pieces)
+    assert 0.7 * len(ds["time"]) < sum(len(p.time) for p in pieces) < len(ds["time"])
+    judged, fit = judge(problem_of(parameters, CHANNELS, pieces), {}, {}, pieces)
     assert fit.converged
-    # edges are known to a fraction of a sample of 2 ms
-    assert max(judged.rms.values()) < 1.3 * NOISE
-    late = [replace(p, drive=replace(p.drive, start_s=p.drive.start_s + 0.02)) for p in pieces]
-    shifted, _ = judge(problem_of(parameters, channels, late), {}, {}, late)
+    assert max(judged.rms.values()) < 1.15 * NOISE
+    late = [replace(p, drive=_later(p.drive, 0.01)) for p in pieces]
+    shifted, _ = judge(problem_of(parameters, CHANNELS, late), {}, {}, late)
     assert max(shifted.rms.values()) > 2 * NOISE
+
+
+def _later(drive, by_s):
+    longer = drive.durations_s.copy()
+    longer[-1] += by_s
+    return replace(drive, durations_s=longer, start_s=drive.start_s + by_s)
 
 
 def test_pieces_of__without_a_torque_beside_recordings_with_one():
