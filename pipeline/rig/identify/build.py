@@ -393,8 +393,9 @@ def _steadied(edges: Edges) -> Edges:
     period = 1.0 / timing.frequency_hz
     number = np.round((edges.rising - edges.rising[0]) / period)
     first = float(np.mean(edges.rising - period * number))
-    rising = first + period * np.arange(int(number[-1]) + 1)
-    return Edges(rising, rising[:-1] + timing.duty_cycle * period, edges.resolution_s)
+    rising = np.asarray(first + period * np.arange(int(number[-1]) + 1), np.float64)
+    falling = np.asarray(rising[:-1] + timing.duty_cycle * period, np.float64)
+    return Edges(rising, falling, edges.resolution_s)
 
 
 def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:

@@ -14,8 +14,8 @@ from pipeline.rig.identify.search import slowest_period
 from pipeline.rig.identify.starts import fit_starts
 
 FIRST_PERIODS = 0.7
-"""Of the slowest oscillation, over which starts are fitted first; then twice that, and so on up to the piece: a
-long piece forgives no bad guess."""
+"""Of the slowest oscillation, over which starts are fitted first; then twice that, and so on up to the piece.
+A long piece forgives no bad guess."""
 
 
 @dataclass(frozen=True)

@@ -175,8 +175,8 @@ def refine(
 ) -> Fit:
     """Fit from one first guess: short stretches, longer ones, whole pieces with free starts.
 
-    Noise in starts that are read off leads short stretches astray where a parameter hardly matters in them, so
-    that whole pieces with starts of their own decide from which stretches' outcome the last fit begins.
+    Noise in starts that are read off leads short stretches astray where a parameter hardly matters in them.
+    So whole pieces, with starts of their own, decide from which stretches' outcome the last fit begins.
     """
     candidates = [np.clip(theta, problem.lower, problem.upper)]
     for stage in _stages(problem) if stages is None else stages:
