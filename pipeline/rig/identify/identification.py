@@ -26,6 +26,7 @@ from pipeline.rig.identify.profiles import Curvature, Profile, following, profil
 from pipeline.rig.identify.search import search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
 from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
+from pipeline.runs.run import stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.files import FIGURES, local_path, writer_lock
@@ -72,6 +73,8 @@ def identify(
         data cannot see.
     NotConvergedError
         If no start converged. The outcomes stay, a result is not written.
+    InterruptedRunError
+        After Ctrl-C or SIGTERM. The outcomes stay.
     """
     path = find_spec(spec)
     parsed = load_identification(path)
@@ -86,7 +89,8 @@ def identify(
             echo(f"{folder} is complete; nothing to do.")
             return store.read_result(folder)
         outcomes = Outcomes(folder / store.OUTCOMES)
-        found = find(parsed, built, outcomes, echo)
+        with stoppable(folder):
+            found = find(parsed, built, outcomes, echo)
         if outcomes.recalled:
             echo(f"{outcomes.recalled} outcomes were there before")
         return _write(folder, parsed, found, sources, info.digest, figures, built.simulated)

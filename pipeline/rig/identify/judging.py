@@ -44,7 +44,10 @@ class Judgement:
         return self._rms([self.residuals[k]])
 
     def _rms(self, residuals: Sequence[np.ndarray]) -> dict[str, float]:
-        mean = np.nanmean(np.concatenate(residuals) ** 2, axis=0)
+        stacked = np.concatenate(residuals)
+        count = np.isfinite(stacked).sum(axis=0)
+        with np.errstate(invalid="ignore"):
+            mean = np.nansum(stacked**2, axis=0) / count
         return dict(zip(self.channels, np.sqrt(mean).tolist(), strict=True))
 
     @property
@@ -55,19 +58,25 @@ class Judgement:
         return {name: _pearson(measured[:, c], computed[:, c]) for c, name in enumerate(self.channels)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data: both criteria, and the root mean squares of each piece."""
+        """Plain data: both criteria, the root mean squares of each piece; None for what is not defined."""
         return {
-            "rms": self.rms,
-            "correlation": self.correlation,
+            "rms": _known(self.rms),
+            "correlation": _known(self.correlation),
             "pieces": [
-                {"recording": p.recording, "piece": p.number, "rms": self.rms_of(k)}
+                {"recording": p.recording, "piece": p.number, "rms": _known(self.rms_of(k))}
                 for k, p in enumerate(self.pieces)
             ],
         }
 
 
+def _known(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: value if np.isfinite(value) else None for name, value in values.items()}
+
+
 def _pearson(x: np.ndarray, y: np.ndarray) -> float:
     known = np.isfinite(x) & np.isfinite(y)
+    if not known.any():
+        return float("nan")
     x, y = x[known] - x[known].mean(), y[known] - y[known].mean()
     size = float(np.sqrt((x @ x) * (y @ y)))
     return float(x @ y / size) if size > 0 else float("nan")

@@ -260,7 +260,12 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
 
 def judgement_lines(judged: Mapping[str, Any], units: Mapping[str, str]) -> list[str]:
     """Both criteria, a line for each channel."""
-    return [
-        f"{name}: root mean square {rms:.4g} {units[name]}, correlation {judged['correlation'][name]:.6f}"
-        for name, rms in judged["rms"].items()
-    ]
+    lines = []
+    for name, rms in judged["rms"].items():
+        shown = "-" if rms is None else f"{rms:.4g} {units[name]}"
+        correlation = judged["correlation"][name]
+        lines.append(
+            f"{name}: root mean square {shown}, correlation "
+            + ("-" if correlation is None else f"{correlation:.6f}")
+        )
+    return lines

@@ -374,3 +374,28 @@ def test_judge__a_piece_that_went_astray_is_found_alone(bench):
     judged, fit = judge(problem, result["values"], result["zeros"], pieces)
     assert fit.converged
     assert judged.rms["x"] == pytest.approx(NOISE, rel=0.15)
+
+
+def test_identify__stopped_by_a_signal_says_so(bench, tmp_path, start):
+    folder, _, _ = bench
+    process = start("identify", folder / "spec.toml", "--out", tmp_path / "out")
+    deadline = time.monotonic() + 120
+    while not list((tmp_path / "out").glob("outcomes/start-*.npz")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 143
+    assert "the same command goes on from there" in err
+
+
+def test_judgement__without_a_spread_has_no_correlation():
+    from pipeline.rig.identify.judging import Judgement
+    from pipeline.rig.identify.problem import Piece
+
+    measured = np.column_stack([np.ones(5), np.arange(5.0), np.full(5, np.nan)])
+    piece = Piece(0, 0, np.arange(5.0), measured, np.zeros(2))
+    judged = Judgement(("a", "b", "c"), (piece,), (0.1 * measured,)).as_dict()
+    assert judged["correlation"]["a"] is None
+    assert judged["correlation"]["b"] == pytest.approx(1.0)
+    assert judged["rms"]["a"] == pytest.approx(0.1)
+    assert judged["rms"]["c"] is None
