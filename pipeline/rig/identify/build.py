@@ -16,7 +16,7 @@ from pipeline.rig.edges import Edges, find_edges
 from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
 from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
-from pipeline.rig.recordings import load_mapping, read_recording, smooth
+from pipeline.rig.recordings import findings_of, load_mapping, read_recording, smooth
 from pipeline.spec.problems import SpecError
 
 FEWEST_SAMPLES = 12
@@ -42,11 +42,14 @@ class Built:
         Judged afterwards, their starts alone refitted.
     simulated : bool
         Whether any of the recordings is simulated.
+    findings : tuple of tuple of str
+        What was found in each recording, a sentence each, notes left out.
     """
 
     problem: Problem
     held_out: tuple[Piece, ...]
     simulated: bool = False
+    findings: tuple[tuple[str, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,12 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         recorded=any(t.drive == "recorded" for t in spec.recordings),
     )  # fmt: skip
     simulated = any(bool(ds.attrs.get("simulated")) for ds in recordings)
-    return Built(problem, tuple(replace(p, follows=-1) for p in held), simulated)
+    said = tuple(
+        tuple(f"{f.severity}: {f.kind} of {f.channel or 'all channels'}: {f.text}" for f in findings_of(ds)
+              if f.severity != "note")
+        for ds in recordings
+    )  # fmt: skip
+    return Built(problem, tuple(replace(p, follows=-1) for p in held), simulated, said)
 
 
 def channels_of(

@@ -189,6 +189,22 @@ def test_identify__another_specification_is_refused(bench):
         identification.identify(folder / "changed.toml", folder / "out", echo=lambda _: None)
 
 
+def test_identify__says_what_is_wrong_with_a_recording(bench):
+    """Three gaps: a warning or a note each, nothing that makes the numbers wrong."""
+    _, result, lines = bench
+    said = result["recordings"][0]["findings"]
+    assert all(line in "\n".join(lines) for line in said)
+    assert not any("error" in line for line in said)
+
+
+def test_result__an_error_in_a_recording_is_a_warning_of_the_result():
+    from pipeline.rig.identify.reports import _errors
+
+    source = d.Source("a.csv", "", "")
+    found = _errors([source], [["warning: gap of x: none", "error: wrap of x: it jumps by a turn"]])
+    assert found == ["a.csv has an error: wrap of x: it jumps by a turn"]
+
+
 def test_check__refits_the_starts_alone(bench):
     folder, result, _ = bench
     found = checking.check(folder / "out", folder / "other.csv")
