@@ -415,3 +415,52 @@ def test_judgement__without_a_spread_has_no_correlation():
     assert judged["correlation"]["b"] == pytest.approx(1.0)
     assert judged["rms"]["a"] == pytest.approx(0.1)
     assert judged["rms"]["c"] is None
+
+
+def test_identify__outliers_under_a_robust_loss(bench, tmp_path):
+    """One sample in forty is off by a hundred times the noise: that leads least squares alone astray."""
+    folder, _, _ = bench
+    rng = np.random.default_rng(8)
+    rows = [line.split(",") for line in (folder / "ringdown.csv").read_text().split()[1:]]
+    for i in rng.choice(len(rows), len(rows) // 40, replace=False):
+        rows[i][1] = str(float(rows[i][1]) + 100 * NOISE * rng.choice([-1, 1]))
+    (tmp_path / "ringdown.csv").write_text("\n".join(["time,x", *(",".join(r) for r in rows)]) + "\n")
+    (tmp_path / "ringdown.toml").write_text(MAPPING)
+    text = SPEC.replace("n_starts = 3", "n_starts = 1").replace("n_samples = 8\n", "")
+    found = {}
+    for loss in ("linear", "cauchy"):
+        (tmp_path / "spec.toml").write_text(f'{text}[fit]\nloss = "{loss}"\nnoise = {{ x = {NOISE} }}\n')
+        found[loss] = identification.identify(
+            tmp_path / "spec.toml", tmp_path / loss, figures=False, echo=lambda _: None
+        )
+    errors = {loss: abs(r["values"]["linear"] - TRUTH["linear"]) for loss, r in found.items()}
+    assert errors["cauchy"] < errors["linear"]
+    assert found["cauchy"]["covariance"]["estimator"] == "newey-west"
+    low, high = found["cauchy"]["estimates"]["linear"]["interval"]
+    assert low - 0.5 * (high - low) < TRUTH["linear"] < high + 0.5 * (high - low)
+    # the profile of the loss, against the standard error of its scores
+    profile_low, profile_high = found["cauchy"]["estimates"]["linear"]["profile_interval"]
+    assert profile_high - profile_low == pytest.approx(high - low, rel=0.3)
+    wide = np.diff(found["linear"]["estimates"]["linear"]["interval"])
+    assert high - low < 0.5 * wide
+
+
+def test_identify__stretches_with_a_price_on_their_gaps(bench, tmp_path):
+    """Gaps that cost take freedom from the starts: intervals are those of whole pieces, or nearly."""
+    folder, whole, _ = bench
+    text = SPEC.replace("hold_out = [2]", "piece_s = 4.0")
+    text = text.replace("n_starts = 3", "n_starts = 1\nprofiles = false").replace("n_samples = 8\n", "")
+    width = {}
+    for name, price in (("free", '"free"'), ("joined", "1000.0")):
+        (folder / f"{name}.toml").write_text(f"{text}[fit]\ncontinuity = {price}\n")
+        result = identification.identify(
+            folder / f"{name}.toml", tmp_path / name, figures=False, echo=lambda _: None
+        )
+        assert len(result["pieces"]) == 16
+        low, high = result["estimates"]["linear"]["interval"]
+        assert low - 0.5 * (high - low) < TRUTH["linear"] < high + 0.5 * (high - low)
+        width[name] = high - low
+    low, high = whole["estimates"]["linear"]["interval"]
+    assert width["joined"] < 0.6 * width["free"]
+    # four pieces instead of the three that were fitted whole
+    assert width["joined"] == pytest.approx((high - low) * np.sqrt(3 / 4), rel=0.35)
