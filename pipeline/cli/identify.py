@@ -97,7 +97,10 @@ def check(
     for line in judgement_lines(found, found["units"]):
         console.result(line)
     for piece in found["pieces"]:
-        values = ", ".join(f"{name} {rms:.4g} {found['units'][name]}" for name, rms in piece["rms"].items())
+        values = ", ".join(
+            f"{name} {'-' if rms is None else format(rms, '.4g')} {found['units'][name]}"
+            for name, rms in piece["rms"].items()
+        )
         console.result(f"piece {piece['piece']}: {values}")
 
 

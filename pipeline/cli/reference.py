@@ -143,7 +143,7 @@ def workflows() -> str:
 
 def specification() -> str:
     """Keys of a specification, table by table."""
-    from pipeline.spec import starts, tables
+    from pipeline.spec import recorded, starts, tables
 
     parts = [
         ("[parameters]", tables.ParametersTable, ""),
@@ -160,6 +160,11 @@ def specification() -> str:
             _STATES.format("a number or [low, high]"),
         ),
         ("[continuation]", tables.Continuation, 'For `kind = "continuation"` alone.'),
+        (
+            "[drive]",
+            recorded.DriveTable,
+            'For `kind = "sweep"` alone: see [Recorded drives](../rig.md#recorded-drives).',
+        ),
         ("[integration]", tables.Integration, ""),
         ("[execution]", tables.Execution, "Decides the layout of the store, never the numbers."),
     ]
@@ -203,7 +208,7 @@ def mapping() -> str:
         _keys("MAPPING.toml", found.Mapping, "", top),
         _keys("time = {...}", found.TimeMap, "", ()),
         _keys("piece = {...}", found.PieceMap, "", ()),
-        _keys("[channels.NAME]", found.ChannelMap, "NAME is a state of the model.", ()),
+        _keys("[channels.NAME]", found.ChannelMap, "NAME is a state of the model, or a quantity.", ()),
         _keys("[drive]", found.DriveMap, 'Or `drive = "none"`.', ()),
         _keys("[csv]", found.CsvMap, "For CSV files alone; what is not stated is found out.", ()),
     ]
@@ -224,6 +229,7 @@ def virtual_rig() -> str:
     parts = [
         _keys("RIG.toml", simulation.RigTable, "", ("drive", "sensors")),
         _keys("[drive]", simulation.DriveTable, 'Or `drive = "none"`.', ()),
+        _keys("sweep = {...}", simulation.SweepTable, "In `[drive]`.", ()),
         _keys("[sensors.STATE]", simulation.SensorTable, "", ()),
     ]
     return "\n\n".join(parts)

@@ -97,7 +97,7 @@ def run(
     check(directory, identity)
     with writer_lock(directory):
         info = establish(directory, parsed, plan, identity, path.read_text("utf-8"), echo)
-        with _stoppable(directory):
+        with stoppable(directory):
             _complete(info, parsed, plan, workers, scheduler, echo)
     return state(directory)
 
@@ -156,8 +156,14 @@ def _require_all(info: RunInfo, plan: Plan) -> None:
 
 
 @contextlib.contextmanager
-def _stoppable(directory: Path) -> Iterator[None]:
-    """Turn Ctrl-C and SIGTERM into `InterruptedRunError`, after everything inside has been closed."""
+def stoppable(directory: Path) -> Iterator[None]:
+    """Turn Ctrl-C and SIGTERM into `InterruptedRunError`, after everything inside has been closed.
+
+    Parameters
+    ----------
+    directory
+        Where what has been done is kept, for the message.
+    """
 
     def stop(number: int, frame: Any) -> None:
         raise _Terminated

@@ -100,11 +100,12 @@ def test_tangents__prints_a_ratio_for_each_number_of_exponents(bench, capsys):
         assert name in printed
 
 
-def test_coverage__intervals_hold_the_truth(bench):
-    """A few seeds; the bench takes hundreds. Of 80 intervals of 95 %, 8 or more miss in 1 of 30 draws."""
-    coverage = bench("coverage")
-    share, found = coverage.coverage(8)
-    assert share.mean() >= 0.9
+def test_intervals__hold_the_truth(bench):
+    """A few seeds; the bench takes hundreds. Intervals too narrow by a half would hold it in 70 % of them."""
+    intervals = bench("intervals")
+    share, found = intervals.coverage(8)
+    # of 80 intervals of 95 %, those of a seed going together
+    assert share.mean() >= 0.8
     assert found[0].n_missing > 0
     assert {o.estimator for o in found} <= {"white", "pieces"}
 

@@ -12,11 +12,11 @@ import xarray as xr
 
 from magpend_core.models.model import Model
 from magpend_core.sampling import Drive
-from pipeline.rig.edges import find_edges
+from pipeline.rig.edges import Edges, find_edges
 from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
 from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
-from pipeline.rig.recordings import load_mapping, read_recording, smooth
+from pipeline.rig.recordings import findings_of, load_mapping, read_recording, smooth
 from pipeline.spec.problems import SpecError
 
 FEWEST_SAMPLES = 12
@@ -24,6 +24,9 @@ FEWEST_SAMPLES = 12
 
 DRIVE = "drive"
 DUTY = "duty_cycle"
+MOST_ROUNDING = 0.45
+"""Scatter of edges, in samples, that rounding to samples makes: evenly spread over one, 0.29."""
+
 LEAST_NOISE = 1e-6
 """Noise is taken as at least this share of a channel's spread: simulated recordings may have none."""
 
@@ -39,11 +42,14 @@ class Built:
         Judged afterwards, their starts alone refitted.
     simulated : bool
         Whether any of the recordings is simulated.
+    findings : tuple of tuple of str
+        What was found in each recording, a sentence each, notes left out.
     """
 
     problem: Problem
     held_out: tuple[Piece, ...]
     simulated: bool = False
+    findings: tuple[tuple[str, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -116,7 +122,12 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         recorded=any(t.drive == "recorded" for t in spec.recordings),
     )  # fmt: skip
     simulated = any(bool(ds.attrs.get("simulated")) for ds in recordings)
-    return Built(problem, tuple(replace(p, follows=-1) for p in held), simulated)
+    said = tuple(
+        tuple(f"{f.severity}: {f.kind} of {f.channel or 'all channels'}: {f.text}" for f in findings_of(ds)
+              if f.severity != "note")
+        for ds in recordings
+    )  # fmt: skip
+    return Built(problem, tuple(replace(p, follows=-1) for p in held), simulated, said)
 
 
 def channels_of(
@@ -362,7 +373,7 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
         if len(covered) < 2:
             raise SpecError(["its drive channel has no values; map another channel."])
         return _Driven(Drive.from_torque(covered, level[known]), float(covered[0]), float(covered[-1]))
-    edges = find_edges(time, level)
+    edges = _steadied(find_edges(time, level))
     rising = edges.rising
     falling = np.array([edges.falling[edges.falling > r][:1] for r in rising[:-1]], dtype=object)
     if len(rising) < 2 or any(len(f) != 1 or f[0] >= r for f, r in zip(falling, rising[1:], strict=True)):
@@ -372,6 +383,27 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
         ])  # fmt: skip
     flat = np.array([float(f[0]) for f in falling])
     return _Driven(Drive.from_edges(rising, flat, name=DUTY), float(rising[0]), float(rising[-1]))
+
+
+def _steadied(edges: Edges) -> Edges:
+    """Edges on the line through them, if they scatter about it by no more than sampling hides.
+
+    An edge between two samples is known to half of their distance; a line through many is known far better.
+    """
+    if not edges.resolution_s:
+        return edges
+    try:
+        timing = edges.frequency()
+    except SpecError:
+        return edges
+    if not timing.jitter_s < MOST_ROUNDING * edges.resolution_s or not math.isfinite(timing.duty_cycle):
+        return edges
+    period = 1.0 / timing.frequency_hz
+    number = np.round((edges.rising - edges.rising[0]) / period)
+    first = float(np.mean(edges.rising - period * number))
+    rising = np.asarray(first + period * np.arange(int(number[-1]) + 1), np.float64)
+    falling = np.asarray(rising[:-1] + timing.duty_cycle * period, np.float64)
+    return Edges(rising, falling, edges.resolution_s)
 
 
 def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:

@@ -55,7 +55,12 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
     if not 0 <= like < len(tables):
         raise SpecError([f"like = {like}: there are recordings 0 to {len(tables) - 1}."])
     table = RecordingTable.model_validate(
-        {"file": str(recording), "mapping": "", **{k: tables[like][k] for k in ("drive", "parameters")}}
+        {
+            "file": str(recording),
+            "mapping": "",
+            "drive": tables[like]["drive"],
+            "parameters": tables[like].get("parameters", {}),
+        }
     )
     ds = read_recording(recording, parse_mapping(info.mappings[like], f"mapping of recording {like}"))
     model = load_model(result["model"])

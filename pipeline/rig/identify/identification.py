@@ -26,6 +26,7 @@ from pipeline.rig.identify.profiles import Curvature, Profile, following, profil
 from pipeline.rig.identify.search import search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
 from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
+from pipeline.runs.run import stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.files import FIGURES, local_path, writer_lock
@@ -72,24 +73,29 @@ def identify(
         data cannot see.
     NotConvergedError
         If no start converged. The outcomes stay, a result is not written.
+    InterruptedRunError
+        After Ctrl-C or SIGTERM. The outcomes stay.
     """
     path = find_spec(spec)
     parsed = load_identification(path)
     folder = directory_of(spec, out)
     sources = store.sources_of(parsed)
-    store.check(folder, store.identity_of(parsed, sources))
+    if store.check(folder, store.identity_of(parsed, sources)) is not None and store.is_complete(folder):
+        echo(f"{folder} is complete; nothing to do.")
+        return store.read_result(folder)
     built = build(parsed, read_all(parsed))
+    for i, said in enumerate(built.findings):
+        for line in said:
+            echo(f"{parsed.recordings[i].file}: {line}")
     refuse_invisible(built.problem)
     with writer_lock(folder):
         info = store.establish(folder, parsed, sources, path.read_text("utf-8"))
-        if store.is_complete(folder):
-            echo(f"{folder} is complete; nothing to do.")
-            return store.read_result(folder)
         outcomes = Outcomes(folder / store.OUTCOMES)
-        found = find(parsed, built, outcomes, echo)
+        with stoppable(folder):
+            found = find(parsed, built, outcomes, echo)
         if outcomes.recalled:
             echo(f"{outcomes.recalled} outcomes were there before")
-        return _write(folder, parsed, found, sources, info.digest, figures, built.simulated)
+        return _write(folder, parsed, built, found, sources, info.digest, figures)
 
 
 def directory_of(spec: str | Path, out: str | Path | None) -> Path:
@@ -98,15 +104,15 @@ def directory_of(spec: str | Path, out: str | Path | None) -> Path:
 
 
 def _write(
-    folder: Path, spec: IdentificationSpec, found: reports.Finding, sources: list[Source], digest: str,
-    figures: bool, simulated: bool,
+    folder: Path, spec: IdentificationSpec, built: Built, found: reports.Finding, sources: list[Source],
+    digest: str, figures: bool,
 ) -> dict[str, Any]:  # fmt: skip
     reports.write_values(folder / store.PRESET, spec, found, sources)
     residuals = reports.residuals_of(spec, found)
-    if simulated:
+    if built.simulated:
         residuals = residuals.assign_attrs(simulated=1)
     residuals.to_netcdf(folder / store.RESIDUALS, engine="scipy", format="NETCDF3_64BIT")
-    result = reports.result_of(spec, found, sources, digest)
+    result = reports.result_of(spec, found, sources, digest, built.findings)
     files = [store.PRESET, store.RESIDUALS]
     if figures:
         from pipeline.rig.identify.figures import draw_all

@@ -10,9 +10,12 @@ import numpy as np
 
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.problem import Piece, Problem
+from pipeline.rig.identify.search import slowest_period
+from pipeline.rig.identify.starts import fit_starts
 
-SHARES = (0.25, 0.5)
-"""Shares of a piece over which its start is fitted before the whole: a long piece forgives no bad guess."""
+FIRST_PERIODS = 0.7
+"""Of the slowest oscillation, over which starts are fitted first; then twice that, and so on up to the piece.
+A long piece forgives no bad guess."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,10 @@ class Judgement:
         return self._rms([self.residuals[k]])
 
     def _rms(self, residuals: Sequence[np.ndarray]) -> dict[str, float]:
-        mean = np.nanmean(np.concatenate(residuals) ** 2, axis=0)
+        stacked = np.concatenate(residuals)
+        count = np.isfinite(stacked).sum(axis=0)
+        with np.errstate(invalid="ignore"):
+            mean = np.nansum(stacked**2, axis=0) / count
         return dict(zip(self.channels, np.sqrt(mean).tolist(), strict=True))
 
     @property
@@ -52,19 +58,25 @@ class Judgement:
         return {name: _pearson(measured[:, c], computed[:, c]) for c, name in enumerate(self.channels)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data: both criteria, and the root mean squares of each piece."""
+        """Plain data: both criteria, the root mean squares of each piece; None for what is not defined."""
         return {
-            "rms": self.rms,
-            "correlation": self.correlation,
+            "rms": _known(self.rms),
+            "correlation": _known(self.correlation),
             "pieces": [
-                {"recording": p.recording, "piece": p.number, "rms": self.rms_of(k)}
+                {"recording": p.recording, "piece": p.number, "rms": _known(self.rms_of(k))}
                 for k, p in enumerate(self.pieces)
             ],
         }
 
 
+def _known(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: value if np.isfinite(value) else None for name, value in values.items()}
+
+
 def _pearson(x: np.ndarray, y: np.ndarray) -> float:
     known = np.isfinite(x) & np.isfinite(y)
+    if not known.any():
+        return float("nan")
     x, y = x[known] - x[known].mean(), y[known] - y[known].mean()
     size = float(np.sqrt((x @ x) * (y @ y)))
     return float(x @ y / size) if size > 0 else float("nan")
@@ -116,19 +128,20 @@ def judge(
         Of the starts; whether it converged counts.
     """
     known = known_problem(problem, values, zeros, pieces)
-    starts = known.starts
-    for share in SHARES:
-        fit = fit_local(_beginning(known, share), np.zeros(0), starts=starts)
-        starts = np.where(np.isfinite(fit.starts), fit.starts, starts)
+    longest = max(float(p.time[-1]) for p in known.pieces)
+    length, starts = FIRST_PERIODS * slowest_period(known), known.starts
+    while length < longest:
+        starts = fit_starts(_beginning(known, length), np.zeros(0), starts).starts
+        length *= 2
     fit = fit_local(known, np.zeros(0), starts=starts)
     return Judgement(problem.channels, tuple(pieces), fit.residuals), fit
 
 
-def _beginning(problem: Problem, share: float) -> Problem:
+def _beginning(problem: Problem, length_s: float) -> Problem:
     """The problem over the first part of each piece."""
     fewest = 4 * len(problem.model.states)
     pieces = []
     for p in problem.pieces:
-        n = min(len(p.time), max(fewest, int(share * len(p.time))))
+        n = min(len(p.time), max(fewest, int(np.searchsorted(p.time, length_s))))
         pieces.append(replace(p, time=p.time[:n], measured=p.measured[:n]))
     return replace(problem, pieces=tuple(pieces))

@@ -87,8 +87,9 @@ def zeros_of(problem: Problem, fit: Fit) -> dict[str, float]:
 
 
 def result_of(
-    spec: IdentificationSpec, found: Finding, sources: Sequence[Source], digest: str
-) -> dict[str, Any]:
+    spec: IdentificationSpec, found: Finding, sources: Sequence[Source], digest: str,
+    findings: Sequence[Sequence[str]],
+) -> dict[str, Any]:  # fmt: skip
     """Return ``result.json`` as plain data; nothing in it depends on when or how fast it was found."""
     names = found.problem.names
     return {
@@ -144,10 +145,21 @@ def result_of(
             }
             for k, fit in sorted(found.starts.items())
         ],
-        "warnings": list(found.warnings),
-        "recordings": [{"file": s.file, "sha256": s.sha256} for s in sources],
+        "warnings": list(found.warnings) + _errors(sources, findings),
+        "recordings": [
+            {"file": s.file, "sha256": s.sha256, "findings": list(said)}
+            for s, said in zip(sources, findings, strict=True)
+        ],
         "versions": versions(),
     }
+
+
+def _errors(sources: Sequence[Source], findings: Sequence[Sequence[str]]) -> list[str]:
+    """Findings that make what is computed from a recording wrong."""
+    return [
+        f"{s.file} has an {line}" for s, said in zip(sources, findings, strict=True) for line in said
+        if line.startswith("error")
+    ]  # fmt: skip
 
 
 def _estimate(found: Finding, i: int) -> dict[str, Any]:
@@ -260,7 +272,12 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
 
 def judgement_lines(judged: Mapping[str, Any], units: Mapping[str, str]) -> list[str]:
     """Both criteria, a line for each channel."""
-    return [
-        f"{name}: root mean square {rms:.4g} {units[name]}, correlation {judged['correlation'][name]:.6f}"
-        for name, rms in judged["rms"].items()
-    ]
+    lines = []
+    for name, rms in judged["rms"].items():
+        shown = "-" if rms is None else f"{rms:.4g} {units[name]}"
+        correlation = judged["correlation"][name]
+        lines.append(
+            f"{name}: root mean square {shown}, correlation "
+            + ("-" if correlation is None else f"{correlation:.6f}")
+        )
+    return lines

@@ -189,6 +189,22 @@ def test_identify__another_specification_is_refused(bench):
         identification.identify(folder / "changed.toml", folder / "out", echo=lambda _: None)
 
 
+def test_identify__says_what_is_wrong_with_a_recording(bench):
+    """Three gaps: a warning or a note each, nothing that makes the numbers wrong."""
+    _, result, lines = bench
+    said = result["recordings"][0]["findings"]
+    assert all(line in "\n".join(lines) for line in said)
+    assert not any("error" in line for line in said)
+
+
+def test_result__an_error_in_a_recording_is_a_warning_of_the_result():
+    from pipeline.rig.identify.reports import _errors
+
+    source = d.Source("a.csv", "", "")
+    found = _errors([source], [["warning: gap of x: none", "error: wrap of x: it jumps by a turn"]])
+    assert found == ["a.csv has an error: wrap of x: it jumps by a turn"]
+
+
 def test_check__refits_the_starts_alone(bench):
     folder, result, _ = bench
     found = checking.check(folder / "out", folder / "other.csv")
@@ -341,3 +357,110 @@ def test_identify__what_the_model_lacks_is_found_in_the_residuals(without_cubic)
     assert "the residuals are autocorrelated" in result["covariance"]["why"]
     assert result["covariance"]["estimator"] == "newey-west"
     assert result["covariance"]["n_effective"]["x"] < 0.3 * result["covariance"]["n_samples"]
+
+
+def test_check__long_pieces_of_other_numbers_and_lengths(bench, tmp_path):
+    """Starts are found over stretches that grow; one short piece and two long ones, each its own length."""
+    folder, _, _ = bench
+    parts = []
+    for k, (seed, n) in enumerate([(11, 40), (12, 700), (13, 1000)]):
+        write_ringdowns(tmp_path / "one.csv", seed, n_pieces=1, n=n)
+        rows = (tmp_path / "one.csv").read_text().split()[1:]
+        parts += [f"{float(r.split(',')[0]) + 200 * k:.3f},{r.split(',')[1]}" for r in rows]
+    (tmp_path / "long.csv").write_text("\n".join(["time,x", *parts]) + "\n")
+    found = checking.check(folder / "out", tmp_path / "long.csv")
+    assert len(found["pieces"]) == 3
+    for piece in found["pieces"]:
+        assert piece["rms"]["x"] == pytest.approx(NOISE, rel=0.25)
+
+
+def test_judge__a_piece_that_went_astray_is_found_alone(bench):
+    """A first guess of a start that is off by much: the others do not suffer."""
+    from dataclasses import replace
+
+    from pipeline.rig.identify.build import build, read_all
+    from pipeline.rig.identify.judging import judge
+    from pipeline.rig.identify.specification import load_identification
+
+    folder, result, _ = bench
+    spec = load_identification(folder / "spec.toml")
+    problem = build(spec, read_all(spec)).problem
+    far = replace(problem.pieces[1], start=np.array([-4.0, 9.0]))
+    pieces = [problem.pieces[0], far, problem.pieces[2]]
+    judged, fit = judge(problem, result["values"], result["zeros"], pieces)
+    assert fit.converged
+    assert judged.rms["x"] == pytest.approx(NOISE, rel=0.15)
+
+
+def test_identify__stopped_by_a_signal_says_so(bench, tmp_path, start):
+    folder, _, _ = bench
+    process = start("identify", folder / "spec.toml", "--out", tmp_path / "out")
+    deadline = time.monotonic() + 120
+    while not list((tmp_path / "out").glob("outcomes/start-*.npz")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 143
+    assert "the same command goes on from there" in err
+
+
+def test_judgement__without_a_spread_has_no_correlation():
+    from pipeline.rig.identify.judging import Judgement
+    from pipeline.rig.identify.problem import Piece
+
+    measured = np.column_stack([np.ones(5), np.arange(5.0), np.full(5, np.nan)])
+    piece = Piece(0, 0, np.arange(5.0), measured, np.zeros(2))
+    judged = Judgement(("a", "b", "c"), (piece,), (0.1 * measured,)).as_dict()
+    assert judged["correlation"]["a"] is None
+    assert judged["correlation"]["b"] == pytest.approx(1.0)
+    assert judged["rms"]["a"] == pytest.approx(0.1)
+    assert judged["rms"]["c"] is None
+
+
+def test_identify__outliers_under_a_robust_loss(bench, tmp_path):
+    """One sample in forty is off by a hundred times the noise: that leads least squares alone astray."""
+    folder, _, _ = bench
+    rng = np.random.default_rng(8)
+    rows = [line.split(",") for line in (folder / "ringdown.csv").read_text().split()[1:]]
+    for i in rng.choice(len(rows), len(rows) // 40, replace=False):
+        rows[i][1] = str(float(rows[i][1]) + 100 * NOISE * rng.choice([-1, 1]))
+    (tmp_path / "ringdown.csv").write_text("\n".join(["time,x", *(",".join(r) for r in rows)]) + "\n")
+    (tmp_path / "ringdown.toml").write_text(MAPPING)
+    text = SPEC.replace("n_starts = 3", "n_starts = 1").replace("n_samples = 8\n", "")
+    found = {}
+    for loss in ("linear", "cauchy"):
+        (tmp_path / "spec.toml").write_text(f'{text}[fit]\nloss = "{loss}"\nnoise = {{ x = {NOISE} }}\n')
+        found[loss] = identification.identify(
+            tmp_path / "spec.toml", tmp_path / loss, figures=False, echo=lambda _: None
+        )
+    errors = {loss: abs(r["values"]["linear"] - TRUTH["linear"]) for loss, r in found.items()}
+    assert errors["cauchy"] < errors["linear"]
+    assert found["cauchy"]["covariance"]["estimator"] == "newey-west"
+    low, high = found["cauchy"]["estimates"]["linear"]["interval"]
+    assert low - 0.5 * (high - low) < TRUTH["linear"] < high + 0.5 * (high - low)
+    # the profile of the loss, against the standard error of its scores
+    profile_low, profile_high = found["cauchy"]["estimates"]["linear"]["profile_interval"]
+    assert profile_high - profile_low == pytest.approx(high - low, rel=0.3)
+    wide = np.diff(found["linear"]["estimates"]["linear"]["interval"])
+    assert high - low < 0.5 * wide
+
+
+def test_identify__stretches_with_a_price_on_their_gaps(bench, tmp_path):
+    """Gaps that cost take freedom from the starts: intervals are those of whole pieces, or nearly."""
+    folder, whole, _ = bench
+    text = SPEC.replace("hold_out = [2]", "piece_s = 4.0")
+    text = text.replace("n_starts = 3", "n_starts = 1\nprofiles = false").replace("n_samples = 8\n", "")
+    width = {}
+    for name, price in (("free", '"free"'), ("joined", "1000.0")):
+        (folder / f"{name}.toml").write_text(f"{text}[fit]\ncontinuity = {price}\n")
+        result = identification.identify(
+            folder / f"{name}.toml", tmp_path / name, figures=False, echo=lambda _: None
+        )
+        assert len(result["pieces"]) == 16
+        low, high = result["estimates"]["linear"]["interval"]
+        assert low - 0.5 * (high - low) < TRUTH["linear"] < high + 0.5 * (high - low)
+        width[name] = high - low
+    low, high = whole["estimates"]["linear"]["interval"]
+    assert width["joined"] < 0.6 * width["free"]
+    # four pieces instead of the three that were fitted whole
+    assert width["joined"] == pytest.approx((high - low) * np.sqrt(3 / 4), rel=0.35)

@@ -1,7 +1,7 @@
 """How often 95 % intervals hold the truth: a virtual double pendulum, identified for each seed of the noise.
 
 Free swings with potentiometers of 12 bits, white noise and a dead band that the second link passes through.
-``python tests/bench/coverage.py 200`` prints the share of seeds for each parameter.
+``python tests/bench/intervals.py 200`` prints the share of seeds for each parameter.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from magpend_core.models import load_model
 from pipeline.rig.identify.build import pieces_of
 from pipeline.rig.identify.linearise import linearise
-from pipeline.rig.identify.local import fit_local
 from pipeline.rig.identify.problem import Free, Problem
+from pipeline.rig.identify.search import refine
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.rig.identify.statistics import covariance_of
 from pipeline.rig.recordings import smooth
@@ -25,7 +25,7 @@ MODEL = load_model("double-pendulum")
 TRUTH = MODEL.load(None, T1=4e-4, T2=2e-4, c1=2e-4, c2=2e-5, k1=0.03, k2=0.01, eps=50.0)
 UNKNOWN = ("l1", "e1", "J1", "J2", "T1", "T2", "c1", "c2", "k1", "k2")
 SENSOR = Sensor("potentiometer", noise=2e-3, bits=12, dead_band=0.15)
-N_PIECES, LENGTH_S, RATE_HZ = 10, 2.0, 200.0
+N_PIECES, LENGTH_S, RATE_HZ = 12, 1.5, 200.0
 CHANNELS = MODEL.angles
 
 
@@ -49,8 +49,8 @@ def problem_of(seed: int) -> Problem:
         start = [*rng.uniform(-1.8, 1.8, 1), *rng.uniform(-2.9, 2.9, 1), *rng.uniform(-3.0, 3.0, 2)]
         ds = record(TRUTH, None, start, times, sensors=dict.fromkeys(CHANNELS, SENSOR), seed=100 * seed + k)
         pieces += pieces_of(MODEL, CHANNELS, (ds, smooth(ds)), table, k)
-    lower = {name: -np.inf if name in ("c1", "c2") else 0.0 for name in UNKNOWN}
-    free = tuple(Free(name, 1.02 * TRUTH[name], lower[name], np.inf) for name in UNKNOWN)
+    lower = {name: -3 * TRUTH[name] if name in ("c1", "c2") else 0.0 for name in UNKNOWN}
+    free = tuple(Free(name, 1.1 * TRUTH[name], lower[name], 5 * TRUTH[name]) for name in UNKNOWN)
     return Problem(
         model=MODEL, fixed=TRUTH, free=free, channels=CHANNELS, pieces=tuple(pieces), noise=np.full(2, 2e-3)
     )
@@ -65,7 +65,7 @@ def outcome(seed: int) -> Outcome:
         If the fit did not converge.
     """
     problem = problem_of(seed)
-    fit = fit_local(problem, problem.start)
+    fit = refine(problem, problem.start)
     if not fit.converged:
         raise ArithmeticError(f"seed {seed}: {fit.message}")
     covariance = covariance_of(linearise(problem, fit), np.array([TRUTH[name] for name in UNKNOWN]))
