@@ -39,6 +39,7 @@ _HOMES = {
     "pipeline.runs.zoom": ("zoom",),
     "pipeline.runs.derive": ("derive", "prune"),
     "pipeline.runs.drawing": ("figure",),
+    "pipeline.rig.identify.identification": ("identify",),
     "pipeline.analysis.chaos.dimensions": ("correlation_dimension", "kaplan_yorke_dimension"),
     "pipeline.analysis.chaos.zero_one": ("zero_one_test",),
     "pipeline.analysis.chaos.lyapunov": ("spectrum_of_jacobians",),
