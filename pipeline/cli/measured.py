@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.common import EXIT_HELP, Csv, Directory, Json, check_csv, read_pairs, tell
+from pipeline.cli.common import EXIT_HELP, Csv, Directory, Json, check_csv, json_rows, read_pairs, tell
 from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import speaking
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from magpend_core.models.parameters import Parameters
     from pipeline.rig.measured.measuring import Way
+    from pipeline.rig.recordings import Mapping
 
 measured_app = typer.Typer(
     help="Diagrams of recorded sweeps, beside and over computed ones.",
@@ -56,10 +57,9 @@ Preset = Annotated[str | None, typer.Option(help="Parameters; by default the mod
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")]
 
 
-def _read(paths: list[Path], mappings: list[Path]) -> list[xr.Dataset]:
-    """Read recordings through their mappings, and say what was found in them."""
-    from pipeline.cli import console
-    from pipeline.rig.recordings import findings_of, load_mapping, read_recording
+def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
+    """Return a mapping for each recording; all of one model, which is known before any is read."""
+    from pipeline.rig.recordings import load_mapping
     from pipeline.spec.problems import SpecError
 
     if len(mappings) not in (1, len(paths)):
@@ -67,7 +67,18 @@ def _read(paths: list[Path], mappings: list[Path]) -> list[xr.Dataset]:
             f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each."
         ])  # fmt: skip
     loaded = [load_mapping(m) for m in mappings] * (len(paths) if len(mappings) == 1 else 1)
-    found = [read_recording(p, m) for p, m in zip(paths, loaded, strict=True)]
+    models = sorted({m.model for m in loaded})
+    if len(models) > 1:
+        raise SpecError([f"--mapping: of the models {', '.join(models)}; a diagram is one model's."])
+    return loaded
+
+
+def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
+    """Read recordings, and say what was found in them."""
+    from pipeline.cli import console
+    from pipeline.rig.recordings import findings_of, read_recording
+
+    found = [read_recording(p, m) for p, m in zip(paths, mappings, strict=True)]
     for path, recording in zip(paths, found, strict=True):
         for finding in findings_of(recording):
             if finding.severity != "note":
@@ -132,9 +143,9 @@ def steps(
 
     _check_targets(None, csv)
     way = _way(transient, window, window_s, hysteresis, max_period)
-    found = _read(recordings, mapping)
-    parameters = _loaded(str(found[0].attrs["model"]), preset, settings)
-    tell(steps_table(measure(found, way, parameters=parameters)), csv, as_json)
+    mappings = _load(recordings, mapping)
+    parameters = _loaded(mappings[0].model, preset, settings)
+    tell(steps_table(measure(_read(recordings, mappings), way, parameters=parameters)), csv, as_json)
 
 
 @measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
@@ -160,21 +171,20 @@ def diagram(
     """Draw the measured bifurcation diagram, alone or with that of a run on the same axes."""
     from pipeline.plots import Frame
     from pipeline.rig.measured.figures import plot_measured
-    from pipeline.rig.measured.measuring import measure, with_sides
+    from pipeline.rig.measured.measuring import measure
     from pipeline.runs.derive import refused
 
     _check_targets(out)
     way = _way(transient, window, window_s, hysteresis, max_period)
-    found = measure(_read(recordings, mapping), way)
-    cube = None
+    mappings = _load(recordings, mapping)
+    cube = parameters = None
     if run is not None:
         from pipeline.rig.measured.computed import cube_and_parameters
         from pipeline.runs.derive import AnalysedRun
 
-        opened = AnalysedRun.of(run)
         pairs = read_pairs("--at", at or [], "q=1.5")
-        cube, parameters = cube_and_parameters(opened, str(found.attrs["model"]), pairs)
-        found = with_sides(found, parameters)
+        cube, parameters = cube_and_parameters(AnalysedRun.of(run), mappings[0].model, pairs)
+    found = measure(_read(recordings, mappings), way, parameters=parameters)
     with refused(run or out):
         figure = plot_measured(
             found, cube, state=state, degrees=degrees, layout=layout, frame=Frame(width)
@@ -212,8 +222,8 @@ def compare(
     from pipeline.cli import console
     from pipeline.plots import Frame
     from pipeline.rig.measured.compare import compare_with
-    from pipeline.rig.measured.computed import Computed
-    from pipeline.rig.measured.measuring import measure, with_sides
+    from pipeline.rig.measured.computed import Computed, cube_and_parameters
+    from pipeline.rig.measured.measuring import measure
     from pipeline.rig.measured.tables import edges_table, steps_table, summary_lines
     from pipeline.rig.measured.writing import write_comparison
     from pipeline.runs.derive import AnalysedRun, refused
@@ -222,14 +232,16 @@ def compare(
     way = _way(transient, window, window_s, hysteresis, max_period)
     pairs = read_pairs("--at", at or [], "q=1.5")
     run = AnalysedRun.of(directory, console.note)
-    found = measure(_read(recordings, mapping), way)
-    computed = Computed.of(run, str(found.attrs["model"]), pairs)
-    compared = compare_with(with_sides(found, computed.parameters), computed)
+    mappings = _load(recordings, mapping)
+    _, parameters = cube_and_parameters(run, mappings[0].model, pairs)
+    found = measure(_read(recordings, mappings), way, parameters=parameters)
+    computed = Computed.of(run, mappings[0].model, pairs)
+    compared = compare_with(found, computed)
     with refused(directory):
         written = write_comparison(compared, computed, out, state=state, degrees=degrees, frame=Frame(width))
     steps_of, ends = steps_table(compared), edges_table(compared)
     if as_json:
-        console.result(json.dumps({"steps": _plain(steps_of.rows), "edges": _plain(ends.rows)}, indent=1))
+        console.result(json.dumps({"steps": json_rows(steps_of), "edges": json_rows(ends)}, indent=1))
         return
     tell(steps_of, csv, as_json=False)
     if csv == "-":
@@ -238,11 +250,6 @@ def compare(
         console.result(line)
     for path in written:
         console.note(f"written: {path}")
-
-
-def _plain(rows: Any) -> list[dict[str, Any]]:
-    """NaN is no JSON."""
-    return [{k: None if v != v else v for k, v in row.items()} for row in rows]
 
 
 @measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
@@ -270,8 +277,9 @@ def series(
     from pipeline.runs.derive import refused
 
     _check_targets(out)
-    (found,) = _read([recording], [mapping])
-    parameters = _loaded(str(found.attrs["model"]), preset, settings)
+    mappings = _load([recording], [mapping])
+    parameters = _loaded(mappings[0].model, preset, settings)
+    (found,) = _read([recording], mappings)
     ds = series_of(
         found, parameters, start_s=start_s, n_periods=periods, window_s=window_s, hysteresis=hysteresis
     )  # fmt: skip

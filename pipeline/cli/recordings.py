@@ -87,11 +87,14 @@ def convert(
     from pipeline.rig.recordings.writing import check_target
 
     check_target(out)
+    _keep(file, out)
     ds = _smoothed(_read(file, mapping, window), smooth, smoothing_window)
+    with_mapping = out.suffix.lower() != ".nc"
+    text = mapping_for(ds, out).toml() if with_mapping else ""
+    beside = _beside(out, text) if with_mapping else out
     console.result(f"recording: {write_recording(ds, out)}")
-    if out.suffix.lower() != ".nc":
-        beside = out.with_suffix(".toml")
-        beside.write_text(mapping_for(ds, out).toml(), encoding="utf-8")
+    if with_mapping:
+        beside.write_text(text, encoding="utf-8")
         console.result(f"mapping: {beside}")
 
 
@@ -106,8 +109,8 @@ def simulate(
 
     check_target(out, SUFFIXES[:2])
     raw, mapping = simulated(load_rig(spec), is_csv=out.suffix.lower() == ".csv")
+    beside = _beside(out, mapping.toml())
     console.result(f"recording: {write_raw(raw, out)}")
-    beside = out.with_suffix(".toml")
     beside.write_text(mapping.toml(), encoding="utf-8")
     console.result(f"mapping: {beside}")
 
@@ -149,6 +152,29 @@ def drive(
             f"samples: {made.n_rows} of {made.n_samples} kept; the others lie within {made.error:.3g} N m"
         )
     console.result(f"drive: {out}")
+
+
+def _keep(file: Path, out: Path) -> None:
+    """Refuse to write a recording over the one that is read."""
+    from pipeline.spec.problems import SpecError
+
+    if out.exists() and file.exists() and out.samefile(file):
+        raise SpecError([f"--out {out}: is the file that is read; give another name."])
+
+
+def _beside(out: Path, text: str) -> Path:
+    """Return where the mapping of a recording goes; refuse to replace what is something else."""
+    from pipeline.spec.problems import SpecError
+
+    path = out.with_suffix(".toml")
+    if path.exists() and path.read_bytes() != text.encode():
+        raise SpecError(
+            [
+                f"--out {out}: its mapping would replace {path}, which holds something else; give another "
+                "name, or move that file away."
+            ]
+        )
+    return path
 
 
 def _read(file: Path, mapping: Path, window: tuple[float, float] | None) -> xr.Dataset:

@@ -203,7 +203,7 @@ def mapping() -> str:
         _keys("MAPPING.toml", found.Mapping, "", top),
         _keys("time = {...}", found.TimeMap, "", ()),
         _keys("piece = {...}", found.PieceMap, "", ()),
-        _keys("[channels.NAME]", found.ChannelMap, "NAME is a state of the model.", ()),
+        _keys("[channels.NAME]", found.ChannelMap, "NAME is a state of the model, or a quantity.", ()),
         _keys("[drive]", found.DriveMap, 'Or `drive = "none"`.', ()),
         _keys("[csv]", found.CsvMap, "For CSV files alone; what is not stated is found out.", ()),
     ]
@@ -224,6 +224,7 @@ def virtual_rig() -> str:
     parts = [
         _keys("RIG.toml", simulation.RigTable, "", ("drive", "sensors")),
         _keys("[drive]", simulation.DriveTable, 'Or `drive = "none"`.', ()),
+        _keys("sweep = {...}", simulation.SweepTable, "In `[drive]`.", ()),
         _keys("[sensors.STATE]", simulation.SensorTable, "", ()),
     ]
     return "\n\n".join(parts)

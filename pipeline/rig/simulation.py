@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from magpend_core.models import ModelError, load_model
 from magpend_core.models.model import Model
@@ -36,14 +36,38 @@ class SensorTable(Table):
     )
 
 
+class SweepTable(Table):
+    """``sweep``: steps of equally many periods at evenly spaced frequencies."""
+
+    start_hz: float = Field(gt=0.0, description="First frequency [Hz].")
+    stop_hz: float = Field(gt=0.0, description="Last frequency [Hz]; below the first to sweep downwards.")
+    num: int = Field(ge=2, le=10_000, description="Number of frequencies.")
+    n_periods: int = Field(ge=1, description="Drive periods at each.")
+
+
 class DriveTable(Table):
     """``[drive]``: what the drive does, and how it is recorded."""
 
     kind: Literal["torque", "signal"] = Field(default="signal", description="What is recorded.")
     noise: float = Field(default=0.0, ge=0.0, description="Standard deviation [N m, or V].")
-    steps: Annotated[tuple[dict[str, float], ...], Field(strict=False, min_length=1)] = Field(
-        description="One table each: frequency_hz, n_periods, and parameters that differ."
+    steps: Annotated[tuple[dict[str, float], ...], Field(strict=False, min_length=1)] | None = Field(
+        default=None, description="One table each: frequency_hz, n_periods, and parameters that differ."
     )
+    sweep: SweepTable | None = Field(default=None, description="Instead of steps.")
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> DriveTable:
+        if (self.steps is None) == (self.sweep is None):
+            raise ValueError("give steps or sweep, one of them.")
+        return self
+
+    def tables(self) -> list[dict[str, float]]:
+        """Return the steps, those of a sweep written out."""
+        if self.sweep is None:
+            return [dict(table) for table in self.steps or ()]
+        s = self.sweep
+        values = np.linspace(s.start_hz, s.stop_hz, s.num).tolist()
+        return [{"frequency_hz": value, "n_periods": s.n_periods} for value in values]
 
 
 class RigTable(Table):
@@ -219,8 +243,7 @@ def _steps(drive: DriveTable | None, parameters: Parameters, problems: list[str]
     if drive is None:
         return None
     steps = []
-    for i, table in enumerate(drive.steps):
-        own = dict(table)
+    for i, own in enumerate(drive.tables()):
         frequency, count = own.pop("frequency_hz", math.nan), own.pop("n_periods", math.nan)
         path = f"drive.steps[{i}]"
         if not frequency > 0.0:

@@ -54,12 +54,15 @@ class Sensor:
         it, what floating-point numbers resolve.
     dead_band : float
         Part of a turn in which a potentiometer does not measure, half a turn from 0 [rad].
+    offset : float
+        By how much it reads too much [the state's unit]; the mapping does not know.
     """
 
     kind: Literal["potentiometer", "encoder"] = "encoder"
     noise: float = 0.0
     bits: int | None = None
     dead_band: float = 0.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,9 @@ class Step:
         """Length [s]."""
         return self.n_periods / self.frequency_hz
 
+
+TOLERANCE = 1e-11
+"""Relative and absolute tolerance of the rig's motion."""
 
 Sensors = AnyMapping[str, Sensor | DriveSensor]
 
@@ -182,7 +188,7 @@ def readings(
             unit = parameters.model.states[i].unit
             read = _potentiometer if sensor.kind == "potentiometer" else _encoder
             values, entries[name], unit = read(
-                f"{GROUP}/{name}", states[:, i], unit, sensor, np.random.default_rng(seeds[i])
+                f"{GROUP}/{name}", states[:, i] + sensor.offset, unit, sensor, np.random.default_rng(seeds[i])
             )
             channels[f"{GROUP}/{name}"] = Channel(f"{GROUP}/{name}", values, unit, 0.0, step)
     mapped: DriveMap | Literal["none"] = "none"
@@ -230,7 +236,9 @@ def _sensor_problems(path: str, sensor: Sensor, is_angle: bool) -> list[str]:
     problems = []
     if sensor.kind == "potentiometer" and not is_angle:
         problems.append(f'{path}.kind = "potentiometer": measures angles alone; take "encoder".')
-    if sensor.noise < 0.0:
+    if not math.isfinite(sensor.offset):
+        problems.append(f"{path}.offset = {sensor.offset!r}: must be a finite number.")
+    if not sensor.noise >= 0.0:
         problems.append(f"{path}.noise = {sensor.noise!r}: must be 0 or more.")
     if sensor.bits is not None and not 1 <= sensor.bits <= 32:
         problems.append(f"{path}.bits = {sensor.bits!r}: must be from 1 to 32.")
@@ -249,7 +257,11 @@ def _states(
     from magpend_core.status import Status
 
     drives = None if drive is None else [_intervals(parameters, drive, times[-1])]
-    found = sample(parameters.model.system, parameters.pack()[None], start[None], [times], drives=drives)
+    # finer than any fit to it: what comes back is the sensors' noise, not the integration's
+    found = sample(
+        parameters.model.system, parameters.pack()[None], start[None], [times], drives=drives, rtol=TOLERANCE,
+        atol=TOLERANCE,
+    )  # fmt: skip
     status = Status(int(found.status[0]))
     if not np.isfinite(found.states[0]).all():
         raise ArithmeticError(f"The trajectory ended early: {status.sentence}.")

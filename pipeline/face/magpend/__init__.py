@@ -40,6 +40,10 @@ _HOMES = {
     "pipeline.runs.derive": ("derive", "prune"),
     "pipeline.runs.drawing": ("figure",),
     "pipeline.rig.identify.identification": ("identify",),
+    "pipeline.rig.recordings": (
+        "findings_of", "load_mapping", "read_recording", "smooth", "window", "write_recording",
+    ),
+    "pipeline.rig.recordings.figure": ("plot_recording",),
     "pipeline.analysis.chaos.dimensions": ("correlation_dimension", "kaplan_yorke_dimension"),
     "pipeline.analysis.chaos.zero_one": ("zero_one_test",),
     "pipeline.analysis.chaos.lyapunov": ("spectrum_of_jacobians",),

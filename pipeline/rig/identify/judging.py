@@ -131,9 +131,9 @@ def judge(
     longest = max(float(p.time[-1]) for p in known.pieces)
     length, starts = FIRST_PERIODS * slowest_period(known), known.starts
     while length < longest:
-        starts = fit_starts(_beginning(known, length), np.zeros(0), starts)
+        starts = fit_starts(_beginning(known, length), np.zeros(0), starts).starts
         length *= 2
-    fit = fit_local(known, np.zeros(0), starts=fit_starts(known, np.zeros(0), starts))
+    fit = fit_local(known, np.zeros(0), starts=starts)
     return Judgement(problem.channels, tuple(pieces), fit.residuals), fit
 
 

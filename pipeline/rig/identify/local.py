@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.rig.identify.objective import Evaluation, evaluate
 from pipeline.rig.identify.problem import Problem
+from pipeline.rig.identify.starts import carry_starts, fit_starts, project_starts_out
 
 Array = NDArray[np.float64]
 
@@ -56,45 +57,69 @@ class Fit:
         return np.asarray(np.sqrt(np.nanmean(np.concatenate(self.residuals) ** 2, axis=0)))
 
 
-class _Unknowns:
-    """Unknowns and starts as one scaled vector, and the last evaluation of it."""
+class _Search:
+    """What `least_squares` walks in, and what is known at its last points.
 
-    def __init__(self, problem: Problem, starts: Array, with_starts: bool, echo: Echo | None) -> None:
-        self.problem, self.starts, self.with_starts, self.echo = problem, starts, with_starts, echo
+    The vector holds the unknowns in units of their sizes; with a weight on the gaps, all starts follow them.
+    Without one, each start depends on its own piece alone: it is found anew for the unknowns of each point,
+    and its directions are projected out of the rows (variable projection: Golub and Pereyra, SIAM J. Numer.
+    Anal. 10, 1973, 413, in Kaufman's form).
+    """
+
+    def __init__(self, problem: Problem, starts: Array, free_starts: bool, echo: Echo | None) -> None:
+        self.problem, self.starts, self.echo = problem, starts, echo
+        self.joint = free_starts and problem.continuity is not None
+        self.projected = free_starts and problem.continuity is None
         self.n_free, self.count, self.best = len(problem.free), 0, np.inf
         self.sizes = np.array([f.size for f in problem.free])
-        if with_starts:
+        if self.joint:
             self.sizes = np.append(self.sizes, np.tile(problem.model.scales, len(starts)))
         self._key = b""
-        self._last: Evaluation | None = None
+        self._last: _Point | None = None
+        self._base: _Point | None = None
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Unknowns and starts of a scaled vector."""
+        """Unknowns, and starts as given or as the vector has them."""
         full = x * self.sizes
-        if not self.with_starts:
+        if not self.joint:
             return full, self.starts
         return full[: self.n_free], full[self.n_free :].reshape(self.starts.shape)
 
-    def at(self, x: Array) -> Evaluation:
+    def at(self, x: Array) -> _Point:
         """Evaluate, or recall the last evaluation."""
         key = x.tobytes()
         if self._last is None or key != self._key:
             theta, starts = self.split(x)
-            self._last = evaluate(self.problem, theta[None], starts[None], slopes=True)[0]
+            if self.projected:
+                starts = self._starts_for(theta)
+            evaluation = evaluate(self.problem, theta[None], starts[None], slopes=True)[0]
+            rows, jacobian = evaluation.rows, evaluation.jacobian[:, : len(self.sizes)]
+            if self.projected:
+                rows, jacobian = project_starts_out(self.problem, evaluation)
+            self._last = _Point(theta, starts, evaluation, rows, jacobian * self.sizes)
             self._key = key
             self.count += 1
-            if self._last.cost < self.best:
-                self.best = self._last.cost
+            if evaluation.cost < self.best:
+                self.best, self._base = evaluation.cost, self._last
                 if self.echo is not None:
                     self.echo(theta, self.best)
         return self._last
 
-    def rows(self, x: Array) -> Array:
-        return self.at(x).rows
+    def _starts_for(self, theta: Array) -> Array:
+        """Starts for unknowns: those of the best point, carried on along its slopes, then fitted."""
+        base = self._base
+        if base is None:
+            return fit_starts(self.problem, theta, self.starts).starts
+        guess = carry_starts(self.problem, base.evaluation, base.starts, theta - base.theta)
+        return fit_starts(self.problem, theta, guess).starts
 
-    def jacobian(self, x: Array) -> Array:
-        jacobian = self.at(x).jacobian
-        return np.asarray(jacobian[:, : len(self.sizes)] * self.sizes)
+
+class _Point(NamedTuple):
+    theta: Array
+    starts: Array
+    evaluation: Evaluation
+    rows: Array
+    jacobian: Array
 
 
 Echo = Callable[[Array, float], None]
@@ -162,40 +187,62 @@ def fit_local(
 def _solve(
     problem: Problem, theta0: Array, starts: Array, free_starts: bool, ending: _Ending, echo: Echo | None
 ) -> Fit:
-    from scipy.optimize import least_squares
-    from scipy.sparse import csr_array
     from threadpoolctl import threadpool_limits
 
-    unknowns = _Unknowns(problem, starts, free_starts, echo)
-    sizes, n_free = unknowns.sizes, len(problem.free)
+    walk = _Search(problem, starts, free_starts, echo)
     theta0 = np.clip(theta0, problem.lower, problem.upper)
-    full = np.append(theta0, starts.ravel()) if free_starts else np.array(theta0)
-    lower, upper = np.full(len(sizes), -np.inf), np.full(len(sizes), np.inf)
-    lower[:n_free], upper[:n_free] = problem.lower, problem.upper
-    if not len(sizes):
-        return _outcome(unknowns, full, True, "nothing to fit")
-    sparse = len(sizes) > DENSE_COLUMNS
+    full = np.append(theta0, starts.ravel()) if walk.joint else np.array(theta0)
     # the matrices are small: more threads would wait for each other
     with threadpool_limits(1):
-        found = least_squares(
-            unknowns.rows, full / sizes,
-            jac=(lambda x: csr_array(unknowns.jacobian(x))) if sparse else unknowns.jacobian,
-            bounds=(lower / sizes, upper / sizes), method="trf", x_scale="jac", xtol=ending.tolerance,
-            ftol=0.1 * ending.tolerance, gtol=None,
-            tr_solver="lsmr" if sparse else "exact", max_nfev=ending.max_evaluations,
-        )  # fmt: skip
-    return _outcome(unknowns, found.x, found.status > 0, found.message)
+        if not len(full):
+            return _starts_alone(walk, free_starts)
+        x, ended, message = _least_squares(walk, full / walk.sizes, ending)
+        point = walk.at(x)
+    return _outcome(point, walk.count, ended, message)
 
 
-def _outcome(unknowns: _Unknowns, x: Array, ended: bool, message: str) -> Fit:
-    evaluation = unknowns.at(x)
-    theta, starts = unknowns.split(x)
-    failed = evaluation.failed
+def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, bool, str]:
+    """Where `least_squares` ends, whether it had converged, and why it ended."""
+    from scipy.optimize import least_squares
+    from scipy.sparse import csr_array
+
+    sizes, problem = walk.sizes, walk.problem
+    lower, upper = np.full(len(sizes), -np.inf), np.full(len(sizes), np.inf)
+    lower[: walk.n_free], upper[: walk.n_free] = problem.lower, problem.upper
+    sparse = len(sizes) > DENSE_COLUMNS
+    found = least_squares(
+        lambda x: walk.at(x).rows, x,
+        jac=lambda x: csr_array(walk.at(x).jacobian) if sparse else walk.at(x).jacobian,
+        bounds=(lower / sizes, upper / sizes), method="trf", x_scale="jac", xtol=ending.tolerance,
+        ftol=0.1 * ending.tolerance, gtol=None, tr_solver="lsmr" if sparse else "exact",
+        max_nfev=ending.max_evaluations,
+    )  # fmt: skip
+    return found.x, bool(found.status > 0), found.message
+
+
+def _starts_alone(walk: _Search, free_starts: bool) -> Fit:
+    """With nothing unknown but the starts."""
+    problem, nothing = walk.problem, np.zeros(0)
+    starts, ended, message = walk.starts, True, "nothing to fit"
+    if free_starts:
+        found = fit_starts(problem, nothing, walk.starts)
+        n = int(np.count_nonzero(~found.settled))
+        starts, ended = found.starts, n == 0
+        message = (
+            f"the starts of {n} of {len(starts)} pieces go on moving" if n else "all starts have settled"
+        )
+    evaluation = evaluate(problem, nothing[None], starts[None], slopes=True)[0]
+    point = _Point(nothing, starts, evaluation, evaluation.rows, evaluation.jacobian)
+    return _outcome(point, 1, ended, message)
+
+
+def _outcome(point: _Point, count: int, ended: bool, message: str) -> Fit:
+    evaluation, failed = point.evaluation, point.evaluation.failed
     if failed:
-        message = f"the trajectories of {failed} of {len(starts)} pieces diverge"
+        message = f"the trajectories of {failed} of {len(point.starts)} pieces diverge"
     return Fit(
-        theta, starts, evaluation.cost, ended and not failed, message, unknowns.count, evaluation.residuals,
-        evaluation.rows, evaluation.jacobian,
+        point.theta, point.starts, evaluation.cost, ended and not failed, message, count,
+        evaluation.residuals, evaluation.rows, evaluation.jacobian,
     )  # fmt: skip
 
 

@@ -19,7 +19,6 @@ from pipeline.products.reporting import report
 from pipeline.rig.identify.local import Echo, Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
-from pipeline.rig.identify.starts import fit_starts
 
 Array = NDArray[np.float64]
 
@@ -173,23 +172,12 @@ def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
 def refine(
     problem: Problem, theta: Array, *, stages: Sequence[Problem] | None = None, echo: Echo | None = None
 ) -> Fit:
-    """Fit from one first guess: short stretches, longer ones, whole pieces with free starts.
-
-    Noise in starts that are read off leads short stretches astray where a parameter hardly matters in them.
-    So whole pieces, with starts of their own, decide from which stretches' outcome the last fit begins.
-    """
-    candidates = [np.clip(theta, problem.lower, problem.upper)]
+    """Fit from one first guess: short stretches, longer ones, whole pieces with free starts."""
     for stage in _stages(problem) if stages is None else stages:
-        fit = fit_local(
-            stage, candidates[-1], free_starts=False, max_evaluations=STAGE_EVALUATIONS,
-            tolerance=STAGE_TOLERANCE,
-        )  # fmt: skip
+        fit = fit_local(stage, theta, max_evaluations=STAGE_EVALUATIONS, tolerance=STAGE_TOLERANCE)
         if np.isfinite(fit.cost):
-            candidates.append(fit.theta)
-    starts = [fit_starts(problem, one, problem.starts) for one in candidates]
-    found = evaluate(problem, np.array(candidates), np.array(starts), slopes=False)
-    best = int(np.argmin([np.inf if e.failed else e.cost for e in found]))
-    return fit_local(problem, candidates[best], starts=starts[best], echo=echo)
+            theta = fit.theta
+    return fit_local(problem, theta, echo=echo)
 
 
 def _stages(problem: Problem) -> list[Problem]:

@@ -1,28 +1,36 @@
-"""The pieces' starts for given parameters: small problems of their own, solved side by side."""
+"""The pieces' starts for given parameters: small problems of their own, side by side or projected out."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.objective import Evaluation, evaluate
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 40
 FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-3, 0.1, 10.0, 1e12
-SETTLED = 1e-6
-"""Relative decrease of a piece's cost at which its start counts as found."""
+SETTLED = 1e-10
+"""Relative decrease of a piece's cost, as its slopes promise it, at which its start counts as found."""
 
 
-def fit_starts(problem: Problem, theta: Array, starts: Array) -> Array:
+class Starts(NamedTuple):
+    """Starts, and which of them have settled at an optimum."""
+
+    starts: Array  # (n_piece, n_states)
+    settled: NDArray[np.bool_]  # (n_piece,)
+
+
+def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
     """Least squares of each piece over its own start, the unknowns held (Levenberg and Marquardt).
 
-    All pieces go together through the engine, each with its own damping; gaps between stretches and a robust
-    loss do not count: this prepares a fit of everything.
+    All pieces go together through the engine, each with its own damping; gaps between stretches do not count.
 
     Parameters
     ----------
@@ -34,50 +42,107 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Array:
 
     Returns
     -------
-    ndarray, (n_piece, n_states)
+    Starts
         None of them worse than its guess.
     """
-    held = replace(
-        problem.without(dict(zip(problem.names, theta, strict=True))), continuity=None, loss="linear"
-    )
+    held = replace(problem.without(dict(zip(problem.names, theta, strict=True))), continuity=None)
     found = np.array(starts)
     damping = np.full(len(found), FIRST_DAMPING)
-    costs, slopes = _blocks(held, found)
+    blocks = _blocks(held, found)
     moving = np.ones(len(found), bool)
     for _ in range(MAX_ITERATIONS):
-        trial = found + _steps(slopes, damping) * moving[:, None]
-        new_costs, new_slopes = _blocks(held, trial)
-        better = moving & (new_costs < costs)
-        settled = better & (costs - new_costs < SETTLED * costs)
-        found[better], damping[better] = trial[better], damping[better] * LESS
-        damping[moving & ~better] *= MORE
-        costs = np.where(better, new_costs, costs)
-        slopes = [new if b else old for new, old, b in zip(new_slopes, slopes, better, strict=True)]
-        moving &= ~settled & (damping < MOST_DAMPING)
-        if not moving.any():
+        steps = np.zeros_like(found)
+        for k in np.flatnonzero(moving):
+            steps[k], gain = _step(*blocks[k], damping[k])
+            # where rounding decides, no step is a better one
+            moving[k] = gain > SETTLED * _cost(blocks[k]) and damping[k] < MOST_DAMPING
+        still = np.flatnonzero(moving)
+        if not len(still):
             break
+        part = replace(held, pieces=tuple(held.pieces[k] for k in still))
+        trial = found[still] + steps[still]
+        for k, start, block in zip(still, trial, _blocks(part, trial), strict=True):
+            better = _cost(block) < _cost(blocks[k])
+            damping[k] *= LESS if better else MORE
+            if better:
+                found[k], blocks[k] = start, block
+    return Starts(found, ~moving)
+
+
+def block_rows(problem: Problem) -> list[slice]:
+    """Rows of each piece in a compressed evaluation."""
+    n_own = len(problem.free) + len(problem.model.states)
+    sizes = [min(int(np.isfinite(p.measured).sum()), n_own + 1) for p in problem.pieces]
+    ends = np.cumsum([0, *sizes])
+    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+
+
+class _Block(NamedTuple):
+    """Slopes of a piece's compressed rows by its start, and the rows."""
+
+    jacobian: Array
+    rows: Array
+
+
+def _blocks(problem: Problem, starts: Array) -> list[_Block]:
+    n = len(problem.model.states)
+    whole = evaluate(problem, np.zeros((1, 0)), starts[None], slopes=True)[0]
+    return [
+        _Block(whole.jacobian[here, k * n : (k + 1) * n], whole.rows[here])
+        for k, here in enumerate(block_rows(problem))
+    ]
+
+
+def _cost(block: _Block) -> float:
+    return float(0.5 * block.rows @ block.rows)
+
+
+def _step(jacobian: Array, rows: Array, damping: float) -> tuple[Array, float]:
+    """Damped Gauss-Newton step, and the decrease of the cost that the slopes promise without damping."""
+    size = np.sqrt(damping) * np.linalg.norm(jacobian, axis=0)
+    stacked = np.vstack([jacobian, np.diag(np.maximum(size, 1e-300))])
+    right = np.concatenate([-rows, np.zeros(len(size))])
+    within = np.linalg.qr(jacobian)[0].T @ rows
+    return np.linalg.lstsq(stacked, right, rcond=None)[0], float(0.5 * within @ within)
+
+
+def _own(problem: Problem, evaluation: Evaluation, k: int, here: slice) -> Array:
+    """Slopes of a piece's rows by its own start."""
+    n, n_free = len(problem.model.states), len(problem.free)
+    return evaluation.jacobian[here, n_free + k * n : n_free + (k + 1) * n]
+
+
+def carry_starts(problem: Problem, evaluation: Evaluation, starts: Array, change: Array) -> Array:
+    """Starts that a change of the unknowns asks for, to first order, (n_piece, n_states)."""
+    found, n_free = np.array(starts), len(problem.free)
+    for k, here in enumerate(block_rows(problem)):
+        wanted = evaluation.rows[here] + evaluation.jacobian[here, :n_free] @ change
+        found[k] -= np.linalg.lstsq(_own(problem, evaluation, k, here), wanted, rcond=None)[0]
     return found
 
 
-def _blocks(problem: Problem, starts: Array) -> tuple[Array, list[tuple[Array, Array]]]:
-    """Cost of each piece, and its compressed slopes and rows."""
-    n = len(problem.model.states)
-    whole = evaluate(problem, np.zeros((1, 0)), starts[None], slopes=True)[0]
-    blocks, at = [], 0
-    for k, piece in enumerate(problem.pieces):
-        size = min(int(np.isfinite(piece.measured).sum()), n + 1)
-        here = slice(at, at + size)
-        blocks.append((whole.jacobian[here, k * n : (k + 1) * n], whole.rows[here]))
-        at += size
-    return np.array([0.5 * rows @ rows for _, rows in blocks]), blocks
+def project_starts_out(problem: Problem, evaluation: Evaluation) -> tuple[Array, Array]:
+    """Rows and slopes by the unknowns, less what changes of the starts can do.
 
+    Parameters
+    ----------
+    problem
+    evaluation
+        With slopes, at starts that are optimal for its unknowns.
 
-def _steps(blocks: list[tuple[Array, Array]], damping: Array) -> Array:
-    """Damped Gauss-Newton steps, (n_piece, n_states)."""
-    found = []
-    for (jacobian, rows), weight in zip(blocks, damping, strict=True):
-        size = np.sqrt(weight) * np.linalg.norm(jacobian, axis=0)
-        stacked = np.vstack([jacobian, np.diag(np.maximum(size, 1e-300))])
-        right = np.concatenate([-rows, np.zeros(len(size))])
-        found.append(np.linalg.lstsq(stacked, right, rcond=None)[0])
-    return np.array(found)
+    Returns
+    -------
+    tuple of ndarray
+        (m,) and (m, n_free): ``rows @ rows / 2`` is the cost.
+    """
+    n, n_free, last = len(problem.model.states), len(problem.free), 0
+    rows, slopes = [], []
+    for k, here in enumerate(block_rows(problem)):
+        full: Array = np.linalg.qr(_own(problem, evaluation, k, here), mode="complete")[0]
+        rest = full[:, n:].T
+        rows.append(rest @ evaluation.rows[here])
+        slopes.append(rest @ evaluation.jacobian[here, :n_free])
+        last = here.stop
+    rows.append(evaluation.rows[last:])
+    slopes.append(evaluation.jacobian[last:, :n_free])
+    return np.concatenate(rows), np.vstack(slopes)

@@ -11,7 +11,7 @@ import xarray as xr
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.sides import flags_of
 from pipeline.rig.measured.computed import Computed
-from pipeline.rig.measured.distances import Candidate, Cloud, distance_to, floor_of, geometry_of
+from pipeline.rig.measured.distances import Candidate, cloud_of, distance_to, floor_of, geometry_of
 from pipeline.rig.measured.measuring import with_sides
 from pipeline.rig.measured.windows import WindowEdge, window_edges
 from pipeline.runs.derive import AnalysedRun
@@ -103,8 +103,7 @@ def _step(
     states = [str(s) for s in measured["state"].values]
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))
     points, noise = measured["section"].values[step], measured["section_noise"].values[step]
-    known = np.isfinite(points).all(axis=1)
-    cloud = Cloud(points[known], noise[known], int(measured["orbit_period"].values[step]))
+    cloud = cloud_of(points, noise, int(measured["orbit_period"].values[step]))
     floor = floor_of(cloud, geometry, np.random.default_rng(seed))
     candidates = computed.candidates(float(measured["frequency"].values[step]), states)
     ids = computed.attractors["attractor"].values.tolist()

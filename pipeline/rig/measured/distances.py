@@ -114,6 +114,28 @@ class Cloud:
         return one.reshape(-1, both.shape[-1]), two.reshape(-1, both.shape[-1])
 
 
+def cloud_of(points: Floats, noise: Floats, orbit_period: int) -> Cloud:
+    """Return the sections of a step; a cycle of which one is missing (NaN) is left out as a whole."""
+    known = np.asarray(np.isfinite(points).all(axis=1), np.bool_)
+    last = int(np.flatnonzero(known)[-1]) + 1
+    cycle = max(orbit_period, 1)
+    if last >= cycle:
+        n = last // cycle * cycle
+        whole = np.repeat(known[:n].reshape(-1, cycle).all(axis=1), cycle)
+        known = np.concatenate([whole, np.zeros(known.size - n, np.bool_)]) if whole.any() else known
+    return Cloud(points[known], _scatter(points, noise, orbit_period)[known], orbit_period)
+
+
+def _scatter(points: Floats, noise: Floats, orbit_period: int) -> Floats:
+    """Noise of sections, or how far a closed motion is seen to scatter: its drive may jitter."""
+    k = orbit_period
+    if not k or len(points) <= 2 * k:
+        return noise
+    second = points[2 * k :] - 2 * points[k:-k] + points[: -2 * k]
+    seen = np.sqrt(np.nanmean(second**2, axis=0) / 6)
+    return np.asarray(np.maximum(noise, seen))
+
+
 def floor_of(cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> float:
     """Wasserstein-1 between the halves of one recording: what noise, and being a sample, amount to.
 

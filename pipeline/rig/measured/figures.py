@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
@@ -22,7 +24,7 @@ from pipeline.rig.measured.computed import Computed
 LAYOUTS = ("side", "over")
 _MARKERS = {"up": "^", "down": "v", "none": "o"}
 _LOOKS = {"up": (1.9, 0.0), "down": (3.8, pixels.TINT), "none": (1.9, 0.0)}
-SIMULATED = "simulated rig"
+SIMULATED, UNMET = "simulated rig", "0.72"
 
 
 def plot_measured(
@@ -164,9 +166,9 @@ def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, ov
         handles += [
             style.dot(f"{_rig(measured)}, {w}", "black", 4.0, face="none", marker=_MARKERS[w]) for w in ways
         ]
-    elif diagram is None:
+    elif diagram is None or len(diagram.layers) < 2:
         handles += [style.dot(w, style.tinted("black", _LOOKS[w][1]), _LOOKS[w][0] + 1.5) for w in ways]
-        if int(measured.attrs.get("simulated", 0)):
+        if diagram is None and int(measured.attrs.get("simulated", 0)):
             handles.append(Line2D([], [], linestyle="none", label=SIMULATED))
     return handles
 
@@ -193,10 +195,10 @@ def plot_comparison(
     Returns
     -------
     DataFigure
-        Three panels over one axis of frequency: the attractors in their colours with the measured sections as
-        open triangles; the distance from the nearest attractor in units of the noise floor, in its colour and
-        pointing the way of the sweep; strips of the regimes of rig and model, coloured by side, with their
-        periods (a cross: unclosed). Its `data` are `compared`.
+        Three panels over one axis of frequency: the attractors, those in colours that were nearest anywhere,
+        with the measured sections as open triangles; the distance from the nearest attractor in units of the
+        noise floor, in its colour and pointing the way of the sweep; strips of the regimes of rig and model,
+        coloured by side, with their periods (a cross: unclosed). Its `data` are `compared`.
 
     Raises
     ------
@@ -207,7 +209,7 @@ def plot_comparison(
     state = state or names[0]
     style.check_choice("state", state, names)
     measure = labels.state_measure(compared, state, degrees)
-    cast = palette.cast_of(computed.attractors)
+    met = _met(compared, computed)
     ways = [w for w in ("up", "down", "none") if w in compared["direction"].values]
     fig = style.new_figure(6.4 + 0.3 * len(ways), compared, frame)
     grid = fig.add_gridspec(3, 1, height_ratios=[1.0, 0.62, 0.17 * len(ways) + 0.08])
@@ -216,9 +218,9 @@ def plot_comparison(
     for ax in (top, middle, bottom):
         style.style_axes(ax, minor=ax is not bottom)
         ax.tick_params(labelbottom=ax is bottom)
-    shown = _draw_attractors(top, computed, measure, cast)
+    _draw_attractors(top, computed, measure, met)
     _draw_steps(top, compared, measure.shown(compared["section"].sel(state=state).values, wrap=True), True)
-    _draw_distances(middle, compared, cast)
+    _draw_distances(middle, compared, met)
     motions = motions_of(compared)
     _draw_regimes(bottom, compared, motions, ways)
     f = np.concatenate([compared["frequency"].values, computed.frequencies])
@@ -228,28 +230,51 @@ def plot_comparison(
     style.label_axes(middle, y="distance / noise floor")
     style.label_axes(bottom, "drive frequency [Hz]")
     fig.align_ylabels([top, middle])
-    style.complete(fig, top, "", _comparison_handles(compared, cast, shown, motions, ways))
+    style.complete(fig, top, "", _comparison_handles(compared, met, motions, ways))
     return fig
 
 
-def _draw_attractors(ax: Axes, computed: Computed, measure: labels.Measure, cast: palette.Cast) -> list[int]:
-    """Draw the points of all attractors; return the ids that are there."""
+@dataclass(frozen=True)
+class _Met:
+    """Attractors that were nearest to the rig anywhere: their colours and names; whether there are others."""
+
+    colours: dict[int, str]
+    names: dict[int, str]
+    others: bool
+
+
+def _met(compared: xr.Dataset, computed: Computed) -> _Met:
+    """Give the first attractor of each side that side's colour, so that all panels say the same."""
+    cast, motions = palette.cast_of(computed.attractors), motions_of(compared)
+    winners, sides = compared["winner"].values, compared["computed_side"].values
+    ids = [int(i) for i in np.unique(winners) if i >= 0]
+    spare = sorted((c for c in palette.COLOURS if c not in motions.colours), key=lambda c: sum(to_rgb(c)))
+    colours: dict[int, str] = {}
+    for i in sorted(ids, key=lambda i: -int((winners == i).sum())):
+        side = int(np.bincount(sides[winners == i].astype(np.int64)).argmax())
+        own = motions.colours[side]
+        free = bool(side) and own not in colours.values() and own != style.GREY
+        colours[i] = own if free else spare[len(colours) % len(spare)]
+    names = {i: cast.names[i] for i in ids}
+    return _Met(colours, names, len(ids) < computed.attractors.sizes["attractor"])
+
+
+def _draw_attractors(ax: Axes, computed: Computed, measure: labels.Measure, met: _Met) -> None:
+    """Draw the points of all attractors, those that the rig did not meet in grey."""
     found = computed.attractors
     points = found["attractor_points"].sel(state=measure.name).transpose(FREQUENCY_DIM, "attractor", "point")
     values = measure.shown(points.values, wrap=True)
-    shown = []
     for i, number in enumerate(found["attractor"].values.tolist()):
         x = np.broadcast_to(computed.frequencies[:, None], values[:, i].shape)
         kept = np.isfinite(values[:, i])
         if kept.any():
-            shown.append(number)
-            ax.plot(x[kept], values[:, i][kept], linestyle="none", marker="o", markersize=1.6, zorder=2.0,
-                    markeredgewidth=0.0, color=cast.colours[number], rasterized=True,
-                    gid=f"points:{letter(number)}")  # fmt: skip
-    return shown
+            own = number in met.colours
+            ax.plot(x[kept], values[:, i][kept], linestyle="none", marker="o", markersize=1.6 if own else 1.2,
+                    zorder=2.0 if own else 1.8, markeredgewidth=0.0, color=met.colours.get(number, UNMET),
+                    rasterized=True, gid=f"points:{letter(number)}")  # fmt: skip
 
 
-def _draw_distances(ax: Axes, compared: xr.Dataset, cast: palette.Cast) -> None:
+def _draw_distances(ax: Axes, compared: xr.Dataset, met: _Met) -> None:
     ax.set_yscale("log")
     ax.axhline(1.0, color="0.5", linewidth=0.7, zorder=1.0)
     f, d = compared["frequency"].values, compared["distance_in_noise"].values
@@ -257,9 +282,9 @@ def _draw_distances(ax: Axes, compared: xr.Dataset, cast: palette.Cast) -> None:
     for way in np.unique(ways):
         for number in np.unique(winners[winners >= 0]):
             chosen = (ways == way) & (winners == number)
-            face = cast.colours[int(number)] if way != "down" else "white"
+            face = met.colours[int(number)] if way != "down" else "white"
             ax.plot(f[chosen], d[chosen], linestyle="none", marker=_MARKERS[way], markersize=4.0, zorder=2.0,
-                    markeredgewidth=0.8, markeredgecolor=cast.colours[int(number)], markerfacecolor=face,
+                    markeredgewidth=0.8, markeredgecolor=met.colours[int(number)], markerfacecolor=face,
                     gid=f"distance:{way}:{letter(int(number))}")  # fmt: skip
     known = d[np.isfinite(d)]
     if known.size:
@@ -308,10 +333,9 @@ def _draw_strip(
             )
 
 
-def _comparison_handles(
-    compared: xr.Dataset, cast: palette.Cast, shown: Sequence[int], motions: Motions, ways: Sequence[str]
-) -> list[Any]:
-    handles: list[Any] = [style.dot(cast.names[i], cast.colours[i]) for i in shown if i in cast.main]
+def _comparison_handles(compared: xr.Dataset, met: _Met, motions: Motions, ways: Sequence[str]) -> list[Any]:
+    handles: list[Any] = [style.dot(name, met.colours[i]) for i, name in met.names.items()]
+    handles += [style.dot("not met by the rig", UNMET)] if met.others else []
     handles += [
         style.dot(f"{_rig(compared)}{', ' + w if w != 'none' else ''}", "black", 4.0, face="none",
                   marker=_MARKERS[w]) for w in ways

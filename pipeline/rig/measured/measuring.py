@@ -20,6 +20,9 @@ from pipeline.rig.measured.sections import ORDER, WINDOW_S, find_sections, name_
 from pipeline.rig.measured.steps import LEAST, TRANSIENT, Stretch, cut
 from pipeline.spec.problems import SpecError
 
+_MEMORY = 3.0
+"""By how much a shaken motion scatters more than one edge moves it: a period has two, and it remembers."""
+_PARTS = ("section", "section_noise", "kink")
 DIRECTIONS = {1: "up", -1: "down", 0: "none"}
 
 
@@ -118,7 +121,7 @@ def _steps(recording: xr.Dataset, number: int, way: Way, parameters: Parameters)
     sections = find_sections(recording, instants, window_s=way.window_s, order=way.order)
     names = tuple(str(n) for n in sections["state"].values)
     scale = np.array([model.state(n).scale for n in names])
-    section, noise = (_in_place(sections, n, instants.rising.size) for n in ("section", "section_noise"))
+    section, noise, kink = (_in_place(sections, n, instants.rising.size) for n in _PARTS)
     found, first = [], 0
     for stretch in stretches:
         own = slice(first, first + stretch.edges.rising.size)
@@ -129,7 +132,8 @@ def _steps(recording: xr.Dataset, number: int, way: Way, parameters: Parameters)
         inner = slice(own.start + int(kept[0]), own.start + int(kept[-1]) + 1)
         points = section[inner]
         blur = _with_instants(points, noise[inner], names, model, stretch.instant_scatter_s)
-        regime = find_period(points / scale, blur / scale, limit=way.limit, max_period=way.max_period)
+        shaken = _shaken(points, blur, np.abs(kink[inner]), names, model, stretch.shake_s)
+        regime = find_period(points / scale, shaken / scale, limit=way.limit, max_period=way.max_period)
         found.append(_Step(stretch, number, names, points, blur, regime))
     return found
 
@@ -158,6 +162,29 @@ def _with_instants(
         rate = model.state(name).rate
         if rate in names:
             both[:, i] = np.hypot(noise[:, i], points[:, names.index(rate)] * scatter_s)
+    return both
+
+
+def _shaken(
+    points: np.ndarray,
+    noise: np.ndarray,
+    kink: np.ndarray,
+    names: tuple[str, ...],
+    model: Model,
+    shake_s: float,
+) -> np.ndarray:
+    """Scatter to be expected of a closed motion whose drive truly jitters.
+
+    An edge that is late by a time lets an angle go on by its rate, and changes a rate by the jump of its
+    derivative, times that time.
+    """
+    if not shake_s:
+        return noise
+    both = noise.copy()
+    for i, name in enumerate(names):
+        rate = model.state(name).rate
+        change = np.abs(points[:, names.index(rate)]) if rate in names else np.nanmedian(kink[:, i])
+        both[:, i] = np.hypot(noise[:, i], _MEMORY * np.nan_to_num(change) * shake_s)
     return both
 
 

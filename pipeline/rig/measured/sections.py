@@ -101,9 +101,10 @@ def find_sections(
     Dataset
         Dims ``edge``, ``state`` (those that are known). ``section`` (edge, state): in the units of the model,
         angles not wrapped; ``section_noise`` (edge, state): standard deviation that the channels' noise
-        leaves in it. Coordinates ``time`` (edge) [s]. An edge with too few samples on a side (a gap, an end)
-        is left out. The attribute ``noise`` tells the noise of a sample by channel, from the residuals, as
-        JSON.
+        leaves in it; ``kink`` (edge, state): by how much the state's derivative jumps at the edge, NaN where
+        a channel cannot tell. Coordinates ``time`` (edge) [s]. An edge with too few samples on a side (a gap,
+        an end) is left out. The attribute ``noise`` tells the noise of a sample by channel, from the
+        residuals, as JSON.
 
     Raises
     ------
@@ -120,20 +121,23 @@ def find_sections(
             f"{name_of(recording)}: no rising edge of the drive has samples on either side; choose a longer "
             "stretch of the recording, or a shorter window_s."
         ])  # fmt: skip
-    kept, values, spread, variance = (np.array(part) for part in zip(*fits, strict=True))
+    kept, values, spread, variance, jumps = (np.array(part) for part in zip(*fits, strict=True))
     noise = np.sqrt(np.median(variance, axis=0))
-    section, blur = (np.full((len(kept), len(model.states)), np.nan) for _ in range(2))
+    section, blur, kink = (np.full((len(kept), len(model.states)), np.nan) for _ in range(3))
     for i, c in enumerate(channels):
         for place, column in ((c.place, 0), (c.slope, 1)):
             if place >= 0:
                 section[:, place] = values[:, i, column]
                 blur[:, place] = spread[:, i, column] * noise[i]
+        # an angle's rate goes on, and bends; a rate that was measured bends itself
+        kink[:, c.slope if c.smooth else c.place] = jumps[:, i] if c.slope >= 0 or not c.smooth else np.nan
     units = [model.states[i].unit for i in known]
     about = {"long_name": "state at the rising edge", "units": "see state_units"}
     return xr.Dataset(
         {
             "section": (("edge", "state"), section[:, known], about),
             "section_noise": (("edge", "state"), blur[:, known], {**about, "long_name": "its noise"}),
+            "kink": (("edge", "state"), kink[:, known], {"long_name": "jump of its derivative"}),
         },
         coords={
             "time": ("edge", edges.rising[kept], {"units": "s", "long_name": "instant of the edge"}),
@@ -163,17 +167,15 @@ def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
 
 def _fits(
     recording: xr.Dataset, edges: Edges, channels: list[Channel], window_s: float, order: int
-) -> list[tuple[int, Floats, Floats, Floats]]:
-    """For edges with enough samples: number, values, their spread per unit noise, residual variance."""
+) -> list[tuple[int, Floats, Floats, Floats, Floats]]:
+    """For edges with enough samples: number, and what `_fit` gives."""
     time = recording["time"].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
     data = np.stack([recording[c.name].values for c in channels], axis=1)
     instants = np.sort(np.concatenate([edges.rising, edges.falling]))
     found = []
     for number, at in enumerate(edges.rising):
-        # an edge that was placed by a line may differ from the one that was seen
-        others = instants[np.abs(instants - at) > 0.25 * window_s]
-        half = min(0.5 * window_s, float(np.abs(others - at).min()) if others.size else math.inf)
+        half = min(0.5 * window_s, _nearest(instants, at, 0.25 * window_s))
         first, last = np.searchsorted(time, [at - half, at + half])
         own = piece[first:last]
         if own.size and (own == own[0]).all():
@@ -183,14 +185,25 @@ def _fits(
     return found
 
 
+def _nearest(instants: Floats, at: float, beyond: float) -> float:
+    """Distance of the nearest instant that is more than `beyond` away, infinite without one.
+
+    An edge that was placed by a line differs a little from the one that was seen.
+    """
+    low, high = np.searchsorted(instants, [at - beyond, at + beyond])
+    before = at - instants[low - 1] if low else math.inf
+    after = instants[high] - at if high < instants.size else math.inf
+    return float(min(before, after))
+
+
 def _fit(
     t: Floats, data: Floats, channels: list[Channel], half: float, order: int
-) -> tuple[Floats, Floats, Floats] | None:
-    """Value and slope (channel, 2) at t = 0, their spread per unit noise, residual variance (channel,)."""
+) -> tuple[Floats, Floats, Floats, Floats] | None:
+    """Value and slope (channel, 2) at t = 0, spread per unit noise; residual variance, kink (channel,)."""
     if min((t < 0).sum(), (t >= 0).sum()) < order + _LEAST_SPARE or not np.isfinite(data).all():
         return None
     values, spread = np.empty((len(channels), 2)), np.empty((len(channels), 2))
-    variance = np.empty(len(channels))
+    variance, jumps = np.empty(len(channels)), np.empty(len(channels))
     for smooth in {c.smooth for c in channels}:
         which = [i for i, c in enumerate(channels) if c.smooth == smooth]
         basis = _basis(t / half, order, smooth)
@@ -201,7 +214,10 @@ def _fit(
         values[which] = coefficients[:2].T * scale
         spread[which] = np.sqrt((inverse[:2] ** 2).sum(axis=1)) * scale
         variance[which] = (residual**2).sum(axis=0) / (len(t) - basis.shape[1])
-    return values, spread, variance
+        # of the curvature, or of the slope: the first pair of coefficients that both sides do not share
+        first = basis.shape[1] - 2 * (order - 1) if smooth else 1
+        jumps[which] = (coefficients[first + 1] - coefficients[first]) * (2 / half**2 if smooth else 1 / half)
+    return values, spread, variance, jumps
 
 
 def _basis(x: Floats, order: int, smooth: bool) -> Floats:

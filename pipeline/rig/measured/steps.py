@@ -17,6 +17,8 @@ TRANSIENT, WINDOW, LEAST = 20, 40, 8
 """Periods dropped after a step; periods of a window of a slow sweep; least periods of a stretch."""
 _OFF = 5.0
 """An edge so many standard deviations off the line through those before it, and the next as well: a step."""
+_TRUE_JITTER = 1.5
+"""A scatter of so many times what measuring explains is the drive's."""
 _BENT = 4.0
 """Curvature of a stretch, in standard errors, that is no chance."""
 _AROUND = 16
@@ -50,6 +52,12 @@ class Stretch:
     instant_scatter_s: float
     instant_error_s: float
     direction: int
+
+    @property
+    def shake_s(self) -> float:
+        """Jitter of the drive itself [s]: what measuring does not explain."""
+        own = self.timing.jitter_s**2 - self.edges.error_s**2
+        return math.sqrt(own) if self.timing.jitter_s > _TRUE_JITTER * self.edges.error_s else 0.0
 
 
 def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) -> list[Stretch]:
@@ -217,7 +225,7 @@ def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
     falling = own.falling - np.interp(own.falling, rising, curve)
     timing = replace(own, rising=rising - curve, falling=falling).frequency()
     line = _line(rising - curve) + curve
-    by_sampling = timing.jitter_s < 1.5 * own.error_s
+    by_sampling = timing.jitter_s <= _TRUE_JITTER * own.error_s
     instants = line if by_sampling else rising
     scatter = timing.jitter_s * math.sqrt(2 / rising.size) if by_sampling else own.error_s
     common = own.common_error(line - curve, timing.jitter_s)

@@ -63,7 +63,7 @@ def _words(row: Row) -> dict[str, str]:
         "frequency Hz": f"{row['frequency_hz']:.{digits}f} ± {error:.{digits}f}",
         "way": row["direction"],
         "jitter ms": number(ms, ".3f"),
-        "duty cycle": f"{row['duty_cycle']:.4f} ± {row['duty_cycle_error']:.4f}",
+        "duty cycle": f"{row['duty_cycle']:.5f} ± {row['duty_cycle_error']:.5f}",
         "sections": str(row["n_sections"]),
         "period": str(row["orbit_period"] or "-"),
         "sure": f"{row['confidence']:.2f}",

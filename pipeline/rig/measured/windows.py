@@ -46,7 +46,7 @@ class WindowEdge:
         The same in the model, for the attractor that is nearest within the window; NaN if there is none with
         that regime, or it goes on to the end of the run's axis.
     note : str
-        Why there is no number.
+        Why there is no number, or what it is worth.
     """
 
     direction: str
@@ -115,6 +115,8 @@ def window_edges(
         f = measured["frequency"].values
         last, first = float(f[one.steps[-1]]), float(f[two.steps[0]])
         computed_hz, error, note = _computed_end(one, measured, winners, computed)
+        if not one.regime[0] and not note:
+            note = "an unclosed motion may be a transient, which ends by chance"
         found.append(
             WindowEdge(
                 one.direction, one.regime, two.regime, 0.5 * (last + first), 0.5 * abs(first - last),

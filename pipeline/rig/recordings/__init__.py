@@ -1,6 +1,6 @@
 """Recordings of a rig: files, their mapping to states, what is wrong with them, their rates."""
 
-from pipeline.rig.recordings.findings import Finding, findings_of
+from pipeline.rig.recordings.findings import Finding, findings_of, summary
 from pipeline.rig.recordings.mapping import Mapping, load_mapping, parse_mapping
 from pipeline.rig.recordings.reading import read_recording, recording_of, window
 from pipeline.rig.recordings.smoothing import smooth
@@ -8,5 +8,5 @@ from pipeline.rig.recordings.writing import mapping_for, write_raw, write_record
 
 __all__ = [
     "Finding", "Mapping", "findings_of", "load_mapping", "mapping_for", "parse_mapping", "read_recording",
-    "recording_of", "smooth", "window", "write_raw", "write_recording",
+    "recording_of", "smooth", "summary", "window", "write_raw", "write_recording",
 ]  # fmt: skip

@@ -186,14 +186,17 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
     """Say where the file states another rate than the mapping."""
     if stated is None:
         return []
-    own = {c.name: step_of(c) for c in stretches[0].values()}
-    return [
-        Finding(
-            "rate", name, math.nan, math.nan, "warning",
-            f"the file says {1.0 / step:.8g} Hz, the mapping {1.0 / stated:.8g} Hz; the mapping's is used.",
-        )
-        for name, step in own.items() if math.isfinite(step) and abs(step / stated - 1.0) > 1e-6
-    ]  # fmt: skip
+    findings = []
+    for name, channel in stretches[0].items():
+        step = step_of(channel)
+        if math.isfinite(step) and abs(step / stated - 1.0) > 1e-6:
+            rates = f"the file says {1.0 / step:.8g} Hz, the mapping {1.0 / stated:.8g} Hz"
+            text = f"{rates}; the mapping's is used."
+            findings.append(Finding("rate", name, math.nan, math.nan, "warning", text))
+        if channel.time is not None:
+            text = "the file's time stamps are not used, nor gaps in them seen: the mapping states a rate."
+            findings.append(Finding("rate", name, math.nan, math.nan, "note", text))
+    return findings
 
 
 def _aligned(

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.rig.recordings.findings import Finding
 from pipeline.rig.recordings.mapping import CsvMap
 from pipeline.rig.recordings.raw import Channel, Raw, digest
-from pipeline.rig.recordings.text import number, read_text, split, table, unique, without_end
+from pipeline.rig.recordings.text import instants, number, read_text, split, table, unique, without_end
 from pipeline.spec.problems import SpecError
 
 SIMULATED = "# simulated"
@@ -36,12 +36,15 @@ class _Form:
     n_columns : int
     n_head : int
         Rows before the numbers.
+    texts : tuple of int
+        Columns without numbers.
     """
 
     delimiter: str
     decimal: str
     n_columns: int
     n_head: int
+    texts: tuple[int, ...]
 
 
 def read_csv(path: Path, stated: CsvMap) -> Raw:
@@ -50,6 +53,7 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
     Lines that begin with ``#`` are comments. The first row with names, if there is one, gives the channels'
     names; a second one their units, as do brackets after a name: ``angle [V]``. Without names the columns are
     ``1``, ``2``, ... What is empty, or no number, is NaN; after the last number of a column it is nothing.
+    Dates and times of day become seconds since the first; other texts are left out.
 
     Parameters
     ----------
@@ -78,13 +82,25 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
             "truncated", "", math.nan, math.nan, "warning",
             f"the last row has {len(last)} of {form.n_columns} fields; it is left out.",
         ))  # fmt: skip
-    values = table(body, form.n_columns, form.delimiter, form.decimal)
-    found = {
-        name: Channel(name, without_end(values[:, j]), unit)
-        for j, (name, unit) in enumerate(zip(names, units, strict=True))
-        if np.isfinite(values[:, j]).any()
-    }
+    found = {}
+    for j, values in _columns(body, form).items():
+        if np.isfinite(values).any():
+            found[names[j]] = Channel(names[j], without_end(values), units[j])
     return Raw(path, "csv", digest(path), (found,), tuple(findings), simulated=is_simulated)
+
+
+def _columns(body: list[str], form: _Form) -> dict[int, np.ndarray]:
+    """Columns of numbers, and those of dates or times of day [s since the first]; no other texts."""
+    numbers = [j for j in range(form.n_columns) if j not in form.texts]
+    values = table(body, numbers, form.delimiter, form.decimal)
+    found = {j: values[:, k] for k, j in enumerate(numbers)}
+    if form.texts:
+        parts = [split(line, form.delimiter) for line in body]
+        for j in form.texts:
+            stamps = instants([row[j] if j < len(row) else "" for row in parts])
+            if stamps is not None:
+                found[j] = stamps
+    return dict(sorted(found.items()))
 
 
 def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
@@ -104,6 +120,8 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
                 "[csv] delimiter, decimal, header or skip_rows in the mapping."
             ]
         )
+    fewest = min(len(f.texts) for f in found)
+    found = [f for f in found if len(f.texts) == fewest]
     # a row of names has as many fields as the rows of numbers
     named = [f for f in found if f.n_head and len(split(rows[0], f.delimiter)) == f.n_columns]
     best = max(f.n_columns for f in named or found)
@@ -123,19 +141,29 @@ def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> 
     """Return the form with this delimiter and decimal point, None if it does not fit."""
     sample = rows[:LOOKED_AT]
     parsed = [[number(part, decimal) for part in split(row, delimiter)] for row in sample]
-    is_text = [any(v is None for v in row) or all(v is None or v != v for v in row) for row in parsed]
-    n_head = next((i for i, text in enumerate(is_text) if not text), len(sample))
+    late = parsed[len(parsed) // 2 :]
+    n_columns = max((len(row) for row in late), default=0)
+    fields = [[row[j] for row in late if j < len(row)] for j in range(n_columns)]
+    texts = tuple(j for j, own in enumerate(fields) if all(v is None for v in own))
+    numbers = [j for j in range(n_columns) if j not in texts]
+
+    def is_body(row: list[float | None]) -> bool:
+        own = [row[j] for j in numbers if j < len(row)]
+        return None not in own and any(v == v for v in own)
+
+    n_head = next((i for i, row in enumerate(parsed) if is_body(row)), len(parsed))
     if header is not None:
         n_head = max(n_head, 1) if header else 0
     body = parsed[n_head:]
-    if not body or n_head > LOOKED_AT // 2:
+    if not body or not numbers or n_head > LOOKED_AT // 2:
         return None
-    n_columns = max(len(row) for row in body)
     whole = body[:-1] if len(rows) <= LOOKED_AT and len(body) > 1 else body
-    if any(len(row) != n_columns or all(v is None for v in row) for row in whole):
+    if any(len(row) != n_columns for row in whole):
         return None
-    n_bad = sum(v is None for row in body for v in row)
-    return _Form(delimiter, decimal, n_columns, n_head) if n_bad <= 0.1 * len(body) * n_columns else None
+    n_bad = sum(row[j] is None for row in body for j in numbers if j < len(row))
+    if n_bad > 0.1 * len(body) * len(numbers):
+        return None
+    return _Form(delimiter, decimal, n_columns, n_head, texts)
 
 
 def _names(head: list[list[str]], n_columns: int) -> tuple[list[str], list[str]]:

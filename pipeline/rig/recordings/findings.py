@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
@@ -77,6 +77,28 @@ def to_json(findings: Iterable[Finding]) -> str:
         for f in findings
     ]
     return json.dumps(rows)
+
+
+def summary(findings: Iterable[Finding]) -> list[str]:
+    """Lines for people: the gravest first, those of one kind and channel in one line.
+
+    Returns
+    -------
+    list of str
+        Empty if there are no findings.
+    """
+    groups: dict[tuple[str, str, str], list[Finding]] = {}
+    for f in sorted(findings, key=lambda f: -SEVERITIES.index(f.severity)):
+        groups.setdefault((f.severity, f.kind, f.channel), []).append(f)
+    return [_group_line(*key, own) for key, own in groups.items()]
+
+
+def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) -> str:
+    """How often, where first, and what the first says."""
+    first = own[0]
+    where = "" if math.isnan(first.start_s) else f" at {first.start_s:.6g} s"
+    often = f" ({len(own)} times, first{where})" if len(own) > 1 else where
+    return f"{severity}: {kind}{f' of {channel}' if channel else ''}{often}: {first.text}"
 
 
 def runs(mask: np.ndarray, piece: np.ndarray | None = None) -> np.ndarray:

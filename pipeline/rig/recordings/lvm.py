@@ -167,7 +167,7 @@ def _channels(segment: _Segment, style: _Style, zero: float) -> dict[str, Channe
     columns = _columns(segment)
     names = dict(zip(columns, unique([segment.names[j] for j in columns]), strict=True))
     # a name alone at the end of a line is a comment's
-    values = table(segment.lines, max(columns, default=-1) + 1, style.separator, style.decimal)
+    values = table(segment.lines, range(max(columns, default=-1) + 1), style.separator, style.decimal)
     starts = _instants(segment, style)
     found = {}
     for j, x in columns.items():

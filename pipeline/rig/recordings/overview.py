@@ -11,7 +11,7 @@ import xarray as xr
 
 from pipeline.products.product import Table
 from pipeline.rig.recordings.clock import step_of
-from pipeline.rig.recordings.findings import SEVERITIES, Finding, findings_of
+from pipeline.rig.recordings.findings import Finding, findings_of, summary
 from pipeline.rig.recordings.mapping import DRIVE
 from pipeline.rig.recordings.raw import Raw
 
@@ -122,19 +122,8 @@ def _findings_table(findings: Sequence[Finding]) -> Table:
         }
         for f in findings
     ]  # fmt: skip
-    groups: dict[tuple[str, str, str], list[Finding]] = {}
-    for f in sorted(findings, key=lambda f: -SEVERITIES.index(f.severity)):
-        groups.setdefault((f.severity, f.kind, f.channel), []).append(f)
-    lines = [_group_line(*key, own) for key, own in groups.items()]
+    lines = summary(findings)
     return Table(rows, lines or ["findings: none"])
-
-
-def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) -> str:
-    """Findings of one kind in a line: how often, where first, and what the first says."""
-    first = own[0]
-    where = "" if math.isnan(first.start_s) else f" at {first.start_s:.6g} s"
-    often = f" ({len(own)} times, first{where})" if len(own) > 1 else where
-    return f"{severity}: {kind}{f' of {channel}' if channel else ''}{often}: {first.text}"
 
 
 def _number(value: float) -> str:

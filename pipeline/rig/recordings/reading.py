@@ -15,7 +15,7 @@ import xarray as xr
 
 from pipeline.rig.recordings import checks, formats, units
 from pipeline.rig.recordings.clock import Clock, clock_of
-from pipeline.rig.recordings.findings import Finding, to_json
+from pipeline.rig.recordings.findings import Finding, findings_of, to_json
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, Scaled, load_mapping
 from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.spec.problems import SpecError, unknown_name
@@ -74,12 +74,11 @@ def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | 
         As `read_recording` does.
     """
     columns = _resolved(raw, mapping)
-    stretches = [_timed(raw, s, mapping, columns) for s in raw.stretches]
-    numbers = None
-    if mapping.piece is not None:
-        numbers = np.concatenate([s[columns["piece"]].values for s in raw.stretches])
+    findings = list(raw.findings)
+    parts = [_timed(s, mapping, columns, findings) for s in raw.stretches]
+    stretches, numbers = [part[0] for part in parts], np.concatenate([part[1] for part in parts])
     clock = clock_of(stretches, mapping.sampling_rate_hz, str(raw.path), numbers=numbers, apart=raw.apart)
-    findings = [*raw.findings, *clock.findings, *_unit_findings(raw, mapping, columns)]
+    findings += [*clock.findings, *_unit_findings(raw, mapping, columns)]
     variables: dict[str, np.ndarray] = {}
     for name in _entries(mapping):
         signal = checks.Signal(name, _joined(stretches, name, clock), clock.time, clock.piece)
@@ -92,7 +91,7 @@ def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | 
 
 
 def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
-    """Return a part of a recording; time goes on counting from the recording's first sample.
+    """Return a part of a recording, with the findings in it; time goes on counting from its first sample.
 
     Parameters
     ----------
@@ -117,7 +116,8 @@ def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
                 f"{Path(str(ds.attrs.get('file', ''))).name} goes from {time[0]:g} to {time[-1]:g} s."
             ]
         )
-    return ds.isel({DIM: np.flatnonzero(inside)})
+    kept = [f for f in findings_of(ds) if not (f.end_s < low - slack or f.start_s > high + slack)]
+    return ds.isel({DIM: np.flatnonzero(inside)}).assign_attrs(findings=to_json(kept))
 
 
 def _entries(mapping: Mapping) -> dict[str, Scaled]:
@@ -159,19 +159,31 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _timed(
-    raw: Raw, stretch: AnyMapping[str, Channel], mapping: Mapping, columns: dict[str, str]
-) -> dict[str, Channel]:
-    """Channels of a stretch by their names in the dataset, with the time stamps that the mapping names."""
+    stretch: AnyMapping[str, Channel], mapping: Mapping, columns: dict[str, str], findings: list[Finding]
+) -> tuple[dict[str, Channel], np.ndarray]:
+    """Channels of a stretch by their names in the dataset, with the mapping's time stamps; piece numbers.
+
+    What is longer than the time stamps or the numbers is cut, and said in `findings`.
+    """
     chosen = {name: replace(stretch[columns[name]], name=name) for name in _entries(mapping)}
-    if mapping.time is None:
-        return chosen
-    scale = units.factor(mapping.time.unit, "s") or 1.0
-    stamps = scale * stretch[columns["time"]].values
-    timed = {}
-    for name, channel in chosen.items():
-        n = min(len(channel), len(stamps))
-        timed[name] = replace(channel, values=channel.values[:n], time=stamps[:n])
-    return timed
+    axes = {name: stretch[columns[name]].values for name in ("time", "piece") if name in columns}
+    for name, values in axes.items():
+        for own, channel in chosen.items():
+            if len(channel) > len(values):
+                text = (
+                    f"has {len(channel)} samples, the channel of {name} {len(values)}; the last are left out."
+                )
+                findings.append(Finding("length", own, math.nan, math.nan, "warning", text))
+                chosen[own] = replace(channel, values=channel.values[: len(values)])
+        longest = max(map(len, chosen.values()))
+        if len(values) > longest:
+            text = f"has {len(values)} samples, the longest channel {longest}; the last are left out."
+            findings.append(Finding("length", name, math.nan, math.nan, "warning", text))
+    if mapping.time is not None:
+        stamps = (units.factor(mapping.time.unit, "s") or 1.0) * axes["time"]
+        chosen = {name: replace(c, time=stamps[: len(c)]) for name, c in chosen.items()}
+    first = next(iter(chosen.values()))
+    return chosen, axes.get("piece", np.zeros(len(first)))[: len(first)]
 
 
 def _joined(stretches: Sequence[AnyMapping[str, Channel]], name: str, clock: Clock) -> np.ndarray:

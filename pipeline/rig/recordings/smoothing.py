@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -32,6 +32,12 @@ GROWTH = 1.25
 
 ENOUGH = 1.5
 """A window whose score is so many times the least ends the search for a longer one."""
+
+SHORT = (0.7, 0.2)
+"""Shares of the window below which a stretch has polynomials of an order less.
+
+On swings of the paper's pendulum with noise of 1 and 11 mrad this halves the error of the rates there.
+"""
 
 LONG = 63
 """Windows longer than this go through Fourier transforms [samples]."""
@@ -152,12 +158,31 @@ def _parts(ds: xr.Dataset, name: str, edges: np.ndarray) -> np.ndarray:
     return np.column_stack([begins[kept], ends[kept]])
 
 
-@cache
-def _leverage(width: int, order: int) -> np.ndarray:
-    """Weight of a sample in its own fitted value, by its place in the window."""
+class _Basis(NamedTuple):
+    """Polynomials on a window, orthonormal on its samples.
+
+    Attributes
+    ----------
+    values, slopes : ndarray
+        (width, order + 1); slopes per sample.
+    leverage : ndarray
+        (width,) weight of a sample in its own fitted value.
+    """
+
+    values: np.ndarray
+    slopes: np.ndarray
+    leverage: np.ndarray
+
+
+@lru_cache(64)
+def _basis(width: int, order: int) -> _Basis:
+    half = width // 2
     x = np.linspace(-1.0, 1.0, width)
-    q, _ = np.linalg.qr(np.polynomial.legendre.legvander(x, order))
-    return np.asarray((q**2).sum(axis=1))
+    plain = np.polynomial.legendre.legvander(x, order)
+    derived = np.stack([np.polynomial.Legendre.basis(k).deriv()(x) for k in range(order + 1)], axis=1)
+    values, mixing = np.linalg.qr(plain)
+    slopes = np.linalg.solve(mixing.T, derived.T).T / half
+    return _Basis(values, slopes, (values**2).sum(axis=1))
 
 
 class _Fit:
@@ -175,10 +200,9 @@ class _Fit:
 
 def _gain(width: int, order: int, derivative: int, step: float) -> float:
     """Standard deviation of a smoothed value, or rate, in the middle of a window over that of a sample."""
-    from scipy.signal import savgol_coeffs
-
-    fitted = min(order, width - 1)
-    return float(np.linalg.norm(savgol_coeffs(width, fitted, deriv=derivative, delta=step)))
+    basis = _basis(width, order)
+    rows = basis.slopes / step if derivative else basis.values
+    return float(np.linalg.norm(rows[width // 2]))
 
 
 def _fit(values: np.ndarray, parts: np.ndarray, width: int | None, order: int, step: float) -> _Fit:
@@ -198,30 +222,12 @@ def _first_samples(parts: np.ndarray, count: int) -> np.ndarray:
     return used
 
 
-def _filtered(y: np.ndarray, width: int, order: int, derivative: int = 0, step: float = 1.0) -> np.ndarray:
-    """Values or slopes of the local polynomials of a stretch, one-sided at its ends.
-
-    What `scipy.signal.savgol_filter` gives; long windows go through Fourier transforms, whose time does not
-    grow with the window.
-    """
-    from scipy.signal import oaconvolve, savgol_coeffs, savgol_filter
-
-    if width <= LONG:
-        return np.asarray(savgol_filter(y, width, order, deriv=derivative, delta=step, mode="interp"))
-    half = width // 2
-    inner = oaconvolve(y, savgol_coeffs(width, order, deriv=derivative, delta=step), mode="valid")
-    x = np.linspace(-1.0, 1.0, width)
-    ends = []
-    for part, places in ((y[:width], x[:half]), (y[-width:], x[width - half :])):
-        fit = np.polynomial.Legendre.fit(x, part, order, domain=[-1.0, 1.0])
-        ends.append(fit.deriv(derivative)(places) / (half * step) ** derivative)
-    return np.concatenate([ends[0], inner, ends[1]])
-
-
 def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
     """Window with the least error of prediction."""
     first = _least(order)
     used = _first_samples(parts, MOST_SAMPLES)
+    if len(used):
+        values, used = values[used[0, 0] : used[-1, 1]], used - used[0, 0]
     longest = int(np.diff(used, axis=1).max(initial=first))
     best, best_score, width = first, math.inf, first
     while width <= longest:
@@ -236,37 +242,69 @@ def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
 
 def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, step: float) -> _Fit:
     """Fit all stretches with one window, or a shorter one where a stretch is shorter."""
-    smooth_values, rates = np.full(len(values), np.nan), np.full(len(values), np.nan)
-    squares = freedom = predicted = 0.0
-    count = 0
-    for begin, end in parts.tolist():
-        n = end - begin
-        own = min(width, n if n % 2 else n - 1)
-        if own <= order:
-            continue
-        y = values[begin:end]
-        mean = float(y.mean())
-        centred = y - mean
-        fitted = _filtered(centred, own, order)
-        smooth_values[begin:end] = fitted + mean
-        rates[begin:end] = _filtered(centred, own, order, 1, step)
-        leverage = _along(own, order, n)
-        residual = centred - fitted
-        free = 1.0 - leverage
-        squares += float(residual @ residual)
-        freedom += float(free.sum())
-        inner = free > 1e-9
-        predicted += float(((residual[inner] / free[inner]) ** 2).sum())
-        count += int(inner.sum())
-    noise = math.sqrt(squares / freedom) if freedom > 0.5 else math.nan
-    return _Fit(smooth_values, rates, noise, width, predicted / count if count else math.inf)
+    fitted, slopes, leverage = (np.full(len(values), np.nan) for _ in range(3))
+    lengths = np.diff(parts, axis=1).ravel()
+    own = np.minimum(width, lengths - 1 + lengths % 2)
+    for w in np.unique(own).tolist():
+        own_order = _order_of(w, width, order)
+        if w > own_order:
+            _fit_ends(values, parts[own == w], w, own_order, (fitted, slopes, leverage))
+    _fit_middles(values, parts[own == width], width, order, (fitted, slopes, leverage))
+    known = np.isfinite(fitted)
+    residual, free = (values - fitted)[known], 1.0 - leverage[known]
+    freedom = float(free.sum())
+    noise = math.sqrt(float(residual @ residual) / freedom) if freedom > 0.5 else math.nan
+    inner = free > 1e-9
+    score = float(np.mean((residual[inner] / free[inner]) ** 2)) if inner.any() else math.inf
+    return _Fit(fitted, slopes / step, noise, width, score)
 
 
-def _along(width: int, order: int, n: int) -> np.ndarray:
-    """Leverage of the samples of a stretch: of the centred window, and off its centre at the ends."""
-    own = _leverage(width, order)
+def _order_of(own: int, width: int, order: int) -> int:
+    """Order in a window that a short stretch makes shorter: what noise adds there outweighs what curves."""
+    return max(order - sum(own < share * width for share in SHORT), 1)
+
+
+def _fit_ends(
+    values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]
+) -> None:
+    """Fill in the first and the last half of a window, and its middle, from the whole window there."""
+    basis, half = _basis(width, order), width // 2
+    for begins, rows in ((parts[:, 0], slice(0, half + 1)), (parts[:, 1] - width, slice(half, width))):
+        window = values[begins[:, None] + np.arange(width)]
+        mean = window.mean(axis=1, keepdims=True)
+        weights = (window - mean) @ basis.values
+        places = begins[:, None] + np.arange(width)[rows]
+        out[0][places] = mean + weights @ basis.values[rows].T
+        out[1][places] = weights @ basis.slopes[rows].T
+        out[2][places] = basis.leverage[rows]
+
+
+def _fit_middles(
+    values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]
+) -> None:
+    """Fill in what has half a window on either side, by convolution."""
     half = width // 2
-    result = np.full(n, own[half])
-    result[:half] = own[:half]
-    result[n - half :] = own[width - half :]
-    return result
+    long = parts[np.diff(parts, axis=1).ravel() > width + 1]
+    if not len(long):
+        return
+    change = np.zeros(len(values) + 1, dtype=np.int64)
+    change[long[:, 0] + half + 1] += 1
+    change[long[:, 1] - half - 1] -= 1
+    is_middle = np.cumsum(change[:-1]) > 0
+    known = np.isfinite(values)
+    mean = float(values[known].mean())
+    centred = np.where(known, values - mean, 0.0)  # no window of a middle has one that is not known
+    basis = _basis(width, order)
+    out[0][is_middle] = mean + _convolved(centred, basis.values @ basis.values[half])[is_middle]
+    out[1][is_middle] = _convolved(centred, basis.values @ basis.slopes[half])[is_middle]
+    out[2][is_middle] = basis.leverage[half]
+
+
+def _convolved(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Weighted sums about each sample; the time of Fourier transforms hardly grows with the window."""
+    from scipy.ndimage import correlate1d
+    from scipy.signal import oaconvolve
+
+    if len(weights) <= LONG:
+        return np.asarray(correlate1d(y, weights, mode="constant"))
+    return np.asarray(oaconvolve(y, weights[::-1], mode="same"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import numpy as np
 
 from pipeline.spec.problems import SpecError
 
-MAX_LINE = 1_000_000
-"""Longest line of a text that is one [characters]."""
+_INSTANT = re.compile(
+    r"(?:(?P<date>\d{4}-\d\d-\d\d)[T ])?(?P<time>\d\d:\d\d:\d\d(?:\.\d{1,9})?)(?P<zone>Z|[+-]\d\d:?\d\d)?"
+)
 
 
 def read_text(path: Path) -> str:
@@ -59,41 +61,62 @@ def split(line: str, delimiter: str) -> list[str]:
     return line.split(delimiter)
 
 
-def table(lines: Sequence[str], n_columns: int, delimiter: str, decimal: str) -> np.ndarray:
+def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal: str) -> np.ndarray:
     """Return rows of numbers; what is empty, missing or no number is NaN.
 
     Parameters
     ----------
     lines
         Without their ends.
-    n_columns
-        Fields that count; further ones are left out, such as comments.
+    columns
+        Fields that are wanted, by number from 0.
 
     Returns
     -------
     ndarray
         (n_lines, n_columns).
     """
-    if not lines or n_columns == 0:
-        return np.empty((len(lines), n_columns))
+    if not lines or not columns:
+        return np.empty((len(lines), len(columns)))
     text = "\n".join(lines)
     if decimal == ",":
         text = text.replace(",", ".")
     try:
         found = np.loadtxt(
-            io.StringIO(text), delimiter=None if delimiter == " " else delimiter, usecols=range(n_columns),
+            io.StringIO(text), delimiter=None if delimiter == " " else delimiter, usecols=columns,
             ndmin=2, comments=None, quotechar='"',
         )  # fmt: skip
-        if found.shape == (len(lines), n_columns):
+        if found.shape == (len(lines), len(columns)):
             return found
     except (ValueError, IndexError):
         pass  # empty or short rows: slower, field by field
-    rows = np.full((len(lines), n_columns), np.nan)
+    rows = np.full((len(lines), len(columns)), np.nan)
     for i, line in enumerate(lines):
-        for j, part in enumerate(split(line, delimiter)[:n_columns]):
-            value = number(part, decimal)
-            rows[i, j] = np.nan if value is None else value
+        parts = split(line, delimiter)
+        for k, j in enumerate(columns):
+            value = number(parts[j], decimal) if j < len(parts) else None
+            rows[i, k] = np.nan if value is None else value
     return rows
+
+
+def instants(fields: Sequence[str]) -> np.ndarray | None:
+    """Return dates, or times of day, as seconds since the first; None of other texts.
+
+    Parameters
+    ----------
+    fields
+        In the order of ISO 8601, with a blank or a T between date and time, and a point or a comma before the
+        parts of a second.
+    """
+    found = [_INSTANT.fullmatch(f.strip().strip('"').replace("/", "-").replace(",", ".")) for f in fields]
+    known = [m for m in found if m is not None]
+    if len(known) < len(found) or not known or len({m["zone"] for m in known}) > 1:
+        return None
+    try:
+        stamps = np.array([f"{m['date'] or '1970-01-01'}T{m['time']}" for m in known], dtype="datetime64[ns]")
+    except ValueError:  # the 31st of February
+        return None
+    return np.asarray((stamps - stamps[0]).astype(np.float64) * 1e-9)
 
 
 def unique(names: Sequence[str]) -> list[str]:

@@ -202,6 +202,27 @@ def test_load_rig__reads_a_specification(tmp_path):
     assert set(raw.stretches[0]) == {"rig/psi1", "rig/drive"}
 
 
+def test_parse_rig__sweep_is_its_steps():
+    data = {
+        "model": "pendulum", "sampling_rate_hz": 100.0, "sensors": {"psi1": {"kind": "encoder"}},
+        "drive": {"sweep": {"start_hz": 3.0, "stop_hz": 2.0, "num": 5, "n_periods": 6}},
+    }  # fmt: skip
+    rig = parse_rig(data)
+    assert [s.frequency_hz for s in rig.drive] == [3.0, 2.75, 2.5, 2.25, 2.0]
+    assert {s.n_periods for s in rig.drive} == {6}
+    data["drive"]["steps"] = [{"frequency_hz": 1.0, "n_periods": 1}]
+    with pytest.raises(SpecError, match="drive: give steps or sweep, one of them"):
+        parse_rig(data)
+
+
+def test_record__offset_is_what_the_mapping_does_not_know(parameters):
+    true = record(parameters, [Step(2.2, 14)], START, TIMES, sensors=ideal("psi1"), seed=0)["psi1"]
+    for kind in ("encoder", "potentiometer"):
+        sensor = Sensor(kind, offset=0.02)
+        ds = record(parameters, [Step(2.2, 14)], START, TIMES, sensors={"psi1": sensor}, seed=0)
+        np.testing.assert_allclose(ds["psi1"] - true, 0.02, atol=1e-12)
+
+
 def test_parse_rig__names_all_problems_at_once():
     with pytest.raises(SpecError) as caught:
         parse_rig({

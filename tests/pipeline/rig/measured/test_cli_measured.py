@@ -122,3 +122,25 @@ def test_measured_diagram__refuses_a_state_and_a_folder_that_are_not_there(main,
     assert (code, "unknown state 'psi3'" in err) == (2, True)
     code, _, err = main(*words, "--out", tmp_path / "gone" / "a.png")
     assert (code, "no such folder" in err) == (2, True)
+
+
+def test_measured_compare__a_run_that_does_not_fit_is_refused_before_anything_is_read(
+    main, files, run_directory, tmp_path
+):
+    sine = files / "sine.toml"
+    sine.write_text((files / "rig.toml").read_text().replace('"pendulum"', '"pendulum-sine"', 1), "utf-8")
+    more = ("--out", tmp_path / "out")
+    code, _, err = main("measured", "compare", run_directory, files / "gone.tdms", "--mapping", sine, *more)
+    assert code == 2
+    assert "a run of the model pendulum, while the recordings' mapping says pendulum-sine" in err
+    code, _, err = main(
+        "measured", "compare", run_directory, files / "gone.tdms", "--mapping", files / "rig.toml", *more,
+        "--at", "q=1.5",
+    )  # fmt: skip
+    assert code == 2
+    assert "unknown axis 'q'" in err
+    code, _, err = main(
+        "measured", "steps", *[files / "up.tdms"] * 2, "--mapping", sine, "--mapping", files / "rig.toml"
+    )  # fmt: skip
+    assert code == 2
+    assert "of the models pendulum, pendulum-sine" in err

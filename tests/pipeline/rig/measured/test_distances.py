@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import wasserstein_distance
 
 from pipeline.analysis.sets import Geometry
-from pipeline.rig.measured.distances import Candidate, Cloud, distance_to, floor_of, wasserstein
+from pipeline.rig.measured.distances import Candidate, Cloud, cloud_of, distance_to, floor_of, wasserstein
 
 LINE = Geometry((False,), (2.0,))
 CIRCLE = Geometry((True, False), (1.0, 10.0))
@@ -47,6 +47,17 @@ def test_floor_of__halves_hold_whole_cycles(n):
     """Unequal numbers of an orbit's points would cost a way of 1 between them."""
     points = np.tile([[0.0, 0.0], [1.0, 0.0], [2.0, 3.0]], (21, 1))[:n]
     assert floor_of(cloud(points, 1e-3, 3), CIRCLE, np.random.default_rng(0)) < 5e-3
+
+
+def test_cloud_of__a_cycle_with_a_gap_is_left_out_whole():
+    """Without its neighbours of the same cycle, so that each point of the orbit weighs alike."""
+    points = np.tile([[0.0, 0.0], [1.0, 0.0], [2.0, 3.0]], (20, 1))
+    points[[7, 58, 59]] = np.nan
+    found = cloud_of(points, np.full(points.shape, 1e-3), 3)
+    assert len(found.points) == 54
+    assert (found.points[::3] == 0.0).all()
+    assert floor_of(found, CIRCLE, np.random.default_rng(0)) < 1e-12
+    assert len(cloud_of(points, points, 0).points) == 57
 
 
 def test_distance_to__the_true_attractor_is_one_floor_away():

@@ -41,6 +41,23 @@ def test_measure__a_slow_sweep_is_cut_into_windows(pendulum, record_steps):
     assert edge == pytest.approx(ended, abs=0.008)
 
 
+def test_measure__a_drive_that_truly_jitters_hides_no_period(pendulum, record_steps):
+    """Half a millisecond shakes the motion by five times the sections' noise: the same periods."""
+    rng, steps = np.random.default_rng(3), []
+    for f in (2.46, 2.48, 2.54, 2.56):
+        edges = np.arange(151) / f + rng.normal(0, 5e-4, 151)
+        steps += [(1 / d, 1) for d in np.diff(edges)]
+    found = measure(
+        [record_steps(pendulum, steps, RIGHT)[0]], Way(transient=80, window=0), parameters=pendulum
+    )
+    np.testing.assert_allclose(found["frequency"].values, [2.46, 2.48, 2.54, 2.56], atol=3e-4)
+    # the edges' own scatter and that of sampling
+    np.testing.assert_allclose(found["jitter_s"].values, np.hypot(5e-4, 1e-3 / np.sqrt(12)), rtol=0.2)
+    assert found["orbit_period"].values.tolist() == [2, 2, 1, 1]
+    assert np.median(found["confidence"].values) > 0.8
+    assert (found["confidence"].values > 0.5).all()
+
+
 @pytest.mark.parametrize(
     ("model", "phase"),
     [("pendulum", 0.0), ("pendulum-sine", 0.0), ("duffing", 0.25), ("double-pendulum", 0.0)],

@@ -123,7 +123,7 @@ def test_wrap__that_is_stated_is_unwrapped_and_noted(make):
 
 
 def test_leaps__flank_of_a_wrap_that_was_sampled(make):
-    """A filter before the converter makes a ramp of the wrap: two halves of a turn, none of them told."""
+    """A filter before the converter makes a ramp of the wrap: parts of a turn, none of which is one."""
     angle = 2.0 * make.time
     volts, _ = pot(angle, dead=0.0)
     smeared = np.convolve(np.pad(volts, (2, 0), mode="edge"), np.ones(3) / 3, mode="valid")

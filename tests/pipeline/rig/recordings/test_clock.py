@@ -129,6 +129,18 @@ def test_clock__stated_rate_that_is_not_the_files(make):
     assert ds.attrs["sampling_rate_hz"] == 250.0
 
 
+def test_clock__stated_rate_beside_time_stamps_is_noted(make):
+    """A gap in stamps that are not used cannot be found: that much is said."""
+    a, b = make.swing()
+    stamps = make.time + 0.5 * (make.time > 2.0)
+    channels = {n: Channel(n, v, time=stamps) for n, v in (("a", a), ("b", b))}
+    stated = make.mapping().model_copy(update={"sampling_rate_hz": 500.0})
+    ds = recording_of(make.raw(channels), stated)
+    assert {(f.kind, f.severity) for f in findings_of(ds)} == {("rate", "note")}
+    np.testing.assert_allclose(ds["time"], make.time, atol=1e-12)
+    assert [f.kind for f in findings_of(recording_of(make.raw(channels), make.mapping()))] == ["gap"]
+
+
 def test_clock__unequal_lengths(make):
     a, b = make.swing()
     ds = recording_of(make.raw(make.channels({"a": a, "b": b[:1900]})), make.mapping())
@@ -197,6 +209,22 @@ def test_clock__piece_channel_begins_new_pieces(make):
     np.testing.assert_array_equal(ds["piece"], number)
 
 
+@pytest.mark.parametrize(("axis", "key"), [("t", "time"), ("k", "piece")])
+@pytest.mark.parametrize("n", [1500, 2500])
+def test_timed__stamps_or_numbers_of_another_length_are_a_finding(make, axis, key, n):
+    a, b = make.swing()
+    values = np.arange(n) * make.step_s if axis == "t" else (np.arange(n) > 700).astype(float)
+    mapping = parse_mapping({
+        "model": "pendulum", key: {"channel": axis},
+        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+    })  # fmt: skip
+    ds = recording_of(make.raw(make.channels({axis: values, "a": a, "b": b})), mapping)
+    assert ds.sizes["sample"] == min(n, make.n)
+    told = {(f.kind, f.channel) for f in findings_of(ds)}
+    assert told == ({("length", "psi1"), ("length", "psi2")} if n < make.n else {("length", key)})
+    assert len(np.unique(ds["piece"])) == (1 if axis == "t" else 2)
+
+
 def test_resolved__missing_channels_are_named_with_the_nearest(make):
     raw = make.raw(make.channels({"rig/angle 1": make.swing()[0], "rig/motor": make.swing()[1]}))
     mapping = parse_mapping({
@@ -214,6 +242,16 @@ def test_window__keeps_time(make):
     ds = window(make.recorded(), (1.0, 2.0))
     assert float(ds["time"][0]) == pytest.approx(1.0)
     assert ds.sizes["sample"] == 501
+
+
+def test_window__keeps_the_findings_in_it(make):
+    stamps = make.time.copy()
+    stamps[700:] += 0.5
+    stamps[1500:] += 0.5
+    ds = stamped(make, stamps)
+    assert len(findings_of(ds)) == 2
+    (found,) = findings_of(window(ds, (2.0, 4.5)))
+    assert found.start_s == pytest.approx(stamps[1499])
 
 
 def test_window__that_is_empty_is_refused(make):

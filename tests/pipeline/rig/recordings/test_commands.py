@@ -68,21 +68,11 @@ def test_recordings_show__with_a_mapping_says_what_was_found(main, swing, tmp_pa
 
 
 def test_recordings_convert__is_read_with_its_mapping(main, swing):
-    for target in ("x.csv", "x.tdms"):
-        code, out, err = main(
-            "recordings",
-            "convert",
-            swing.name,
-            "--mapping",
-            "swing.toml",
-            "--out",
-            target,
-            "--window",
-            0.5,
-            1.5,
-        )
-        assert (code, out) == (0, f"recording: {target}\nmapping: x.toml\n"), err
-        code, out, _ = main("recordings", "show", target, "--mapping", "x.toml")
+    for name in ("x.csv", "y.tdms"):
+        words = ("--mapping", "swing.toml", "--window", 0.5, 1.5, "--out", name)
+        code, out, err = main("recordings", "convert", swing.name, *words)
+        assert (code, out) == (0, f"recording: {name}\nmapping: {name[0]}.toml\n"), err
+        code, out, _ = main("recordings", "show", name, "--mapping", f"{name[0]}.toml")
         assert "501 samples at 500 Hz" in out
         assert "simulated" in out
     code, out, _ = main(
@@ -116,3 +106,19 @@ def test_recordings_show__refuses(main, swing, words, sentence):
     code, out, err = main("recordings", "show", *words)
     assert (code, out) == (2, "")
     assert sentence in err
+
+
+def test_recordings__never_replace_what_they_read(main, swing, tmp_path):
+    """A specification, a mapping or a recording of the same name stays."""
+    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    for words in (
+        ("simulate", "rig.toml", "--out", "rig.csv"),
+        ("convert", "swing.tdms", "--mapping", "swing.toml", "--out", "swing.csv"),
+        ("convert", "swing.tdms", "--mapping", "swing.toml", "--out", "swing.tdms"),
+    ):
+        code, out, err = main("recordings", *words)
+        assert (code, out) == (2, "")
+        assert "give another name" in err
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+    assert main("recordings", "simulate", "rig.toml", "--out", "swing.tdms")[0] == 0  # the same again
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before

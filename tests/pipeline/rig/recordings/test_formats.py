@@ -385,6 +385,24 @@ def test_read_csv__names_with_units_in_brackets_or_below(tmp_path):
     np.testing.assert_array_equal(b.stretches[0]["Channel A"].values, [1.5, 2.5])
 
 
+@pytest.mark.parametrize(
+    "stamp", ["2026-03-01 12:00:{:06.3f}", "2026/03/01T12:00:{:06.3f}", "12:00:{:06.3f}"]
+)
+def test_read_csv__dates_are_seconds_and_other_texts_are_left_out(tmp_path, make, stamp):
+    a, _ = make.swing()
+    rows = [f"{stamp.format(0.002 * i)};ok;{a[i]:.9f}".replace(".", ",") for i in range(500)]
+    path = tmp_path / "x.csv"
+    path.write_text("when;state;angle\n" + "\n".join(rows))
+    assert read_raw(path).names == ("when", "angle")
+    mapping = parse_mapping({
+        "model": "pendulum", "time": {"channel": "when"}, "channels": {"psi1": {"channel": "angle"}},
+    })  # fmt: skip
+    ds = read_recording(path, mapping)
+    assert ds.attrs["sampling_rate_hz"] == 500.0
+    assert findings_of(ds) == []
+    np.testing.assert_allclose(ds["psi1"], a[:500], atol=1e-9)
+
+
 def test_read_csv__comma_that_may_be_both_is_refused_and_can_be_stated(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("1,5\n2,5\n3,5\n")

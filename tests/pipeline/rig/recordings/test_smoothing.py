@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from pipeline.rig.recordings import recording_of, smooth
 from pipeline.rig.recordings.mapping import parse_mapping
-from pipeline.rig.recordings.smoothing import _along, _filtered, _first_samples, _switches
+from pipeline.rig.recordings.smoothing import _first_samples, _smoothed, _switches
 from pipeline.spec.problems import SpecError
 
 
@@ -168,12 +170,23 @@ def test_smooth__spans_no_gap_and_no_piece(make):
 
 
 def test_smooth__stretches_shorter_than_the_window(make):
+    """They have a window of their own; one or two samples are none."""
     a, _ = make.swing()
     a[20:1990] = np.nan
-    a[1993:1996] = np.nan
+    a[[1993, 1996]] = np.nan
     found = smooth(make.recorded(a, a), window_s=0.1)
     assert np.isfinite(found["psi1"].values[:20]).all()
-    assert np.isnan(found["psi1"].values[1990:1993]).all()  # three samples: no cubic
+    assert np.isfinite(found["psi1_dot"].values[1990:1993]).all()
+    assert np.isnan(found["psi1_dot"].values[1994:1996]).all()
+
+
+def test_smooth__short_stretches_have_lower_order(make):
+    """A third of the window: a cubic's rates there would be twice as far off."""
+    ds, _, rates = noisy(make, 1e-3)
+    edges = np.arange(1, 1000) * 0.021
+    error = smooth(ds, window_s=0.061, edges_s=edges)["psi1_dot"].values - rates[0]
+    cubic = smooth(ds, window_s=0.021, edges_s=edges)["psi1_dot"].values - rates[0]
+    assert error.std() < 0.6 * cubic.std()
 
 
 def test_smooth__measured_rates_are_kept(make):
@@ -208,24 +221,42 @@ def test_smooth__refuses(make, more, sentence):
         smooth(make.recorded(), **more)
 
 
-@pytest.mark.parametrize(("width", "order"), [(5, 1), (9, 3), (15, 2)])
-def test_along__is_the_weight_of_a_sample_in_its_own_value(width, order):
-    """Against the smoothing of unit vectors, sample by sample, up to both ends."""
+@pytest.mark.parametrize("width", [5, 9, 63, 65, 201, 999])
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_smoothed__is_scipys_savitzky_golay_filter(width, order):
+    """Values and slopes up to both ends, of windows short and long, in stretches of several lengths."""
     from scipy.signal import savgol_filter
 
+    y = np.random.default_rng(0).standard_normal(6000).cumsum() + 100.0
+    parts = np.array([[0, 1500], [1500, 2501], [2510, 2510 + width], [4000, 4001 + width]])
+    found = _smoothed(y, parts, width, order, 0.01)
+    for begin, end in parts:
+        own = min(width, (end - begin) - 1 + (end - begin) % 2)
+        for derivative, mine in ((0, found.values), (1, found.rates)):
+            wanted = savgol_filter(y[begin:end], own, order, deriv=derivative, delta=0.01, mode="interp")
+            np.testing.assert_allclose(mine[begin:end], wanted, atol=1e-10 * np.abs(wanted).max())
+    inside = np.zeros(6000, bool)
+    for begin, end in parts:
+        inside[begin:end] = True
+    assert (np.isfinite(found.values) == inside).all()
+
+
+@pytest.mark.parametrize(("width", "order"), [(5, 1), (9, 3), (15, 2), (23, 3)])
+def test_smoothed__noise_and_score_are_those_of_the_operator(width, order):
+    """Against the smoothing of unit vectors: degrees of freedom, and leave-one-out by leaving each out."""
+    from scipy.signal import savgol_filter
+
+    y = np.random.default_rng(1).standard_normal(24)
     operator = savgol_filter(np.eye(24), width, order, axis=0, mode="interp")
-    np.testing.assert_allclose(_along(width, order, 24), np.diag(operator), atol=1e-12)
-
-
-@pytest.mark.parametrize("derivative", [0, 1])
-@pytest.mark.parametrize("width", [65, 201, 999])
-def test_filtered__long_windows_are_those_of_scipy(width, derivative):
-    from scipy.signal import savgol_filter
-
-    y = np.random.default_rng(0).standard_normal(1500).cumsum()
-    wanted = savgol_filter(y, width, 3, deriv=derivative, delta=0.01, mode="interp")
-    found = _filtered(y, width, 3, derivative, 0.01)
-    np.testing.assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
+    found = _smoothed(y, np.array([[0, 24]]), width, order, 1.0)
+    residual = y - operator @ y
+    assert found.noise == pytest.approx(math.sqrt(residual @ residual / (24 - np.trace(operator))))
+    errors = []
+    for i in range(24):
+        own = np.arange(width) + min(max(i - width // 2, 0), 24 - width)
+        others = own[own != i]
+        errors.append(y[i] - np.polyval(np.polyfit(others, y[others], order), i))
+    assert found.score == pytest.approx(np.mean(np.square(errors)), rel=1e-9)
 
 
 def test_first_samples__cuts_the_last_stretch():
