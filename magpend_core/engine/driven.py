@@ -6,8 +6,11 @@ import dataclasses
 from functools import cache
 from typing import Any
 
+import numpy as np
+
 from magpend_core.engine.absent import no_edges, no_forcing
 from magpend_core.engine.jit import inline
+from magpend_core.engine.plain import plain
 from magpend_core.engine.system import System
 
 LEVEL, SLOPE = "recorded_drive", "recorded_drive_slope"
@@ -77,3 +80,44 @@ def with_recorded_drive(system: System) -> System:
         edges=no_edges,
         recorded_for=system,
     )
+
+
+def drive_parameters(system: System, packed: np.ndarray) -> tuple[str, ...]:
+    """Return the parameters that act on a system's forcing and on nothing else: its amplitude, say.
+
+    They have no effect once a recording takes the forcing's place. Found by changing each by itself, in plain
+    Python at a few instants and states; nothing is compiled.
+
+    Parameters
+    ----------
+    system
+        Any system.
+    packed
+        Values of its parameters, shape (n_parameters,), at which it can be evaluated.
+
+    Returns
+    -------
+    tuple of str
+        None of them if a function of the system cannot be run in plain Python.
+    """
+    constants, forcing, rhs = (plain(f) for f in (system.constants, system.forcing, system.rhs))
+    states = np.random.default_rng(0).uniform(-1.0, 1.0, (4, system.n_states))
+
+    def values(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        c = np.full(system.n_constants, np.nan)
+        constants(1.0, p, c)
+        drive = np.array([float(forcing(t, tuple(c))) for t in np.linspace(0.03, 0.97, 11)])
+        return drive, np.array([rhs(tuple(y), 0.7, tuple(c)) for y in states])
+
+    found = []
+    try:
+        drive, rates = values(packed)
+        for i, name in enumerate(system.parameter_names):
+            changed = packed.copy()
+            changed[i] += 0.01 + 0.01 * abs(changed[i])
+            own_drive, own_rates = values(changed)
+            if np.array_equal(own_rates, rates) and not np.array_equal(own_drive, drive):
+                found.append(name)
+    except NotImplementedError:
+        return ()
+    return tuple(found)

@@ -106,8 +106,12 @@ def simulate(
     from pipeline.cli import console
     from pipeline.rig.recordings.writing import SUFFIXES, check_target, write_raw
     from pipeline.rig.simulation import load_rig, simulated
+    from pipeline.spec.problems import SpecError
 
     check_target(out, SUFFIXES[:2])
+    beside = out.with_suffix(".toml")
+    if beside.resolve() == spec.resolve():
+        raise SpecError([f"--out {out}: its mapping would be written over {spec}; give another name."])
     raw, mapping = simulated(load_rig(spec), is_csv=out.suffix.lower() == ".csv")
     beside = _beside(out, mapping.toml())
     console.result(f"recording: {write_raw(raw, out)}")
@@ -140,6 +144,8 @@ def drive(
     check_target(out, (".csv",))
     made = drive_file(_read(file, mapping, window), kind, tolerance=tolerance)
     out.write_text(made.text, encoding="utf-8")
+    for note in made.notes:
+        console.note(note)
     if made.timing is not None:
         t = made.timing
         console.result(

@@ -143,7 +143,7 @@ def workflows() -> str:
 
 def specification() -> str:
     """Keys of a specification, table by table."""
-    from pipeline.spec import starts, tables
+    from pipeline.spec import recorded, starts, tables
 
     parts = [
         ("[parameters]", tables.ParametersTable, ""),
@@ -160,6 +160,11 @@ def specification() -> str:
             _STATES.format("a number or [low, high]"),
         ),
         ("[continuation]", tables.Continuation, 'For `kind = "continuation"` alone.'),
+        (
+            "[drive]",
+            recorded.DriveTable,
+            'For `kind = "sweep"` alone: see [Recorded drives](../rig.md#recorded-drives).',
+        ),
         ("[integration]", tables.Integration, ""),
         ("[execution]", tables.Execution, "Decides the layout of the store, never the numbers."),
     ]

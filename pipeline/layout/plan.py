@@ -17,12 +17,16 @@ from pipeline.layout.cells import CellMap
 from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable
+from pipeline.spec.drives import TORQUE
 from pipeline.spec.parsing import Spec
 from pipeline.spec.tables import FREQUENCY
 
 MICROSECONDS_PER_PERIOD, MICROSECONDS_PER_SECOND = 9.0, 21.5
 """Rule of thumb for one trajectory on one core at rtol 1e-8: a period of length T takes
 9 us + 21.5 us T/s (measured between 0.1 and 3 Hz on AVX-512, good to 20 %)."""
+
+MICROSECONDS_PER_INTERVAL = 0.9
+"""Time that a trajectory takes more for each interval of a recorded torque."""
 
 RTOL_OF_RULE = 1e-8
 ROOT = 6
@@ -62,6 +66,8 @@ class Plan:
         Sizes of the dims that are not cell dims.
     seconds_per_cell : float
         Estimated time on one core [s].
+    is_recorded : bool
+        Whether the drive is a recording.
     """
 
     kind: str
@@ -72,6 +78,7 @@ class Plan:
     variables: tuple[Variable, ...]
     sizes: Mapping[str, int]
     seconds_per_cell: float
+    is_recorded: bool = False
 
     @property
     def n_cells(self) -> int:
@@ -159,7 +166,7 @@ def make_plan(spec: Spec) -> Plan:
         block = (*(1 for _ in spec.axes), *_tile(grid, spec.refine, wanted))
     return Plan(
         spec.kind, cells.dims, cells.shape, cells.path, block, variables_of(spec.model, spec.products),
-        sizes_of(spec.model, spec.products, spec.integration.n_keep), seconds,
+        sizes_of(spec.model, spec.products, spec.integration.n_keep), seconds, spec.recorded is not None,
     )  # fmt: skip
 
 
@@ -183,7 +190,12 @@ def periods_per_cell(spec: Spec) -> tuple[float, float]:
 
 def _seconds_per_cell(spec: Spec) -> float:
     """Mean time of a cell [s]."""
-    return sum(periods_per_cell(spec)) * mean_seconds_per_period(spec)
+    periods = sum(periods_per_cell(spec))
+    seconds = periods * mean_seconds_per_period(spec)
+    if spec.recorded is not None and spec.recorded.kind == TORQUE:
+        per_period = spec.recorded.n_intervals / spec.recorded.n_periods
+        seconds += periods * per_period * MICROSECONDS_PER_INTERVAL * 1e-6
+    return seconds
 
 
 def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:

@@ -228,7 +228,9 @@ def _value(ds: xr.Dataset, coordinate: xr.DataArray, is_start: bool) -> str:
         measure = start_measure(ds, name)
         return _assignment(measure.symbol, value, measure.unit)
     if name == "frequency":
-        return _assignment("$f$", value, "Hz")
+        # under a recorded drive the mean one
+        mean = "mean " if str(coordinate.attrs.get("long_name", "")).startswith("mean") else ""
+        return _assignment(f"{mean}$f$", value, "Hz")
     return _assignment(name, value, unit)
 
 

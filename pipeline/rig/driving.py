@@ -14,6 +14,9 @@ from pipeline.spec.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 
+LONG = 1.5
+"""A period that is longer than the median by this factor has perhaps lost an edge."""
+
 
 @dataclass(frozen=True)
 class DriveFile:
@@ -31,6 +34,8 @@ class DriveFile:
         Of the recording.
     error : float
         Largest difference between the torque's samples and the lines of the file; 0 for edges.
+    notes : tuple of str
+        What looks as if an edge had been missed.
     """
 
     text: str
@@ -38,6 +43,7 @@ class DriveFile:
     n_rows: int
     n_samples: int
     error: float = 0.0
+    notes: tuple[str, ...] = ()
 
 
 def drive_file(recording: xr.Dataset, kind: str, *, tolerance: float = 0.0) -> DriveFile:
@@ -115,7 +121,15 @@ def _edges(recording: xr.Dataset) -> DriveFile:
     falling = edges.falling[after]
     rows = [f"{a!r},{b!r}" for a, b in zip(rising[:-1].tolist(), falling.tolist(), strict=True)]
     lines = [*_head(recording, "Edges", EDGES), *rows, f"{float(rising[-1])!r},"]
-    return DriveFile("\n".join(lines) + "\n", timing, len(rising), recording.sizes["sample"])
+    period = np.diff(rising)
+    median = float(np.median(period))
+    notes = tuple(
+        f"the period from {rising[i]:.6g} s on is {period[i]:.4g} s, {period[i] / median:.2g} times the "
+        "median; if an edge was missed there, choose a window without it"
+        for i in np.flatnonzero(period > LONG * median)
+    )
+    text = "\n".join(lines) + "\n"
+    return DriveFile(text, timing, len(rising), recording.sizes["sample"], notes=notes)
 
 
 def _torque(recording: xr.Dataset, tolerance: float) -> DriveFile:

@@ -24,6 +24,8 @@ MANY_SECTIONS = 500
 def first_figure(plan: Plan) -> str:
     """Name of the figure of ``magpend plot`` that shows a run as a whole: exponents where it has them."""
     n_swept, n_grid = _long(plan)
+    if plan.is_recorded:  # what rests on attractors is not drawn of a run that cannot go on
+        return "bifurcation" if n_swept else "section"
     if any(v.name == "lyapunov" for v in plan.variables):
         return "lyapunov" if n_swept else "convergence"
     if n_swept >= 2:

@@ -126,7 +126,23 @@ def run_problems(
             "initial_conditions.refine: cells are inferred from closed orbits, and a recording repeats "
             "itself to its jitter alone; drop the key, or [drive]."
         )
+    problems += _idle_problems(drive, model, data.get("axes", {}))
     return problems + _product_problems(drive, data.get("products", {}))
+
+
+def _idle_problems(drive: RecordedDrive, model: Model, axes: Any) -> list[str]:
+    """Axes along which nothing changes: parameters of the drive whose place a torque takes."""
+    if drive.kind != TORQUE or not isinstance(axes, Mapping) or not set(axes) - {FREQUENCY, DUTY}:
+        return []
+    from magpend_core.engine.driven import drive_parameters
+
+    idle = drive_parameters(model.system, model.load().pack())
+    return [
+        f"axes.{name}: acts on the model's own drive alone, and the torque of {drive.file} takes its "
+        "place; drop the axis, or give the drive as edges."
+        for name in axes
+        if name in idle and name != DUTY
+    ]
 
 
 def _replaced_problems(drive: RecordedDrive, table: str, data: Mapping[str, Any]) -> list[str]:

@@ -3,10 +3,10 @@
     OMP_NUM_THREADS=1 python tests/bench/virtual_rig.py [--seeds 200]
 
 Free swings and forced motions without magnets, potentiometers of 12 bits with a dead band and 1 mrad of
-white noise, the torque recorded with a duty cycle of 49.27 %; weighed masses, a measured length, gravity and a
-guess of the friction's steepness as priors, drawn anew for each seed like the noise. The first seed is fitted
-from guesses a tenth off. Then, for many seeds, how often the 95 % intervals hold the truth; these fits start at the
-truth, which changes no optimum.
+white noise, the torque recorded with a duty cycle of 49.27 %; weighed masses, a measured length, gravity and
+a guess of the friction's steepness as priors, drawn anew for each seed like the noise. The first seed is
+fitted from guesses a tenth off. Then, for many seeds, how often the 95 % intervals hold the truth; these fits
+start at the truth, which changes no optimum.
 """
 
 from __future__ import annotations
@@ -147,7 +147,8 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"coverage over {len(found)} seeds: {100 * hits.mean():.1f} %")
         for k, name in enumerate(UNKNOWN):
             print(
-                f"  {name:4s} {100 * hits[:, k].mean():6.1f} %   z {z[:, k].mean():+.2f} +- {z[:, k].std():.2f}"
+                f"  {name:4s} {100 * hits[:, k].mean():6.1f} %   "
+                f"z {z[:, k].mean():+.2f} +- {z[:, k].std():.2f}"
             )
 
 

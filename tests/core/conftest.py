@@ -161,3 +161,32 @@ def run_python(tmp_path):
         return done.stdout
 
     return run
+
+
+def _pendulum_rhs(p, torque):
+    """The pendulum without magnets and load-dependent friction, written out from Eq. 1-8."""
+    B1 = p["J1"] + p["e1"] ** 2 * p["m1"] + p["l1"] ** 2 * p["m2"]
+    B2 = p["J2"] + p["e2"] ** 2 * p["m2"]
+    N = p["m2"] * p["e2"] * p["l1"]
+    M1, M2 = p["m1"] * p["g"] * p["e1"] + p["m2"] * p["g"] * p["l1"], p["m2"] * p["g"] * p["e2"]
+
+    def dry(v):
+        stribeck = (1 - p["mu0"]) * np.exp(-p["c0"] * abs(v)) + p["mu0"]
+        return 2 / np.pi * np.arctan(p["eps"] * v) * stribeck
+
+    def rhs(t, y):
+        a, b, v, w = y
+        s, c = np.sin(a - b), np.cos(a - b)
+        R1 = p["T1"] * dry(v) + 2 * p["c"] * v
+        R2 = p["T2"] * dry(w - v) + p["c"] * (w - v)
+        matrix = [[B1, N * c], [N * c, B2]]
+        right = [torque(t) - R1 + R2 - N * s * w**2 - M1 * np.sin(a), N * s * v**2 - M2 * np.sin(b) - R2]
+        return [v, w, *np.linalg.solve(matrix, right)]
+
+    return rhs
+
+
+@pytest.fixture(scope="session")
+def pendulum_rhs():
+    """From parameters and a torque of time to a right-hand side that shares nothing with the engine."""
+    return _pendulum_rhs

@@ -55,30 +55,7 @@ def test_sample__does_not_depend_on_the_neighbours():
     assert np.isnan(among.states[5, 3:]).all()
 
 
-def _pendulum_rhs(p, torque):
-    """The pendulum without magnets and load-dependent friction, written out from Eq. 1-8."""
-    B1 = p["J1"] + p["e1"] ** 2 * p["m1"] + p["l1"] ** 2 * p["m2"]
-    B2 = p["J2"] + p["e2"] ** 2 * p["m2"]
-    N = p["m2"] * p["e2"] * p["l1"]
-    M1, M2 = p["m1"] * p["g"] * p["e1"] + p["m2"] * p["g"] * p["l1"], p["m2"] * p["g"] * p["e2"]
-
-    def dry(v):
-        stribeck = (1 - p["mu0"]) * np.exp(-p["c0"] * abs(v)) + p["mu0"]
-        return 2 / np.pi * np.arctan(p["eps"] * v) * stribeck
-
-    def rhs(t, y):
-        a, b, v, w = y
-        s, c = np.sin(a - b), np.cos(a - b)
-        R1 = p["T1"] * dry(v) + 2 * p["c"] * v
-        R2 = p["T2"] * dry(w - v) + p["c"] * (w - v)
-        matrix = [[B1, N * c], [N * c, B2]]
-        right = [torque(t) - R1 + R2 - N * s * w**2 - M1 * np.sin(a), N * s * v**2 - M2 * np.sin(b) - R2]
-        return [v, w, *np.linalg.solve(matrix, right)]
-
-    return rhs
-
-
-def test_sample__follows_measured_edges():
+def test_sample__follows_measured_edges(pendulum_rhs):
     """Periods of unequal lengths and duty cycles, a start within the first: against another integrator."""
     values = PENDULUM.load(mu=0.0, eps=40.0, eps_drive=30.0)
     p = values.as_dict()
@@ -100,7 +77,7 @@ def test_sample__follows_measured_edges():
         PENDULUM.system, values.pack()[None], [start], [times], drives=[drive], rtol=1e-11, atol=1e-11
     )
     other = solve_ivp(
-        _pendulum_rhs(p, torque), (0, 1.5), start, "DOP853", times, rtol=1e-10, atol=1e-10, max_step=2e-3
+        pendulum_rhs(p, torque), (0, 1.5), start, "DOP853", times, rtol=1e-10, atol=1e-10, max_step=2e-3
     )
     np.testing.assert_allclose(found.states[0], other.y.T, atol=2e-6)
 

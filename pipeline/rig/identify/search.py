@@ -19,6 +19,7 @@ from pipeline.products.reporting import report
 from pipeline.rig.identify.local import Echo, Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
+from pipeline.rig.identify.starts import fit_starts
 
 Array = NDArray[np.float64]
 
@@ -172,12 +173,22 @@ def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
 def refine(
     problem: Problem, theta: Array, *, stages: Sequence[Problem] | None = None, echo: Echo | None = None
 ) -> Fit:
-    """Fit from one first guess: short stretches, longer ones, whole pieces with free starts."""
+    """Fit from one first guess: short stretches, longer ones, whole pieces, all with free starts.
+
+    Where noise leads short stretches astray, longer ones may not find back: so whole pieces decide which
+    length's outcome the last fit begins with.
+    """
+    candidates = []
     for stage in _stages(problem) if stages is None else stages:
         fit = fit_local(stage, theta, max_evaluations=STAGE_EVALUATIONS, tolerance=STAGE_TOLERANCE)
         if np.isfinite(fit.cost):
             theta = fit.theta
-    return fit_local(problem, theta, echo=echo)
+            candidates.append(theta)
+    candidates = candidates or [np.clip(theta, problem.lower, problem.upper)]
+    starts = [fit_starts(problem, one, problem.starts).starts for one in candidates]
+    found = evaluate(problem, np.array(candidates), np.array(starts), slopes=False)
+    best = int(np.argmin([np.inf if e.failed else e.cost for e in found]))
+    return fit_local(problem, candidates[best], starts=starts[best], echo=echo)
 
 
 def _stages(problem: Problem) -> list[Problem]:

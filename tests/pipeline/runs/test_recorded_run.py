@@ -1,0 +1,196 @@
+"""Runs whose drive is a recording: the numbers of ordinary ones, the same bytes whatever happens."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from magpend_core import load_preset
+from pipeline import open_run
+from pipeline.compute import task
+from pipeline.compute.execute import TaskFailedError
+from pipeline.runs.derive import derive
+from pipeline.runs.drawing import figure
+from pipeline.runs.preview import describe_plan
+from pipeline.runs.run import run
+from pipeline.runs.status import state
+from pipeline.runs.zoom import Changes, read_source, to_toml, zoom
+from pipeline.spec.parsing import parse_spec
+from pipeline.spec.problems import SpecError
+from pipeline.store.errors import DamagedError, RefusedError
+from pipeline.store.runfile import read_run
+
+HZ = 2.2
+CELLS = """
+[axes]
+q = { values = [0.6, 1.6] }
+[initial_conditions]
+kind = "grid"
+psi1_deg = { start = -30, stop = 30, num = 3 }
+psi2_deg = { start = -20, stop = 20, num = 4 }
+[integration]
+n_transient = 7
+n_keep = 4
+[execution]
+trajectories_per_task = 6
+"""
+RECORDED = f'kind = "sweep"\n[drive]\nfile = "drive.csv"\n{CELLS}'
+ORDINARY = f'kind = "sweep"\n[parameters]\nfrequency_hz = {HZ}\n{CELLS}'
+EXTREMES = '[products]\nextremes = { quantities = ["drive_torque"] }\n'
+
+
+def silent(line):
+    pass
+
+
+def edges(n=12, jitter=0.0, start=3.5):
+    """Text of a drive file with the model's own duty cycle."""
+    rng = np.random.default_rng(0)
+    rising = start + (np.arange(n + 1) + jitter * rng.standard_normal(n + 1)) / HZ
+    falling = rising[:-1] + load_preset().as_dict()["duty_cycle"] * np.diff(rising)
+    rows = [f"{a!r},{b!r}" for a, b in zip(rising[:-1].tolist(), falling.tolist(), strict=True)]
+    return "\n".join(["rising_s,falling_s", *rows, f"{float(rising[-1])!r},"]) + "\n"
+
+
+@pytest.fixture
+def recorded(write_spec, tmp_path):
+    """Write a specification and its drive file; returns the path of the former."""
+
+    def write(text=RECORDED, drive=None):
+        (tmp_path / "drive.csv").write_text(drive or edges(jitter=0.01), "utf-8")
+        return write_spec(text)
+
+    return write
+
+
+def test_run__equal_periods_give_the_numbers_of_the_ordinary_run(recorded, write_spec, tmp_path):
+    run(recorded(RECORDED + EXTREMES, edges()), tmp_path / "recorded", workers=0, echo=silent)
+    run(write_spec(ORDINARY + EXTREMES), tmp_path / "ordinary", workers=0, echo=silent)
+    one, other = open_run(tmp_path / "recorded").load(), open_run(tmp_path / "ordinary").load()
+    assert one.section.dims == other.section.dims
+    # 11 periods at rtol 1e-8, of cells that are not yet settled
+    np.testing.assert_allclose(one.section, other.section, atol=1e-6)
+    np.testing.assert_allclose(one.extremes, other.extremes, atol=1e-6)
+    for name in ("turns", "status", "orbit_period", "n_periods"):
+        assert np.array_equal(one[name], other[name]), name
+    assert float(one.frequency) == pytest.approx(HZ)
+    assert one.frequency.attrs["long_name"] == "mean frequency of the recorded drive"
+
+
+def torque(n=1200):
+    """The model's own wave, sampled; it begins low, so that its first rising edge is in it."""
+    times = np.linspace(0, 5, n + 1)
+    level = np.where(np.mod(times * HZ, 1) > 0.5, 1.6, -1.6)
+    rows = [f"{t!r},{x!r}" for t, x in zip(times.tolist(), level.tolist(), strict=True)]
+    return "\n".join(["time_s,drive", *rows]) + "\n"
+
+
+@pytest.mark.parametrize("kind", ["edges", "torque"])
+def test_run__same_bytes_in_other_tasks_and_after_a_failure(recorded, tmp_path, monkeypatch, bytes_of, kind):
+    text = RECORDED.replace("n_transient = 7", "n_transient = 5")
+    path = recorded(text.replace("q = {", "T1 = {"), torque()) if kind == "torque" else recorded(text)
+    run(path, tmp_path / "whole", workers=0, echo=silent)
+    original, calls = task.compute, []
+
+    def failing(spec, cells, block):
+        calls.append(block)
+        if len(calls) == 3:
+            raise RuntimeError("out of luck")
+        return original(spec, cells, block)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(task, "compute", failing)
+        with pytest.raises(TaskFailedError):
+            run(path, tmp_path / "run", workers=0, echo=silent)
+    assert state(tmp_path / "run").done == {0, 1}
+    # a worker reads the drive from run.json, not from its file
+    run(path, tmp_path / "run", workers=1 if kind == "edges" else 0, echo=silent)
+    assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
+    path.write_text(path.read_text("utf-8").replace("per_task = 6", "per_task = 5"), "utf-8")
+    run(path, tmp_path / "other", workers=0, echo=silent)
+    one, other = open_run(tmp_path / "whole").load(), open_run(tmp_path / "other").load()
+    assert one.drop_attrs(deep=False).identical(other.drop_attrs(deep=False))
+
+
+def test_run__killed_and_resumed_has_the_same_bytes(recorded, tmp_path, start, magpend, bytes_of):
+    path = recorded(RECORDED.replace("num = 3", "num = 9").replace("num = 4", "num = 12"))
+    assert magpend("run", path, "--out", "whole", "--workers", "1").returncode == 0
+    process = start("run", path, "--out", "run", "--workers", "1")
+    deadline = time.monotonic() + 200
+    while time.monotonic() < deadline and not list((tmp_path / "run" / "commits").glob("**/*.json")):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert magpend("run", path, "--out", "run", "--workers", "1").returncode == 0
+    assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
+
+
+def test_run__explains_itself_when_the_file_is_gone(recorded, tmp_path):
+    run(recorded(), tmp_path / "run", workers=0, echo=silent)
+    text = (tmp_path / "drive.csv").read_text("utf-8")
+    (tmp_path / "drive.csv").unlink()
+    spec = parse_spec(read_run(tmp_path / "run").spec)
+    assert spec.drive.text == text
+    assert open_run(tmp_path / "run").section.notnull().all()
+    assert figure(tmp_path / "run", "bifurcation").axes
+    assert figure(tmp_path / "run", "section", {"at": {"q": 1.6}}).axes
+
+
+def test_run__with_another_drive_is_refused(recorded, tmp_path, bytes_of):
+    path = recorded()
+    run(path, tmp_path / "run", workers=0, echo=silent)
+    before = bytes_of(tmp_path / "run")
+    recorded(drive=edges(jitter=0.02))
+    with pytest.raises(RefusedError, match=r"spec\.drive\.sha256"):
+        run(path, tmp_path / "run", workers=0, echo=silent)
+    assert bytes_of(tmp_path / "run") == before
+
+
+def test_run__damaged_drive_is_found_and_rebuilt(recorded, tmp_path, bytes_of):
+    path, directory = recorded(), tmp_path / "run"
+    run(path, directory, workers=0, echo=silent)
+    before, file = bytes_of(directory), directory / "run.json"
+    data = json.loads(file.read_text("utf-8"))
+    data["spec"]["drive"]["text"] = data["spec"]["drive"]["text"].replace("3.", "4.", 1)
+    file.write_text(json.dumps(data), "utf-8")
+    with pytest.raises(DamagedError, match=r"run\.json: damaged"):
+        open_run(directory)
+    run(path, directory, workers=0, echo=silent)
+    assert bytes_of(directory) == before
+
+
+@pytest.mark.parametrize("name", ["attractors", "basins", "chaos", "settling"])
+def test_derive__refuses_what_goes_on_beyond_the_recording(recorded, tmp_path, name):
+    run(recorded(), tmp_path / "run", workers=0, echo=silent)
+    with pytest.raises(
+        SpecError, match=rf"drive is the recording drive\.csv, and {name} goes on where it ends"
+    ):
+        derive(tmp_path / "run", name)
+    with pytest.raises(SpecError, match="goes on where it ends"):
+        figure(tmp_path / "run", "gallery", {"at": {"q": 1.6}})
+
+
+def test_describe_plan__measures_a_recorded_drive(recorded, tmp_path):
+    lines = list(describe_plan(recorded(), tmp_path / "run", workers=1))
+    assert any("24 cells" in line for line in lines)
+    assert any("measured" in line for line in lines)
+    assert not (tmp_path / "run").exists()
+
+
+def test_zoom__takes_the_drive_along(recorded, tmp_path):
+    source = read_source(recorded())
+    found, _ = zoom(source.spec, Changes(ranges={"q": (0.6, 1.0)}))
+    assert found.drive == source.spec.drive
+    assert 'sha256 = "' in to_toml(found)
+
+
+def test_cli__says_which_numbers_do_not_fit(recorded, tmp_path, main):
+    path = recorded(RECORDED.replace("n_transient = 7", "n_transient = 9"))
+    code, _, err = main("run", path, "--out", "run")
+    assert code == 2
+    assert "n_transient = 9 and n_keep = 4 are 13 drive periods, and drive.csv has 12" in err
+    assert not (tmp_path / "run").exists()
