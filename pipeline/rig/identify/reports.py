@@ -108,6 +108,31 @@ def result_of(
         "units": {c: spec.model.state(c).unit for c in found.problem.channels},
         **found.fitted.as_dict(),
         "held_out": None if found.held_out is None else found.held_out.as_dict(),
+        **_sureness(found),
+        "starts": [
+            {
+                "number": k,
+                "cost": _number(fit.cost),
+                "converged": fit.converged,
+                "best": found.is_same(fit),
+                "message": fit.message,
+                "n_evaluations": fit.n_evaluations,
+            }
+            for k, fit in sorted(found.starts.items())
+        ],
+        "warnings": list(found.warnings) + _errors(sources, findings),
+        "recordings": [
+            {"file": s.file, "sha256": s.sha256, "findings": list(said)}
+            for s, said in zip(sources, findings, strict=True)
+        ],
+        "versions": versions(),
+    }
+
+
+def _sureness(found: Finding) -> dict[str, Any]:
+    """Covariance, correlations, singular values and profiles as plain data."""
+    names = found.problem.names
+    return {
         "covariance": {
             "estimator": found.covariance.estimator,
             "why": found.covariance.why,
@@ -134,23 +159,6 @@ def result_of(
             name: {"values": _plain(p.values), "growth": _plain(p.growth), "interval": _plain(p.interval)}
             for name, p in found.profiles.items()
         },
-        "starts": [
-            {
-                "number": k,
-                "cost": _number(fit.cost),
-                "converged": fit.converged,
-                "best": found.is_same(fit),
-                "message": fit.message,
-                "n_evaluations": fit.n_evaluations,
-            }
-            for k, fit in sorted(found.starts.items())
-        ],
-        "warnings": list(found.warnings) + _errors(sources, findings),
-        "recordings": [
-            {"file": s.file, "sha256": s.sha256, "findings": list(said)}
-            for s, said in zip(sources, findings, strict=True)
-        ],
-        "versions": versions(),
     }
 
 
