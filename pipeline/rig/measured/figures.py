@@ -85,7 +85,8 @@ def plot_measured(
         axes[1].set_ylabel("")
         axes[1].tick_params(labelleft=False)
         for ax, text in zip(axes, (_rig(measured), "computed"), strict=True):
-            ax.text(0.045, 0.955, text, transform=ax.transAxes, va="top", fontsize=fig.look.label)
+            ax.text(0.045, 0.955, text, transform=ax.transAxes, va="top", fontsize=fig.look.label, zorder=5.0,
+                    bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5})  # fmt: skip
     over = diagram is not None and layout == "over"
     _draw_steps(axes[0], measured, values, over)
     motions = motions_of(measured)
