@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from magpend_core.models import load_model
 from magpend_core.sampling import Drive
 from pipeline.rig.identify.local import fit_local
-from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.objective import _steps, evaluate
 from pipeline.rig.identify.problem import Free, Piece, Problem
 from pipeline.rig.identify.search import cut, refine, search, slowest_period, sobol
 from pipeline.rig.identify.starts import fit_starts
@@ -205,6 +205,8 @@ def test_fit_local__follows_ties_and_priors():
     tied = make_problem(free=("damping", "linear", "amplitude"), tied={"cubic": (0.8 / 3.0, "linear")})
     fit = fit_local(tied, tied.start)
     np.testing.assert_allclose(fit.theta, truth_of(tied), rtol=1e-5)
+    values = tied.values(fit.theta)
+    assert (values["cubic"], values["linear"]) == pytest.approx((0.8, 3.0), rel=1e-5)
     plain = make_problem(NOISE)
     free = tuple(replace(f, prior_mean=3.3, prior_sd=1e-7) if f.name == "linear" else f for f in plain.free)
     pinned = fit_local(replace(plain, free=free), plain.start)
@@ -279,6 +281,25 @@ def test_cut__reads_starts_off_the_recording():
         at = int(np.argmin(np.abs(problem.pieces[p.number].measured[:, 0] - p.measured[0, 0])))
         if at:
             np.testing.assert_allclose(p.start, whole[at] + [ZERO, 0.0], atol=0.03)
+
+
+def test_cut__leaves_each_stretch_its_own_drive():
+    """At the truth, with starts of their own, stretches fit as the whole does."""
+    stretches = cut(make_problem(), 1.5)
+    starts = fit_starts(stretches, truth_of(stretches), stretches.starts).starts
+    found = evaluate(stretches, truth_of(stretches)[None], starts[None], slopes=False)[0]
+    assert np.abs(np.concatenate(found.residuals)).max() < 1e-6
+
+
+@pytest.mark.parametrize("at", ["lower", "upper"])
+def test_evaluate__takes_slopes_within_the_bounds(at):
+    """On a bound beyond which a model may not exist."""
+    problem = make_problem()
+    value = truth_of(problem)[0]
+    bound = {at: value}
+    free = (replace(problem.free[0], **bound), *problem.free[1:])
+    steps = _steps(replace(problem, free=free), truth_of(problem)[None])[0]
+    assert (steps[0] > 0) == (at == "lower")
 
 
 def test_slowest_period__is_that_of_a_sine():
