@@ -119,3 +119,13 @@ def test_identification__compares_the_same_residuals(bench, capsys):
     printed = capsys.readouterr().out
     for name in ("solve_ivp", "variational equations", "normal matrices"):
         assert name in printed
+
+
+def test_virtual_rig__finds_all_parameters_again(bench):
+    """A third of each recording, one seed: no parameter is off by more than its interval allows."""
+    rig = bench("virtual_rig")
+    found = rig.outcome(1, shorten=3)
+    off = np.abs(found.fit.theta - rig.truth()) / found.errors
+    assert off.max() < 4.0
+    assert found.hits.sum() >= 12
+    assert (found.errors / rig.truth() < 0.5).all()

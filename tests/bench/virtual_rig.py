@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -110,10 +111,14 @@ def judged(problem: Problem, fit: Fit) -> Outcome:
     return Outcome(fit, found.errors, found.critical * found.errors)
 
 
-def outcome(seed: int, shorten: int = 1) -> Outcome:
-    """Fit one seed from the truth."""
+def outcome(seed: int, shorten: int = 1) -> Outcome | None:
+    """Fit one seed from the truth; None if that does not converge."""
     problem = problem_of(seed, shorten)
-    return judged(problem, fit_local(problem, truth()))
+    fit = fit_local(problem, truth())
+    found = judged(problem, fit) if fit.converged else None
+    note = f"{found.hits.sum()} of {len(UNKNOWN)} intervals hold the truth" if found else fit.message
+    print(f"seed {seed}: {fit.n_evaluations} evaluations, {note}", file=sys.stderr, flush=True)
+    return found
 
 
 def from_afar(seed: int) -> Outcome:
@@ -140,11 +145,11 @@ def main(arguments: list[str] | None = None) -> None:
         UNKNOWN, truth(), first.fit.theta, first.half, first.hits, strict=True
     ):
         print(f"  {name:4s} {value:12.6g} {theta:12.6g} +- {half:9.3g} {'' if hit else 'outside'}")
-    found = [outcome(seed) for seed in range(1, options.seeds + 1)]
+    found = [o for o in map(outcome, range(1, options.seeds + 1)) if o is not None]
     if found:
         hits = np.array([o.hits for o in found])
         z = np.array([(o.fit.theta - truth()) / o.errors for o in found])
-        print(f"coverage over {len(found)} seeds: {100 * hits.mean():.1f} %")
+        print(f"coverage over {len(found)} of {options.seeds} seeds: {100 * hits.mean():.1f} %")
         for k, name in enumerate(UNKNOWN):
             print(
                 f"  {name:4s} {100 * hits[:, k].mean():6.1f} %   "
