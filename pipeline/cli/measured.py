@@ -76,13 +76,12 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
 def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
     """Read recordings, and say what was found in them."""
     from pipeline.cli import console
-    from pipeline.rig.recordings import findings_of, read_recording
+    from pipeline.rig.recordings import findings_of, read_recording, summary
 
     found = [read_recording(p, m) for p, m in zip(paths, mappings, strict=True)]
     for path, recording in zip(paths, found, strict=True):
-        for finding in findings_of(recording):
-            if finding.severity != "note":
-                console.note(f"{finding.severity}: {path.name}: {finding.text}")
+        for line in summary(f for f in findings_of(recording) if f.severity != "note"):
+            console.note(f"{path.name}: {line}")
     return found
 
 

@@ -16,7 +16,7 @@ from pipeline.rig.edges import Edges, find_edges
 from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
 from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
-from pipeline.rig.recordings import findings_of, load_mapping, read_recording, smooth
+from pipeline.rig.recordings import findings_of, load_mapping, read_recording, smooth, summary
 from pipeline.spec.problems import SpecError
 
 FEWEST_SAMPLES = 12
@@ -122,11 +122,7 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         recorded=any(t.drive == "recorded" for t in spec.recordings),
     )  # fmt: skip
     simulated = any(bool(ds.attrs.get("simulated")) for ds in recordings)
-    said = tuple(
-        tuple(f"{f.severity}: {f.kind} of {f.channel or 'all channels'}: {f.text}" for f in findings_of(ds)
-              if f.severity != "note")
-        for ds in recordings
-    )  # fmt: skip
+    said = tuple(tuple(summary(f for f in findings_of(ds) if f.severity != "note")) for ds in recordings)
     return Built(problem, tuple(replace(p, follows=-1) for p in held), simulated, said)
 
 
