@@ -14,6 +14,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from magpend_core.models import ModelError, load_model
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import ParameterError, Parameters
+from magpend_core.models.presets import find_preset
 from pipeline.rig.recordings.mapping import DRIVE, Mapping, TimeMap
 from pipeline.rig.recordings.raw import Raw
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, readings
@@ -125,11 +126,11 @@ def load_rig(path: str | Path) -> Rig:
     SpecError
         With all problems at once; also if the file cannot be read or is not TOML.
     """
-    return parse_rig(read_toml(path))
+    return parse_rig(read_toml(path), Path(path).parent)
 
 
-def parse_rig(data: AnyMapping[str, Any]) -> Rig:
-    """Check the specification of a virtual rig given as plain data.
+def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
+    """Check the specification of a virtual rig given as plain data; a preset's file is seen from `folder`.
 
     Raises
     ------
@@ -146,7 +147,7 @@ def parse_rig(data: AnyMapping[str, Any]) -> Rig:
         name: _checked(SensorTable, table, f"sensors.{name}", problems)
         for name, table in _table(data, "sensors", problems).items()
     }
-    parameters = _parameters(data, problems)
+    parameters = _parameters(data, folder, problems)
     if parameters is None:
         raise SpecError(problems)
     start = _start(_table(data, "initial_state", problems), parameters.model, problems)
@@ -206,7 +207,7 @@ def _table(data: AnyMapping[str, Any], name: str, problems: list[str]) -> dict[s
     return value
 
 
-def _parameters(data: AnyMapping[str, Any], problems: list[str]) -> Parameters | None:
+def _parameters(data: AnyMapping[str, Any], folder: str | Path, problems: list[str]) -> Parameters | None:
     if "model" not in data:
         problems.append("model: missing; name the model, as magpend models lists them.")
         return None
@@ -216,8 +217,9 @@ def _parameters(data: AnyMapping[str, Any], problems: list[str]) -> Parameters |
         problems += [f"model: {p}" for p in getattr(error, "problems", [f"{data['model']!r} is no name."])]
         return None
     overrides = _table(data, "parameters", problems)
+    preset = data.get("preset")
     try:
-        return model.load(data.get("preset"), **overrides)
+        return model.load(None if preset is None else find_preset(preset, folder), **overrides)
     except ParameterError as error:
         problems += [f"parameters: {p}" for p in error.problems]
         return None

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from magpend_core import load_model, load_preset, trajectory
+from magpend_core.models.presets import write_preset
 from pipeline.rig.recordings import findings_of, parse_mapping, read_recording, write_raw
 from pipeline.rig.simulation import load_rig, parse_rig, simulated
 from pipeline.rig.virtual import TOLERANCE, DriveSensor, Sensor, Step, readings, record
@@ -255,3 +256,16 @@ def test_parse_rig__refuses(data, sentence):
     with pytest.raises(SpecError) as caught:
         parse_rig(data)
     assert any(sentence in p for p in caught.value.problems)
+
+
+def test_load_rig__finds_a_presets_file_beside_it(tmp_path, monkeypatch):
+    """Wherever the command is given from."""
+    values = load_preset(T1=0.095)
+    write_preset(
+        tmp_path / "own.toml", "pendulum", values.as_dict(), dict.fromkeys(values.names, "a test"), "own"
+    )
+    rig = 'model = "pendulum"\npreset = "own.toml"\nsampling_rate_hz = 100.0\nduration_s = 1.0\n'
+    (tmp_path / "rig.toml").write_text(rig + '[sensors.psi1]\nkind = "encoder"\n')
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert load_rig(tmp_path / "rig.toml").parameters["T1"] == 0.095
