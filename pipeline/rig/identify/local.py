@@ -66,10 +66,9 @@ class _Search:
     Anal. 10, 1973, 413, in Kaufman's form).
     """
 
-    def __init__(self, problem: Problem, starts: Array, free_starts: bool, echo: Echo | None) -> None:
+    def __init__(self, problem: Problem, starts: Array, echo: Echo | None) -> None:
         self.problem, self.starts, self.echo = problem, starts, echo
-        self.joint = free_starts and problem.continuity is not None
-        self.projected = free_starts and problem.continuity is None
+        self.joint = problem.continuity is not None
         self.n_free, self.count, self.best = len(problem.free), 0, np.inf
         self.sizes = np.array([f.size for f in problem.free])
         if self.joint:
@@ -90,11 +89,11 @@ class _Search:
         key = x.tobytes()
         if self._last is None or key != self._key:
             theta, starts = self.split(x)
-            if self.projected:
+            if not self.joint:
                 starts = self._starts_for(theta)
             evaluation = evaluate(self.problem, theta[None], starts[None], slopes=True)[0]
             rows, jacobian = evaluation.rows, evaluation.jacobian[:, : len(self.sizes)]
-            if self.projected:
+            if not self.joint:
                 rows, jacobian = project_starts_out(self.problem, evaluation)
             self._last = _Point(theta, starts, evaluation, rows, jacobian * self.sizes)
             self._key = key
@@ -136,7 +135,6 @@ def fit_local(
     *,
     starts: Array | None = None,
     fixed: Mapping[str, float] | None = None,
-    free_starts: bool = True,
     max_evaluations: int = MAX_EVALUATIONS,
     tolerance: float = TOLERANCE,
     echo: Echo | None = None,
@@ -152,8 +150,6 @@ def fit_local(
         First guess of the pieces' starts, (n_piece, n_states); by default the problem's.
     fixed
         Unknowns that are held at a value, by name: the fit is over the others, `Fit.theta` has all.
-    free_starts
-        Whether the starts are fitted, too.
     max_evaluations
         Limit; beyond it a fit has not converged.
     tolerance
@@ -170,32 +166,30 @@ def fit_local(
     A robust loss counts residuals in units of their own scale, which a first fit of least squares gives.
     """
     if fixed:
-        return _fit_others(problem, theta0, starts, fixed, free_starts, _Ending(max_evaluations, tolerance))
+        return _fit_others(problem, theta0, starts, fixed, _Ending(max_evaluations, tolerance))
     ending = _Ending(max_evaluations, tolerance)
     first = problem.starts if starts is None else starts
     plain = replace(problem, loss="linear") if problem.loss != "linear" else problem
-    fit = _solve(plain, theta0, first, free_starts, ending, echo)
+    fit = _solve(plain, theta0, first, ending, echo)
     if problem.loss == "linear":
         return fit
     z = np.concatenate(fit.residuals) / problem.noise
     scale = 1.4826 * float(np.nanmedian(np.abs(z)))
     scaled = replace(problem, loss_scale=max(scale, 1.0))
-    robust = _solve(scaled, fit.theta, fit.starts, free_starts, ending, echo)
+    robust = _solve(scaled, fit.theta, fit.starts, ending, echo)
     return replace(robust, n_evaluations=fit.n_evaluations + robust.n_evaluations)
 
 
-def _solve(
-    problem: Problem, theta0: Array, starts: Array, free_starts: bool, ending: _Ending, echo: Echo | None
-) -> Fit:
+def _solve(problem: Problem, theta0: Array, starts: Array, ending: _Ending, echo: Echo | None) -> Fit:
     from threadpoolctl import threadpool_limits
 
-    walk = _Search(problem, starts, free_starts, echo)
+    walk = _Search(problem, starts, echo)
     theta0 = np.clip(theta0, problem.lower, problem.upper)
     full = np.append(theta0, starts.ravel()) if walk.joint else np.array(theta0)
     # the matrices are small: more threads would wait for each other
     with threadpool_limits(1):
         if not len(full):
-            return _starts_alone(walk, free_starts)
+            return _starts_alone(walk)
         x, ended, message = _least_squares(walk, full / walk.sizes, ending)
         point = walk.at(x)
     return _outcome(point, walk.count, ended, message)
@@ -220,17 +214,13 @@ def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, boo
     return found.x, bool(found.status > 0), found.message
 
 
-def _starts_alone(walk: _Search, free_starts: bool) -> Fit:
+def _starts_alone(walk: _Search) -> Fit:
     """With nothing unknown but the starts."""
     problem, nothing = walk.problem, np.zeros(0)
-    starts, ended, message = walk.starts, True, "nothing to fit"
-    if free_starts:
-        found = fit_starts(problem, nothing, walk.starts)
-        n = int(np.count_nonzero(~found.settled))
-        starts, ended = found.starts, n == 0
-        message = (
-            f"the starts of {n} of {len(starts)} pieces go on moving" if n else "all starts have settled"
-        )
+    starts, settled = fit_starts(problem, nothing, walk.starts)
+    n = int(np.count_nonzero(~settled))
+    ended = n == 0
+    message = f"the starts of {n} of {len(starts)} pieces go on moving" if n else "all starts have settled"
     evaluation = evaluate(problem, nothing[None], starts[None], slopes=True)[0]
     point = _Point(nothing, starts, evaluation, evaluation.rows, evaluation.jacobian)
     return _outcome(point, 1, ended, message)
@@ -247,13 +237,13 @@ def _outcome(point: _Point, count: int, ended: bool, message: str) -> Fit:
 
 
 def _fit_others(
-    problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float], free_starts: bool,
+    problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float],
     ending: _Ending,
 ) -> Fit:  # fmt: skip
     """Fit with some unknowns held; the outcome speaks of all again."""
     held = np.array([name in fixed for name in problem.names], bool)
     part = fit_local(
-        problem.without(fixed), np.asarray(theta0)[~held], starts=starts, free_starts=free_starts,
+        problem.without(fixed), np.asarray(theta0)[~held], starts=starts,
         max_evaluations=ending.max_evaluations, tolerance=ending.tolerance,
     )  # fmt: skip
     theta = np.array([fixed.get(name, 0.0) for name in problem.names])
