@@ -119,6 +119,7 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         pieces=tuple(kept), tied=spec.tied, loss=spec.fit.loss,
         noise=noise_of(spec.model, channels, smoothed, spec.fit.noise),
         continuity=None if spec.fit.continuity == "free" else float(spec.fit.continuity), rtol=spec.fit.rtol,
+        slopes=spec.fit.slopes,
         recorded=any(t.drive == "recorded" for t in spec.recordings),
     )  # fmt: skip
     simulated = any(bool(ds.attrs.get("simulated")) for ds in recordings)

@@ -79,6 +79,10 @@ class FitTable(Table):
     )
     decimate: Annotated[int, Field(ge=1)] = Field(1, description="Take every so many samples")
     rtol: Annotated[float, Field(gt=0, le=1e-3)] = Field(1e-8, description="Tolerance of the integration")
+    slopes: Literal["differences", "variational"] = Field(
+        "differences",
+        description="Sensitivities: differences between lanes, or variational equations (exacter, slower)",
+    )
 
 
 class SearchTable(Table):

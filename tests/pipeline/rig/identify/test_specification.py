@@ -129,3 +129,19 @@ def test_parse_identification__refuses_a_run(parse):
 def test_load_identification__a_file_that_is_not_there(tmp_path):
     with pytest.raises(SpecError, match="cannot be read"):
         load_identification(tmp_path / "none.toml")
+
+
+def test_load__slopes_are_one_of_two_kinds(tmp_path):
+    """What the fit takes them by goes into the problem; another word is refused by name."""
+    from pipeline.rig.identify.build import build, read_all
+    from pipeline.runs.workflows import find_spec
+
+    path = find_spec("multiarm")
+    text = path.read_text("utf-8").replace("recordings/", f"{path.parent}/recordings/")
+    own = tmp_path / "own.toml"
+    own.write_text(text + '\n[fit]\nslopes = "variational"\n')
+    spec = load_identification(own)
+    assert build(spec, read_all(spec)).problem.slopes == "variational"
+    own.write_text(text + '\n[fit]\nslopes = "variation"\n')
+    with pytest.raises(SpecError, match=r"fit\.slopes"):
+        load_identification(own)
