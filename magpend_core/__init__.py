@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from magpend_core.crossing import Crossing
     from magpend_core.lyapunov import LyapunovExponents, lyapunov_exponents
     from magpend_core.meaning import kernel_version
     from magpend_core.models import (
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from magpend_core.trajectory import trajectory
 
 __all__ = [
+    "Crossing",
     "LyapunovExponents",
     "Model",
     "ModelError",
@@ -61,6 +63,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "crossing": ("Crossing",),
     "lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
     "meaning": ("kernel_version",),
     "models": (

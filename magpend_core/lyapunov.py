@@ -32,6 +32,9 @@ BOUNDED = int(Status.BOUNDED)
 SHRUNK = -12.0
 """Logarithm of the change of volume at which the vectors are made orthonormal."""
 
+SHORTEST = 1e-100
+"""Length at which a tangent vector counts as gone, in units of `LENGTH`."""
+
 MOST_LOSS = 1e14
 """Shortening of a vector in one orthonormalisation beyond which rounding errors decide its direction."""
 
@@ -88,8 +91,9 @@ class _Settings(NamedTuple):
     periods_per_block: int
 
 
-# The observer's memory: since the last section, sums of logarithms, integral of the divergence, largest loss.
-# A row of its record: the sums over a block. Its measures: weighted sums, the sum of weights, largest loss.
+# The observer's memory: since the last section, sums of logarithms, integral of the divergence, largest loss,
+# and with a section by crossing the time, which the engine puts last. A row of its record: the sums over a
+# block, and then its time. Its measures: weighted sums, the sum of weights (times the time), largest loss.
 
 
 def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
@@ -110,11 +114,12 @@ def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
         after = 0.0
         for i in range(N_BASE):
             after += state[own + i] * state[own + i]
-        length = np.sqrt(after) / LENGTH
+        # a vector can vanish: along the one by which trajectories that begin to slide differed
+        length = max(np.sqrt(after) / LENGTH, SHORTEST)
         for i in range(N_BASE):
             state[own + i] /= length
         memory[k] += log(length)
-        memory[n_vectors + 1] = max(memory[n_vectors + 1], np.sqrt(before / after))
+        memory[n_vectors + 1] = max(memory[n_vectors + 1], np.sqrt(before / after)) if after > 0.0 else np.inf
     memory[n_vectors] += state[N - 1]
     state[N - 1] = 0.0
 
@@ -129,14 +134,18 @@ def _average(
     if i > 0:
         block = (i - 1) // settings.periods_per_block
         if (i - 1) % settings.periods_per_block == 0:
-            for k in range(n_vectors + 1):
+            for k in range(n_vectors + 1 + HAS_RETURNS):
                 record[block, k] = 0.0
         middle = (i - 0.5) / n_periods
         weight = exp(4.0 - 1.0 / (middle * (1.0 - middle)))
         for k in range(n_vectors + 1):
             record[block, k] += memory[k]
             measures[k] += weight * memory[k]
-        measures[n_vectors + 1] += weight
+        if HAS_RETURNS:
+            record[block, n_vectors + 1] += memory[len(memory) - 1]
+            measures[n_vectors + 1] += weight * memory[len(memory) - 1]
+        else:
+            measures[n_vectors + 1] += weight
         measures[n_vectors + 2] = max(measures[n_vectors + 2], memory[n_vectors + 1])
     for k in range(n_vectors + 2):
         memory[k] = 0.0
@@ -145,12 +154,13 @@ def _average(
 
 @inline
 def _memory_size(settings: Any, n_states: int) -> int:
-    return n_states
+    return n_states + 1
 
 
-def _observer(n: int, n_vectors: int) -> Observer:
-    bindings = {"N_BASE": n, "N_TANGENTS": n * n_vectors}
-    return Observer("lyapunov", _average, _memory_size, bindings, _orthonormalise, SHRUNK)
+def _observer(n: int, n_vectors: int, has_returns: bool) -> Observer:
+    bindings = {"N_BASE": n, "N_TANGENTS": n * n_vectors, "HAS_RETURNS": has_returns}
+    name = "lyapunov_returns" if has_returns else "lyapunov"
+    return Observer(name, _average, _memory_size, bindings, _orthonormalise, SHRUNK)
 
 
 def lyapunov_exponents(
@@ -227,28 +237,33 @@ def lyapunov_exponents(
         )
     n_exponents = system.n_states if n_exponents is None else n_exponents
     settings = _settings(n_exponents, n_transient, n_periods, n_blocks, system)
-    n = system.n_states
+    n, has_returns = system.n_states, system.section is not None
     extended = with_tangents(system, n_exponents, divergence=True)
     extended = dataclasses.replace(extended, n_controlled=n * (1 + n_exponents))
     cells = integrate(
-        extended, _observer(n, n_exponents), settings,
+        extended, _observer(n, n_exponents, has_returns), settings,
         parameters=packed[:, None], frequency_hz=frequency[:, None],
         initial_states=_with_vectors(start, n_exponents), n_keep=n_blocks, n_measures=n_exponents + 3,
         rtol=rtol, atol=atol, max_steps_per_period=max_steps_per_period, n_lanes=n_lanes,
     )  # fmt: skip
-    seconds = settings.periods_per_block / frequency
-    sums = cells.section[:, 0] / seconds[:, None, None]
-    means = sums[:, :, :n_exponents].mean(axis=1)
+    record = cells.section[:, 0]
+    by_drive = (settings.periods_per_block / frequency)[:, None]
+    seconds = record[:, :, n_exponents + 1] if has_returns else by_drive
+    sums = record / seconds[:, :, None]
+    # where blocks last differently long, the longer one counts for more
+    shares = seconds / seconds.mean(axis=1, keepdims=True) if has_returns else np.ones((1, 1))
+    means = (sums[:, :, :n_exponents] * shares[:, :, None]).mean(axis=1)
     order = np.argsort(-means, axis=1, kind="stable")
     blocks = np.take_along_axis(sums[:, :, :n_exponents], order[:, None, :], axis=2)
     measures = np.where(cells.status == BOUNDED, cells.measures[:, 0], np.nan)
-    weighted = measures[:, :n_exponents] / measures[:, n_exponents + 1, None] * frequency[:, None]
+    per_weight = np.ones_like(frequency) if has_returns else frequency
+    weighted = measures[:, :n_exponents] / measures[:, n_exponents + 1, None] * per_weight[:, None]
     return LyapunovExponents(
         exponents=np.take_along_axis(means, order, axis=1),
         stderr=blocks.std(axis=1, ddof=1) / np.sqrt(settings.n_blocks),
         weighted=np.take_along_axis(weighted, order, axis=1),
         blocks=blocks,
-        divergence=sums[:, :, n_exponents].mean(axis=1),
+        divergence=(sums[:, :, n_exponents] * shares).mean(axis=1),
         loss=measures[:, n_exponents + 2],
         status=cells.status[:, 0].astype(np.int8),
         is_whole=n_exponents == n,

@@ -1,4 +1,11 @@
-"""Periodic orbits: Newton's method on the stroboscopic map, with Floquet multipliers."""
+"""Periodic orbits: Newton's method on the stroboscopic map or the return map, with Floquet multipliers.
+
+The return map of a flow takes a point of a section by crossing to its next crossing. With the flow's
+monodromy matrix Phi over that time, its rates f at the image, and the normal n of the section, its derivative
+is (1 - f n^T/(n^T f)) Phi on the section (Parker & Chua, Practical Numerical Algorithms for Chaotic Systems,
+1989, Sect. D.2). The row and the column of the state that crosses are 0 here: so is one multiplier, which
+stands for the flow's own, 1 along the orbit.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magpend_core.crossing import LEVEL
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
+from magpend_core.pointwise import rates_packed
 from magpend_core.sections import run_branches
 from magpend_core.validation import check_array, check_frequency, check_states, check_tolerance
 
@@ -27,17 +36,20 @@ class PeriodicOrbits:
     Attributes
     ----------
     section : ndarray, (n, n_states)
-        A point of the orbit on the stroboscopic section, angles in (-pi, pi] [rad, rad/s].
+        A point of the orbit on the section, angles in (-pi, pi] [rad, rad/s].
     orbit_period : ndarray of int, (n,)
-        Least period found [drive periods].
+        Least period found [drive periods, or returns].
     multipliers : ndarray of complex, (n, n_states)
-        Floquet multipliers over the orbit's period, by falling modulus.
+        Floquet multipliers over the orbit's period, by falling modulus; with a section by crossing one of
+        them is 0 and stands for the flow's own, 1 along the orbit.
     residual : ndarray, (n,)
         Certificate: scaled distance between the point and its image after the period.
     converged : ndarray of bool, (n,)
         Whether the residual is within the tolerance.
     n_iterations : ndarray of int, (n,)
         Newton steps taken.
+    seconds : ndarray, (n,)
+        Period [s]; NaN for rows that did not converge.
     """
 
     section: np.ndarray
@@ -46,11 +58,89 @@ class PeriodicOrbits:
     residual: np.ndarray
     converged: np.ndarray
     n_iterations: np.ndarray
+    seconds: np.ndarray
 
     @property
     def is_stable(self) -> np.ndarray:
         """Whether all multipliers lie inside the unit circle."""
         return np.asarray(np.abs(self.multipliers).max(axis=1) < 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Returns:
+    """Where section points come back to, one per row.
+
+    Attributes
+    ----------
+    images : ndarray, (n, n_periods, n_states)
+        Sections after 1, 2, ... periods, angles in (-pi, pi]; NaN where the integration failed.
+    derivatives : ndarray, (n, n_states, n_states)
+        Derivative of the last image by the point, on the section if that is one by crossing: the monodromy
+        matrix of a periodic orbit.
+    times : ndarray, (n, n_periods)
+        How long each period took [s].
+    """
+
+    images: np.ndarray
+    derivatives: np.ndarray
+    times: np.ndarray
+
+
+def section_map(
+    parameters: np.ndarray,
+    frequency_hz: np.ndarray,
+    points: np.ndarray,
+    n_periods: int | np.ndarray,
+    *,
+    rtol: float = RTOL,
+    system: System = PENDULUM_FITTED,
+) -> Returns:
+    """Follow section points for some periods, with the derivatives of where they arrive.
+
+    Parameters
+    ----------
+    parameters
+        Packed parameters, shape (n, n_parameters) [SI].
+    frequency_hz
+        Shape (n,) [Hz]; with a section by crossing one over the longest wait.
+    points
+        Shape (n, n_states); the state that crosses is put at the level. Rows that are not finite give NaN.
+    n_periods
+        Periods of the drive, or returns: a number, or one per row, whose derivative is that after its own.
+    rtol
+        Relative and absolute tolerance.
+    system
+        What is integrated.
+
+    Raises
+    ------
+    ValueError
+        See `run_branches`.
+    """
+    n, packed, frequency = system.n_states, np.asarray(parameters), np.asarray(frequency_hz)
+    rows, most = np.arange(len(points)), int(np.max(n_periods, initial=1))
+    last = np.broadcast_to(n_periods, len(points)) - 1
+    starts = on_section(points, packed, system)
+    is_finite = np.isfinite(starts).all(axis=1)
+    # tangents in the error control: near a rest the trajectory alone would allow any step, and a corner in
+    # the Jacobian leaves an error in the multipliers that the tolerance does not bound
+    extended = dataclasses.replace(with_tangents(system, n), n_controlled=None)
+    identity = np.broadcast_to(np.eye(n).ravel(), (len(starts), n * n))
+    result = run_branches(
+        packed[:, None, :], frequency[:, None],
+        np.concatenate([np.where(is_finite[:, None], starts, 0.0), identity], axis=1),
+        n_transient=0, n_keep=most, rtol=rtol, atol=rtol, system=extended,
+    )  # fmt: skip
+    states = np.where(is_finite[:, None, None], result.section[:, 0], np.nan)
+    images = states[:, :, :n]
+    # tangent vector k, the derivative by state k, is a column
+    derivatives = states[rows, last, n:].reshape(len(starts), n, n).transpose(0, 2, 1)
+    crossed = crossed_state(system)
+    if crossed is None:
+        return Returns(images, derivatives, np.repeat(1.0 / frequency[:, None], most, axis=1))
+    slopes = rates_packed(system, images[rows, last], packed, frequency)
+    times = np.asarray(result.return_time)[:, 0]
+    return Returns(images, on_section_derivative(derivatives, slopes, crossed), times)
 
 
 def stroboscopic_map(
@@ -62,53 +152,54 @@ def stroboscopic_map(
     rtol: float = RTOL,
     system: System = PENDULUM_FITTED,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Images of section points after `n_periods` drive periods, and the map's derivatives.
+    """Return `Returns.images` and `Returns.derivatives` of `section_map`."""
+    found = section_map(parameters, frequency_hz, points, n_periods, rtol=rtol, system=system)
+    return found.images, found.derivatives
+
+
+def crossed_state(system: System) -> int | None:
+    """Number of the state whose crossings are the section; None if that is at a drive's period."""
+    return None if system.section is None else system.section[0]
+
+
+def on_section(points: np.ndarray, parameters: np.ndarray, system: System) -> np.ndarray:
+    """Return points with the state that crosses at its level; as they are at a drive's period.
 
     Parameters
     ----------
-    parameters
-        Packed parameters, shape (n, n_parameters) [SI].
-    frequency_hz
-        Shape (n,) [Hz].
     points
-        Shape (n, n_states) [rad, rad/s].
-    n_periods
-        Drive periods.
-    rtol
-        Relative and absolute tolerance.
+        Shape (..., n_states).
+    parameters
+        Packed parameters, of a shape whose leading part broadcasts with theirs.
     system
-        What is integrated.
-
-    Returns
-    -------
-    images : ndarray, (n, n_periods, n_states)
-        Sections after 1, 2, ... drive periods, angles in (-pi, pi]; NaN where the integration failed.
-    derivatives : ndarray, (n, n_states, n_states)
-        Derivative of the last image by the point: the monodromy matrix on a periodic orbit.
-
-    Raises
-    ------
-    ValueError
-        See `run_branches`.
+        Whose section it is.
     """
-    n = system.n_states
-    # tangents in the error control: near a rest the trajectory alone would allow any step
-    extended = dataclasses.replace(with_tangents(system, n), n_controlled=None)
-    identity = np.broadcast_to(np.eye(n).ravel(), (len(points), n * n))
-    result = run_branches(
-        np.asarray(parameters)[:, None, :],
-        np.asarray(frequency_hz)[:, None],
-        np.concatenate([points, identity], axis=1),
-        n_transient=0,
-        n_keep=n_periods,
-        rtol=rtol,
-        atol=rtol,
-        system=extended,
-    )
-    states = result.section[:, 0]
-    # tangent vector k, the derivative by state k, is a column
-    derivatives = states[:, -1, n:].reshape(len(points), n, n).transpose(0, 2, 1)
-    return states[:, :, :n], derivatives
+    crossed = crossed_state(system)
+    moved = np.array(points, dtype=np.float64)
+    if crossed is not None:
+        moved[..., crossed] = np.asarray(parameters)[..., system.parameter_names.index(LEVEL)]
+        moved = wrap_angles(moved, system)
+    return moved
+
+
+def on_section_derivative(monodromy: np.ndarray, slopes: np.ndarray, crossed: int) -> np.ndarray:
+    """Derivative of the return map from that of the flow over the same time.
+
+    Parameters
+    ----------
+    monodromy
+        Derivative of the flow, shape (n, n_states, n_states).
+    slopes
+        Rates at the images, shape (n, n_states).
+    crossed
+        Number of the state that crosses; its row and column of the result are 0.
+    """
+    share = monodromy[:, crossed, :] / slopes[:, crossed, None]
+    found = monodromy - slopes[:, :, None] * share[:, None, :]
+    found[:, crossed, :] = 0.0
+    found[:, :, crossed] = 0.0
+    found[~np.isfinite(slopes).all(axis=1)] = np.nan
+    return np.asarray(found)
 
 
 def wrap_angles(states: np.ndarray, system: System = PENDULUM_FITTED) -> np.ndarray:
@@ -179,12 +270,13 @@ def polish_orbits(
         raise ValueError(f"orbit_period = {periods.tolist()} must be whole numbers of 1 or more.")
     n = system.n_states
     found = PeriodicOrbits(
-        section=guesses.copy(),
+        section=on_section(guesses, packed, system),
         orbit_period=periods.astype(np.int64),
         multipliers=np.full((len(guesses), n), np.nan, dtype=np.complex128),
         residual=np.full(len(guesses), np.nan),
         converged=np.zeros(len(guesses), dtype=bool),
         n_iterations=np.zeros(len(guesses), dtype=np.int64),
+        seconds=np.full(len(guesses), np.nan),
     )
     for period in np.unique(found.orbit_period):
         rows = np.flatnonzero(found.orbit_period == period)
@@ -204,13 +296,14 @@ def _newton(
 ) -> None:
     """Iterate the orbits of one period in place."""
     for iteration in range(max_iterations + 1):
-        images, derivatives = stroboscopic_map(
-            packed[rows], frequency[rows], found.section[rows], period, system=system
-        )
+        ends = section_map(packed[rows], frequency[rows], found.section[rows], period, system=system)
+        images, derivatives = ends.images, ends.derivatives
         found.residual[rows] = scaled_distance(images[:, -1], found.section[rows], system)
         found.n_iterations[rows] = iteration
         done = found.residual[rows] <= tolerance
-        for row, orbit, derivative in zip(rows[done], images[done], derivatives[done], strict=True):
+        for row, orbit, derivative, times in zip(
+            rows[done], images[done], derivatives[done], ends.times[done], strict=True
+        ):
             least = _least_period(orbit, tolerance, system)
             if least < period:
                 again = np.array([row])
@@ -219,7 +312,7 @@ def _newton(
             multipliers = np.linalg.eigvals(derivative)
             found.orbit_period[row] = period
             found.multipliers[row] = multipliers[np.argsort(-np.abs(multipliers), kind="stable")]
-            found.converged[row] = True
+            found.converged[row], found.seconds[row] = True, times.sum()
         going = np.isfinite(found.residual[rows]) & ~done
         rows, images, derivatives = rows[going], images[going], derivatives[going]
         if not len(rows) or iteration == max_iterations:

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from magpend_core.engine.checks import check_system
-from magpend_core.engine.jit import inline, is_covered, kernel, specialise
+from magpend_core.engine.events import event_bindings
+from magpend_core.engine.jit import keeping, kernel, part, specialise
+from magpend_core.engine.modes import mode_bindings
 from magpend_core.engine.simd import WIDTH, load, load_rows, store_rows
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
@@ -29,24 +31,42 @@ def _named(t: Any, y: Any, c: Any) -> Any:
     return quantities(t, y, rhs(y, u, c), u, c)
 
 
+def _set_modes(t: float, y: Any, rows: Any, lane: int, edge_times: Any) -> None:
+    """Put one lane's modes where its state and the time are: switches by their signs, no sliding."""
+    for k in range(N_OWN, NC):
+        rows[k * WIDTH + lane] = 1.0
+    if HAS_SWITCHES:
+        values = event_values(t, lane_states(y, lane), lane_states(y, lane), lane_constants(rows, lane), 0.0)
+        for k in range(N_SWITCHES):
+            rows[(N_OWN + k) * WIDTH + lane] = -1.0 if values[2 * k] < 0.0 else 1.0
+    if HAS_SEGMENTS:
+        passed = 0.0
+        for i in range(NE):
+            passed += edge_times[i] <= t
+        rows[(NC - 1) * WIDTH + lane] = passed
+
+
 def _evaluate(t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
     """Fill `out` (n, n_out) with the bound function at `t` (n,) and `states` (n, N)."""
-    c = np.empty(NC)
+    c = np.empty(N_OWN)
     constants(frequency, p, c)
-    rows = np.empty(NC * WIDTH)
-    for i in range(NC):
+    rows = np.ones(NC * WIDTH)
+    for i in range(N_OWN):
         for lane in range(WIDTH):
             rows[i * WIDTH + lane] = c[i]
     time = np.zeros(WIDTH)
     y = np.zeros(N * WIDTH)
     values = np.zeros(out.shape[1] * WIDTH)
-    n = len(t)
+    n, edge_table = len(t), np.zeros((3, max(NE, 1)))
+    edges(frequency, p, edge_table[0], edge_table[1], edge_table[2])
     for first in range(0, n, WIDTH):
         for lane in range(WIDTH):
             source = min(first + lane, n - 1)
             time[lane] = t[source]
             for i in range(N):
                 y[i * WIDTH + lane] = states[source, i]
+            if HAS_MODES:
+                _set_modes(time[lane], y, rows, lane, edge_table[0])
         store_rows(values, 0, quantity(load(time, 0), load_rows(y, 0, N), load_rows(rows, 0, NC)))
         for lane in range(min(WIDTH, n - first)):
             for i in range(out.shape[1]):
@@ -64,7 +84,13 @@ _KINDS = {"rates": _rates, "jacobian": _slopes, "quantities": _named, "forcing":
 def _evaluator(system: System, kind: str) -> Any:
     bindings: dict[str, Any] = {
         "N": system.n_states,
-        "NC": system.n_constants,
+        "NC": system.n_constants + system.n_modes,
+        "N_OWN": system.n_constants,
+        "NE": system.n_edges,
+        "HAS_MODES": system.n_modes > 0,
+        "edges": system.edges,
+        **event_bindings(system),
+        **mode_bindings(system),
         "rhs": system.rhs,
         "forcing": system.forcing,
         "rhs_jacobian": system.jacobian,
@@ -72,8 +98,9 @@ def _evaluator(system: System, kind: str) -> Any:
         "quantities": system.quantities,
     }
     label = f"{system.label}_{kind}"
-    bindings["quantity"] = inline(specialise(_KINDS[kind], label, **bindings))
-    return kernel(specialise(_evaluate, label, **bindings), is_covered(*system.functions))
+    bindings["_set_modes"] = part(specialise(_set_modes, label, **bindings), True)
+    bindings["quantity"] = part(specialise(_KINDS[kind], label, **bindings), True)
+    return kernel(specialise(_evaluate, label, **bindings), keeping(*system.functions))
 
 
 def _at(kind: str, n_out: int, t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
@@ -120,6 +147,67 @@ def evaluate_packed(
     """
     times, rows = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(states, np.float64)
     _evaluator(system, "quantities")(times, rows, float(frequency_hz), packed, out)
+
+
+def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
+    """Rates of a flow at many finite states with common parameters, for callers that have checked them.
+
+    Parameters
+    ----------
+    system
+        Without a drive.
+    states
+        Shape (n, n_states).
+    packed
+        Parameters, shape (n_parameters,).
+
+    Returns
+    -------
+    ndarray, (n, n_states)
+    """
+    return _flow_at("rates", system.n_states, system, states, packed)
+
+
+def jacobian_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
+    """Jacobians of `rates_at`, shape (n, n_states, n_states)."""
+    n = system.n_states
+    return _flow_at("jacobian", n * n, system, states, packed).reshape(-1, n, n)
+
+
+def _flow_at(kind: str, n_out: int, system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
+    rows, parameters = np.ascontiguousarray(states, np.float64), np.ascontiguousarray(packed, np.float64)
+    out = np.empty((len(rows), n_out))
+    if len(rows):
+        _evaluator(system, kind)(np.zeros(len(rows)), rows, 1.0, parameters, out)
+    return out
+
+
+def rates_packed(
+    system: System, states: np.ndarray, packed: np.ndarray, frequency_hz: np.ndarray
+) -> np.ndarray:
+    """Rates of a flow at many states, each with parameters of its own, for callers that have checked them.
+
+    Parameters
+    ----------
+    system
+        Without a drive: the time is 0.
+    states
+        Shape (n, n_states); rows that are not finite give NaN.
+    packed
+        Parameters, shape (n, n_parameters).
+    frequency_hz
+        Shape (n,) [Hz].
+
+    Returns
+    -------
+    ndarray, (n, n_states)
+    """
+    found = np.full(states.shape, np.nan)
+    evaluator, time = _evaluator(system, "rates"), np.zeros(1)
+    for i in np.flatnonzero(np.isfinite(states).all(axis=1)):
+        row = np.ascontiguousarray(states[i : i + 1])
+        evaluator(time, row, float(frequency_hz[i]), np.ascontiguousarray(packed[i]), found[i : i + 1])
+    return found
 
 
 def rates(t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:

@@ -9,6 +9,7 @@ run.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from magpend_core.engine.driven import LEVEL, with_recorded_drive
 from magpend_core.engine.entry import N_LANES, check_quantities, integrate
-from magpend_core.engine.jit import is_covered, kernel, specialise
+from magpend_core.engine.jit import keeping, kernel, specialise
 from magpend_core.engine.lanes import Cells, engine_bindings
 from magpend_core.engine.observers import FIRST_TURN, RECORD_LAST, Settings
 from magpend_core.engine.system import System
@@ -232,8 +233,8 @@ def _judge(sections: Any, settings: Any, out: Any) -> None:
 
 @cache
 def _judge_of(system: System) -> Callable[..., None]:
-    bindings = engine_bindings(system, RECORD_LAST)
-    return kernel(specialise(_judge, f"{system.label}_judge", **bindings), is_covered(*system.functions))
+    bindings = engine_bindings(replace(system, method="dopri5"), RECORD_LAST)
+    return kernel(specialise(_judge, f"{system.label}_judge", **bindings), keeping(*system.functions))
 
 
 def closed_periods(sections: np.ndarray, settings: Settings, system: System) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Stroboscopic sections of many trajectories: the door to the engine."""
+"""Sections of many trajectories, stroboscopic or by crossing: the door to the engine."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.crossing import Crossing
 from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD_CLOSED, RECORD_LAST, Settings
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
-from magpend_core.validation import check_count, check_frequency, check_states, check_tolerance
+from magpend_core.validation import check_array, check_count, check_frequency, check_states, check_tolerance
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class Sections:
     extremes : ndarray, (..., n_keep, n_quantities, 3), or None
         Least and largest value and mean of each watched quantity over the drive period that ends at the
         section; NaN for cells that failed, None if nothing was watched. See `engine.watching`.
+    return_time : ndarray, (..., n_keep), or None
+        Time from the crossing before to each kept one [s], with a section by crossing; None without.
     """
 
     section: np.ndarray
@@ -55,11 +58,12 @@ class Sections:
     final_state: np.ndarray
     step_size: np.ndarray
     extremes: np.ndarray | None = None
+    return_time: np.ndarray | None = None
 
 
 def run_branches(
     parameters: np.ndarray,
-    frequency_hz: np.ndarray,
+    frequency_hz: np.ndarray | None,
     initial_states: np.ndarray,
     *,
     n_transient: int,
@@ -74,6 +78,8 @@ def run_branches(
     system: System = PENDULUM_FITTED,
     n_lanes: int = N_LANES,
     quantities: Sequence[str] | None = None,
+    method: str | None = None,
+    section: Crossing | None = None,
 ) -> Sections:
     """Walk many branches through their points; each point starts where the one before ended.
 
@@ -87,7 +93,7 @@ def run_branches(
         Packed parameters of each point, shape (branch, point, len(system.parameter_names)) [SI]; see
         `Parameters.pack`.
     frequency_hz
-        Drive frequency of each point, shape (branch, point) [Hz].
+        Drive frequency of each point, shape (branch, point) [Hz]; None with a section by crossing.
     initial_states
         Shape (branch, n_states) [rad, rad/s].
     n_transient
@@ -117,6 +123,13 @@ def run_branches(
         Names of quantities and states of the system whose extremes and means are wanted over each
         period that ends in a kept section. They change no other number. Angles are counted on from
         their value in (-pi, pi] at the begin of the period.
+    section
+        What ends a period instead of the drive: then "drive period" above means the time between two
+        crossings, and the system must be without forcing. A start need not be on the section.
+
+    method
+        ``"dopri5"`` of order 5, or ``"dop853"`` of order 8 for smooth equations; None for that of `system`.
+        See `System.method`.
 
     Returns
     -------
@@ -133,6 +146,12 @@ def run_branches(
     max_orbit_period = check_count("max_orbit_period", max_orbit_period, 1)
     tolerance = check_tolerance("closure_tolerance", closure_tolerance)
     settings = Settings(n_transient, n_keep, max_orbit_period, tolerance, max(64, 4 * max_orbit_period))
+    if method is not None:
+        system = replace(system, method=method)
+    if section is not None:
+        if frequency_hz is not None:
+            raise ValueError("frequency_hz must be None with a section by crossing: its periods are returns.")
+        system, parameters, frequency_hz = section.applied(check_array("parameters", parameters, 3), system)
     cells = integrate(
         system, RECORD_CLOSED if stop_when_closed else RECORD_LAST, settings,
         parameters=parameters, frequency_hz=frequency_hz, initial_states=initial_states,
@@ -152,12 +171,13 @@ def run_branches(
         final_state=cells.state,
         step_size=cells.step_size,
         extremes=cells.watched if quantities is not None else None,
+        return_time=cells.return_times if system.section is not None else None,
     )
 
 
 def sections(
     parameters: Parameters,
-    frequency_hz: np.ndarray,
+    frequency_hz: np.ndarray | float | None,
     initial_states: np.ndarray,
     *,
     n_transient: int,
@@ -173,7 +193,8 @@ def sections(
     parameters
         See `load_preset`.
     frequency_hz
-        Drive frequency of each cell, shape (n,), or one number for all [Hz].
+        Drive frequency of each cell, shape (n,), or one number for all [Hz]; None with a section by
+        crossing.
     initial_states
         Shape (n, 4): psi1, psi2, psi1_dot, psi2_dot at a rising edge of the drive [rad, rad/s].
     n_transient, n_keep, rtol, atol
@@ -199,11 +220,17 @@ def sections(
     """
     system = parameters.model.system
     initial = check_states(initial_states, 2, system.n_states, "initial_states")
-    frequency = np.asarray(frequency_hz, np.float64)
-    if frequency.ndim == 0:
-        frequency = np.full(len(initial), float(frequency))
-    frequency = check_frequency(frequency, 1)[:, None]
-    packed = np.broadcast_to(parameters.pack(), (len(frequency), 1, len(parameters.names)))
+    if frequency_hz is None:
+        if options.get("section") is None:
+            raise ValueError("frequency_hz = None: give the drive's frequency, or a section by crossing.")
+        frequency = None
+    else:
+        frequency = np.asarray(frequency_hz, np.float64)
+        if frequency.ndim == 0:
+            frequency = np.full(len(initial), float(frequency))
+        frequency = check_frequency(frequency, 1)[:, None]
+    n = len(initial) if frequency is None else len(frequency)
+    packed = np.broadcast_to(parameters.pack(), (n, 1, len(parameters.names)))
     result = run_branches(
         packed, frequency, initial, n_transient=n_transient, n_keep=n_keep,
         rtol=rtol, atol=atol, system=system, **options,

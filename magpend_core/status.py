@@ -16,6 +16,7 @@ class Status(IntEnum):
     STEP_UNDERFLOW = 5
     UNREACHED = 6
     INFERRED = 7
+    NO_RETURN = 8
 
     @property
     def sentence(self) -> str:
@@ -34,4 +35,6 @@ _SENTENCES = {
     Status.UNREACHED: "the branch ended at an earlier point of its path, so this point was not computed",
     Status.INFERRED: "not integrated: in a refined grid all integrated cells around it closed on one orbit, "
     "and it carries the section, orbit_period and turns of one of them",
+    Status.NO_RETURN: "the trajectory did not come back to the section within the longest time waited for; "
+    "it may rest at an equilibrium; raise section.longest, or move the section",
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,8 +12,9 @@ from numba import njit
 
 from magpend_core.engine.checks import check_system
 from magpend_core.engine.entry import check_tolerances, slack_of
-from magpend_core.engine.jit import OPTIONS, is_covered, kernel, specialise
+from magpend_core.engine.jit import OPTIONS, keeping, kernel, specialise
 from magpend_core.engine.lanes import (
+    CROSSED,
     DIVERGED,
     FIRST_STEP,
     REACHED,
@@ -76,6 +78,8 @@ def follow(
     turns = np.zeros(N, np.int64)
     edge = begin_period(w, 0, 0, edge_table)
     take_section(w, 0, 0, section, turns)
+    if HAS_EVENTS:
+        begin_events(w, 0, 0)
     done, i_period = ZERO, ZERO
     while done < len(times):
         t0 = w[ROWS.time]
@@ -90,6 +94,8 @@ def follow(
         if w[ROWS.after_rejection] == 0.0:
             begin = i_period * w[ROWS.period]
             done = fill(w, y0, k0, t0, times, begin, turns, done, out)
+        if HAS_EVENTS and w[ROWS.event] == CROSSED:
+            act_on_events(w, 0, 0)
         if w[ROWS.event] == REACHED and edge < NE:
             edge = begin_segment(w, 0, 0, edge_table, edge + 1)
         elif w[ROWS.event] == REACHED:
@@ -102,10 +108,10 @@ def follow(
 
 @cache
 def _follower(system: System) -> Callable[..., int]:
-    bindings = engine_bindings(system, RECORD_LAST)
+    bindings = engine_bindings(replace(system, method="dopri5"), RECORD_LAST)
     for template in (prepare, fill):
         bindings[template.__name__] = njit(**OPTIONS)(specialise(template, system.label, **bindings))
-    return kernel(specialise(follow, system.label, **bindings), is_covered(*system.functions))
+    return kernel(specialise(follow, system.label, **bindings), keeping(*system.functions))
 
 
 def trajectory(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import sys
 
 import pytest
 import xarray as xr
@@ -119,22 +118,8 @@ def day(tmp_path_factory):
 
 
 @pytest.fixture
-def call(day, monkeypatch, capsys):
-    from pipeline.cli.main import main
-
-    def run(*words):
-        monkeypatch.chdir(day)
-        monkeypatch.setattr(sys, "argv", ["magpend", *map(str, words)])
-        code = 0
-        try:
-            main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        captured = capsys.readouterr()
-        assert code == 0, captured.err
-        return captured.out, captured.err
-
-    return run
+def call(command, day):
+    return lambda *words: command(day, *words)
 
 
 @pytest.fixture

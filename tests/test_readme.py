@@ -95,7 +95,7 @@ def test_docs__names_in_python_exist(page):
 def test_docs__modules_and_files_exist(page):
     for name in re.findall(r"`((?:pipeline|magpend_core)(?:\.\w+)+)`", PAGES[page]):
         pkgutil.resolve_name(name)
-    for name in re.findall(r"`?((?:pipeline|magpend_core|tests|workflows)/[\w/.]+)", PAGES[page]):
+    for name in re.findall(r"`?((?:pipeline|magpend_core|tests|workflows)/[\w/.-]+)", PAGES[page]):
         assert "NAME" in name or (ROOT / name.rstrip(".")).exists(), name
 
 

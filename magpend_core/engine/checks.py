@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.engine import event_checks
 from magpend_core.engine.plain import plain
 from magpend_core.engine.system import System
 
@@ -170,6 +171,7 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
             yield f"{field} = {getattr(system, field)} is out of bounds: it must be 0 or more."
     if not 1 <= system.controlled <= max(n, 1):
         yield f"n_controlled = {system.n_controlled} is out of bounds: it must be between 1 and {n}."
+    yield from event_checks.declaration(system)
     if linearised and system.jacobian is None:
         yield "jacobian is missing; exponents, multipliers and orbits need it."
     if system.quantity_names and system.quantities is None:
@@ -274,10 +276,17 @@ class _Motion:
         self.system, self.functions = system, functions
         self.scales = np.asarray(system.scales, np.float64)
         self.period = 1.0 / frequency
-        self.c = functions.constants(frequency, p)
-        self.edge_at_start = bool(system.n_edges) and functions.edges(frequency, p)[0, 0] == 0.0
+        self.times = self.period * (np.arange(N_SAMPLES) + 0.5) / N_SAMPLES
+        self.edges = functions.edges(frequency, p) if system.n_edges else np.empty((3, 0))
+        self.own = functions.constants(frequency, p)
+        self.c = self._constants_at(self.times)
+        self.edge_at_start = bool(system.n_edges) and self.edges[0, 0] == 0.0
         self.y = self._states(states)
         self.u: Any = 0.0
+
+    def _constants_at(self, times: np.ndarray) -> tuple[Any, ...]:
+        """Constants and modes."""
+        return (*self.own, *event_checks.modes_at(self.system, times, self.edges))
 
     def _states(self, states: np.ndarray) -> np.ndarray:
         """Samples around the first states that a run starts from, shape (n_states, sample)."""
@@ -308,17 +317,19 @@ class _Motion:
             self._check_jacobian(rates)
         if self.system.has_layers:
             self._check_layers(rates)
+        event_checks.motion_problems(self, rates)
         if self.system.quantities is not None:
             names = self.system.quantity_names
-            times = self.period * (np.arange(N_SAMPLES) + 0.5) / N_SAMPLES
             self.functions.numbers(
-                "quantities", len(names), ", ".join(names), times, tuple(self.y), tuple(rates), self.u, self.c
-            )
+                "quantities", len(names), ", ".join(names), self.times, tuple(self.y), tuple(rates), self.u,
+                self.c,
+            )  # fmt: skip
         return found
 
     def _check_forcing(self) -> None:
         shares = np.append(np.arange(N_SAMPLES) + 0.5, (0.0, N_SAMPLES)) / N_SAMPLES
-        u = self.functions.call("forcing", self.period * shares, self.c)
+        times = self.period * shares
+        u = self.functions.call("forcing", times, self._constants_at(times))
         if u is _NOT_RUN:
             return
         if isinstance(u, tuple):
@@ -326,6 +337,9 @@ class _Motion:
             return
         u = np.broadcast_to(np.asarray(u, np.float64), len(shares))
         self.u = u[:N_SAMPLES]
+        if self.system.forcing_is_time:
+            self._check_period()
+            return
         first, last = u[N_SAMPLES:]
         if not np.isfinite(u).all():
             self.functions.problems.append("forcing is not finite at some instants of the period.")
@@ -333,6 +347,24 @@ class _Motion:
             self.functions.problems.append(
                 f"forcing is {first:g} at time 0 and {last:g} at 1/frequency; it must have the period of the "
                 "drive, or an edge at time 0."
+            )
+
+    def _check_period(self) -> None:
+        """Compare the rates at the begin and at the end of a period, where the forcing is the time."""
+        ends = []
+        for time in (0.0, self.period):
+            self.u = np.full(N_SAMPLES, time)
+            self.c = self._constants_at(self.u)
+            ends.append(self._rates(self.y))
+        self.u, self.c = self.times, self._constants_at(self.times)
+        if ends[0] is None or ends[1] is None or self.edge_at_start:
+            return
+        size = np.nanmax(np.abs(ends[0]), axis=1, initial=0.0)[:, None]
+        changed = np.abs(ends[1] - ends[0]) > 1e-6 * size
+        for i in np.flatnonzero(changed.sum(axis=1) >= TWICE):
+            self.functions.problems.append(
+                f"rhs: the rate of {self.system.state_names[i]} differs between time 0 and 1/frequency; it "
+                "must have the period of the drive, or an edge at time 0."
             )
 
     def _rates(self, y: np.ndarray) -> np.ndarray | None:
@@ -392,7 +424,8 @@ class _Motion:
         return np.asarray((above - below) / (right[j] - left[j]))
 
     def _check_layers(self, rates: np.ndarray) -> None:
-        found = self.functions.call("layers", tuple(self.y), tuple(rates), self.c)
+        timed = (self.times,) if self.system.timed_layers else ()
+        found = self.functions.call("layers", tuple(self.y), (*rates, *timed), self.c)
         problems = self.functions.problems
         if found is _NOT_RUN:
             return

@@ -18,7 +18,7 @@ LEVEL, SLOPE = "recorded_drive", "recorded_drive_slope"
 
 
 def _wrapped(source: str, module: str, **bindings: Any) -> Any:
-    """Compile a one-function source; it passes for a function of `module` (see `jit.is_covered`)."""
+    """Compile a one-function source; it passes for a function of `module` (see `jit.keeping`)."""
     scope: dict[str, Any] = {"__name__": module, **bindings}
     exec(source, scope)
     return inline(scope["function"])
@@ -48,18 +48,34 @@ def with_recorded_drive(system: System) -> System:
     """
     if system.forcing is no_forcing:
         raise ValueError(f"{system.name} has no drive: its forcing cannot be a recording.")
+    if system.forcing_is_time or system.timed_layers:
+        raise ValueError(
+            f"{system.name}: time enters by more than one number; a recording cannot take its place."
+        )
     n, m, module = system.n_constants, len(system.parameter_names), system.rhs.__module__
-    own = f"c[:{n}]"
+    # modes stay behind all constants
+    own = f"c[:{n}]" if not system.n_modes else f"c[:{n}] + c[{n + 2}:]"
     bindings = {
         "_constants": system.constants, "_rhs": system.rhs, "_jacobian": system.jacobian,
-        "_layers": system.layers, "_quantities": system.quantities,
+        "_layers": system.layers, "_quantities": system.quantities, "_switches": system.switches,
+        "_impacts": system.impacts, "_reset": system.reset,
     }  # fmt: skip
 
     def wrap(head: str, body: str) -> Any:
         return _wrapped(f"def function({head}):\n    {body}\n", module, **bindings)
 
+    events = {
+        name: wrap(head, f"return _{name}({head[:-1]}{own})")
+        for name, head, function in (
+            ("switches", "t, y, dy, c", system.switches),
+            ("impacts", "t, y, dy, c", system.impacts),
+            ("reset", "k, t, y, c", system.reset),
+        )
+        if function is not None
+    }
     return dataclasses.replace(
         system,
+        **events,
         name=f"{system.name}_recorded",
         parameter_names=(*system.parameter_names, LEVEL, SLOPE),
         n_constants=n + 2,

@@ -125,6 +125,8 @@ def integrate(
     """
     rtol, atol = check_tolerances(rtol, atol)
     watched = check_quantities(quantities, system)
+    if watched and system.method != "dopri5":
+        raise ValueError(f"quantities are watched with method dopri5 alone; it is {system.method!r}.")
     attempts = float(check_count("max_steps_per_period", max_steps_per_period, 1))
     n_lanes = check_count("n_lanes", n_lanes, 1)
     frequency = check_frequency(frequency_hz, 2)
@@ -157,6 +159,7 @@ def integrate(
         n_steps=np.zeros(per_cell, np.int64),
         n_rejected=np.zeros(per_cell, np.int64),
         watched=np.full((*per_cell, n_keep, len(watched), 3), np.nan),
+        return_times=np.full((*per_cell, n_keep if system.section else 0), np.nan),
     )
     if cells.status.size:
         engine_of(system, observer, watched)(cells, n_lanes, rtol, atol, attempts, settings)

@@ -3,9 +3,10 @@
 numba's own ``cache=True`` watches the file of the cached function alone: after an edit of a callee
 in another file the cached caller goes on returning the old result. Here the cache folder is named
 by a digest of all sources of ``magpend_core`` with the versions of numba and llvmlite, so that any
-edit starts an empty folder. numba itself separates CPU models inside it. The digest is of bytes, not of
-meaning like `kernel_version`: no rule about what matters can then let an old answer through, and one
-compilation is all that a needless change costs.
+edit starts an empty folder. What calls functions from outside the package has a folder of its own in
+there, named by a digest of those functions and of all that they reach (see `digests`). numba itself
+separates CPU models inside it. The digest is of bytes, not of meaning like `kernel_version`: no rule about
+what matters can then let an old answer through, and one compilation is all that a needless change costs.
 
 Environment variables, read once at import:
 
@@ -28,6 +29,9 @@ import llvmlite
 import numba
 from numba import njit
 
+from magpend_core.engine.digests import PACKAGE, functions_digest
+from magpend_core.engine.parts import PartCompiler, RawCompiler
+
 # `contract` lets a product and a sum become one fused operation and nothing else: wider flags would
 # turn isnan(nan) into False. The default error model would add a branch to every division.
 F = TypeVar("F", bound=Callable[..., Any])
@@ -37,6 +41,9 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"
 # A function that allocates nothing needs no reference counts, and each is an atomic operation: passing
 # a tuple of a dozen arrays to a callee costs a microsecond.
 UNCOUNTED: dict[str, Any] = {**OPTIONS, "_nrt": False}
+
+# A door for C is made for every function that has none forbidden, though nothing here is called through one.
+WITHOUT_C: dict[str, Any] = {"no_cfunc_wrapper": True}
 
 _PACKAGE = Path(__file__).parents[1]
 
@@ -66,28 +73,60 @@ CACHE_FOLDER = _cache_folder()
 
 def inline(function: F) -> F:
     """Compile a helper of the hot path, which allocates nothing; it dissolves into its caller."""
-    return njit(forceinline=True, **UNCOUNTED)(function)
+    return njit(forceinline=True, **UNCOUNTED, **WITHOUT_C)(function)
+
+
+def part(function: F, dissolves: bool, short: bool = False) -> F:
+    """Compile a part of an engine, which only compiled functions may call.
+
+    It has neither a door for Python nor machine code of its own, which take half of the time to compile: a
+    call from Python would end the process.
+
+    Parameters
+    ----------
+    function
+        It allocates nothing.
+    dissolves
+        Whether it becomes a part of its callers.
+    short
+        Whether the engine is small enough to be optimised as a whole.
+    """
+    compiler = RawCompiler if short else PartCompiler
+    options = {"no_cpython_wrapper": True, "pipeline_class": compiler, **UNCOUNTED, **WITHOUT_C}
+    return njit(forceinline=dissolves, **options)(function)
 
 
 def is_covered(*functions: Callable[..., Any]) -> bool:
     """Whether `source_digest` covers the functions: whether all are defined in ``magpend_core``."""
-    return all(f.__module__.partition(".")[0] == "magpend_core" for f in functions)
+    return all(f.__module__.partition(".")[0] == PACKAGE for f in functions)
 
 
-def kernel(function: F, cached: bool = True) -> F:
+def keeping(*functions: Callable[..., Any]) -> str | None:
+    """Return under what the machine code of an entry point that calls `functions` is kept.
+
+    Returns
+    -------
+    str or None
+        Empty if `source_digest` covers them; else a digest of the functions and of all that they reach; None
+        if that cannot be found out: then the code is not kept, since a kept answer could be an old one.
+    """
+    return "" if is_covered(*functions) else functions_digest(*functions)
+
+
+def kernel(function: F, kept: str | None = "") -> F:
     """Compile an entry point and keep its machine code in the digest-named cache folder.
 
-    Pass ``cached=False`` for one that calls functions from outside the package (see `is_covered`):
-    the digest does not change with them, so a kept answer could be an old one.
+    Pass what `keeping` says of the functions that it calls if some may be from outside the package.
     """
-    if CACHE_FOLDER is None or not cached:
-        return njit(**OPTIONS)(function)
+    if CACHE_FOLDER is None or kept is None:
+        return njit(**OPTIONS, **WITHOUT_C)(function)
+    folder = CACHE_FOLDER / kept[:32] if kept else CACHE_FOLDER
     # numba picks the folder while it decorates; the setting is put back so that other users of
     # numba in the same process keep theirs.
     settings: Any = numba.config
-    before, settings.CACHE_DIR = settings.CACHE_DIR, str(CACHE_FOLDER)
+    before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
     try:
-        return njit(cache=True, **OPTIONS)(function)
+        return njit(cache=True, **OPTIONS, **WITHOUT_C)(function)
     finally:
         settings.CACHE_DIR = before
 

@@ -1,8 +1,8 @@
 """The engine: many trajectories in step, each with its own time, step size and parameters.
 
-Dormand-Prince 5(4) with error control. Every trajectory owns a lane; `simd.WIDTH` lanes form a
-group, whose numbers lie row by row in one flat array (see `Rows`). One attempted step advances all
-groups; accept or reject is a choice per lane, never a branch. Afterwards a short scalar pass serves
+Dormand and Prince's methods of order 5 or 8, with error control. Every trajectory owns a lane; `simd.WIDTH`
+lanes form a group, whose numbers lie row by row in one flat array (see `Rows`). One attempted step advances
+all groups; accept or reject is a choice per lane, never a branch. Afterwards a short scalar pass serves
 the lanes at which something happened: the end of a segment between two edges of the forcing, the end
 of a period (then the observer is called), the end of a cell (then the lane is refilled).
 
@@ -22,10 +22,14 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from magpend_core.engine import events as event_templates
+from magpend_core.engine import modes as mode_templates
 from magpend_core.engine import observers
-from magpend_core.engine.jit import UNCOUNTED, inline, is_covered, kernel, specialise
+from magpend_core.engine.digests import code_length
+from magpend_core.engine.events import LANDED, TAKE_BACK, event_bindings
+from magpend_core.engine.jit import inline, keeping, kernel, part, specialise
+from magpend_core.engine.modes import mode_bindings
 from magpend_core.engine.observers import Observer
 from magpend_core.engine.simd import (
     WIDTH,
@@ -41,7 +45,6 @@ from magpend_core.engine.simd import (
     where_less,
 )
 from magpend_core.engine.system import System
-from magpend_core.engine.tableau import ERROR, N_STAGES, NODES, STAGES
 from magpend_core.engine.vecmath import TWO_PI, exp2_rough, hypot_rough, log2_rough
 from magpend_core.engine.watching import (
     begin_watch,
@@ -57,7 +60,15 @@ ZERO: Any = np.int64(0)  # a plain 0 is a type of its own to numba and compiles 
 
 UNROLLED_STATES = 3
 """Systems of so many states at most have their stages written out (see `unrolled_stages`)."""
+UNROLLED_LENGTH = 3000
+"""So have those of one state more if their right-hand side has at most so many bytes of bytecode."""
 
+FADED = 5.1
+"""Distance in half-widths at which a layer that fades is not felt any more, at a `step_ratio` of 1.
+
+Of a jump J exp(-pi m) is left at m half-widths d. A step of 1000 d that ends there errs by some 1000 J d
+exp(-pi m), which equals slack/1e4, the tolerance, at m = 5.1 - log(slack/(J d))/pi.
+"""
 FIRST_STEP = 1e-3
 """First step of a branch in drive periods; error control finds the right size within a few steps."""
 SAFETY = 0.85
@@ -65,10 +76,10 @@ SHRINK = 0.2
 GROW = 5.0
 
 # events that the vector part leaves for the scalar pass
-NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW, DUE = 0.0, 1.0, 2.0, 3.0, 4.0
+NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW, DUE, CROSSED = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0
 PENDING, DIVERGED = int(Status.PENDING), int(Status.DIVERGED)
 STEP_LIMIT, STEP_UNDERFLOW = int(Status.STEP_LIMIT), int(Status.STEP_UNDERFLOW)
-UNREACHED = int(Status.UNREACHED)
+UNREACHED, NO_RETURN = int(Status.UNREACHED), int(Status.NO_RETURN)
 
 
 class Rows(NamedTuple):
@@ -103,14 +114,27 @@ class Rows(NamedTuple):
     lowest: int  # in this period
     highest: int
     integral: int
+    known: int  # values and rates of events at the begin of the step, see `events`
+    found: int  # at the end of the attempt
+    passed: int  # where the last attempt that was taken back ended
+    side: int  # of each event
+    fired: int  # 1 if it happened at the end of the last step
+    dip: int  # share of the attempt at which it may have gone beyond zero and come back, or 2
+    aimed: int  # s, length of the next attempt, if an event decides it
+    ahead: int  # s, from the begin of the step to where `passed` is of
+    resolution: int  # s, of the instant that is looked for; 0 if none is
+    level: int  # of the section
     size: int
 
 
 def rows_of(system: System, n_watched: int = 0) -> Rows:
     """Lay out a group for a system of which `n_watched` quantities are watched."""
+    n = system.n_events
     counts = [
-        system.n_states, N_STAGES * system.n_states, system.n_states, system.n_constants, *[1] * 18,
-        system.n_states if n_watched else 0, *[n_watched] * 6,
+        system.n_states, system.tableau.n_stages * system.n_states, system.n_states,
+        system.n_constants + system.n_modes,
+        *[1] * 18, system.n_states if n_watched else 0, *[n_watched] * 6, *[2 * n] * 3, *[n] * 3,
+        *[1 if n else 0] * 4,
     ]  # fmt: skip
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
     return Rows(*(int(x) for x in offsets))
@@ -123,7 +147,7 @@ def step_ratio(room: Any) -> Any:
     from the poles at +-i d grow like J d n!/R^(n+1): a step h = c R leaves an error in proportion to
     J d c^6 for a method of order 5. So c = (slack/(J d))^(1/6), with `room` = slack/(J d).
     """
-    return exp2_rough(log2_rough(minimum(maximum(room, 1e-30), 1e30)) * (1.0 / 6.0))
+    return exp2_rough(log2_rough(minimum(maximum(room, 1e-30), 1e30)) * (1.0 / (ORDER + 1.0)))
 
 
 def choose_step(w: Any, base: int, slack: float) -> None:
@@ -132,8 +156,9 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     The step is the least of what error control wants and, for each layer and edge, what keeps it in
     proportion to the distance from the nearest complex singularity: with D the distance in time to
     the crossing, d the half-width in time and c the layer's `step_ratio`, at most
-    max(c D/(1 + c), c d) towards the crossing and, to 2 %, c sqrt(D^2 + d^2) away from it. It ends on
-    the segment's end exactly, and the last two steps before that share the rest.
+    max(c D/(1 + c), c d) towards the crossing and, to 2 %, c sqrt(D^2 + d^2) away from it. Layers that
+    fade are not felt from further away than `FADED`: a step may lead to there, or to a tenth of D. A step
+    ends on the segment's end exactly, and the last two steps before that share the rest.
     """
     y = load_rows(w, base + ROWS.state, N)
     dy = load_rows(w, base + ROWS.slopes, N)
@@ -144,7 +169,7 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     if HAS_LAYERS:  # numba cannot loop over an empty tuple
         # the least quotient, kept as one until the end: one division for all layers
         speed_h = 1.0 + 0.0 * h
-        for value, rate, half_width, per_strength in layers(y, dy, c):
+        for value, rate, half_width, per_strength in layers_at(t, y, dy, c):
             speed = absolute(rate)
             ratio = step_ratio(slack * speed * per_strength)
             distance = absolute(value)
@@ -152,6 +177,11 @@ def choose_step(w: Any, base: int, slack: float) -> None:
             # the two bounds of the docstring over one common division
             towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
             away = ratio * hypot_rough(distance, half_width)
+            if LAYERS_FADE:
+                reach = half_width * maximum(FADED - 1.32 * log2_rough(ratio), 1.0)
+                nearer = (1.0 + ratio) * minimum(distance - reach, 0.9 * distance)
+                towards = maximum(towards, nearer)
+                away = where_less(reach, distance, 1e100, away)
             length = where_less(nearing, 0.0, towards, away)
             speed = speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)
             mine, other = length * speed_h, h * speed
@@ -166,12 +196,15 @@ def choose_step(w: Any, base: int, slack: float) -> None:
         h = minimum(maximum(load(w, base + ROWS.target_share) * remaining, least), h)
     shared = where_less(remaining, 2.0 * h, 0.5 * remaining, h)
     h = where_less(h, remaining, shared, remaining)
+    if HAS_EVENTS:
+        aimed = load(w, base + ROWS.aimed)
+        h = where_less(0.0, aimed, aimed, h)
     h = where_less(0.5, load(w, base + ROWS.fresh), 0.0, h)
     store(w, base + ROWS.step, h)
 
 
 def run_stage(w: Any, base: int, s: int) -> None:
-    """Compute the state and the slope of stage `s` (1 to 6)."""
+    """Compute the state and the slope of stage `s` (1, 2, ...)."""
     h = load(w, base + ROWS.step)
     for i in range(N):
         row = base + i * WIDTH
@@ -199,10 +232,11 @@ def run_stages(w: Any, base: int) -> None:
 def unrolled_stages(system: System) -> Callable[..., None]:
     """Return `run_stages` written out for a small system.
 
-    The slopes stay in registers, the tableau's zeros cost nothing. Not for larger systems: six copies
-    of a long right-hand side compile for long and gain little.
+    The slopes stay in registers, the tableau's zeros cost nothing. Not for larger systems: many
+    copies of a long right-hand side compile for long and gain little.
     """
-    n = system.n_states
+    n, tableau = system.n_states, system.tableau
+    nodes, stages = tableau.nodes, tableau.stages
     lines = [
         "def run_stages(w, base):",
         "h, t = load(w, base + ROWS.step), load(w, base + ROWS.time)",
@@ -210,8 +244,8 @@ def unrolled_stages(system: System) -> Callable[..., None]:
         "y = load_rows(w, base + ROWS.state, N)",
         "k0 = load_rows(w, base + ROWS.slopes, N)",
     ]
-    for s in range(1, N_STAGES):
-        terms = [(j, STAGES[s, j]) for j in range(s) if STAGES[s, j] != 0.0]
+    for s in range(1, tableau.n_stages):
+        terms = [(j, stages[s, j]) for j in range(s) if stages[s, j] != 0.0]
         states = []
         for i in range(n):
             first, *rest = terms
@@ -220,8 +254,8 @@ def unrolled_stages(system: System) -> Callable[..., None]:
                 total = f"multiply_add({float(a)!r}, k{j}[{i}], {total})"
             states.append(f"multiply_add(h, {total}, y[{i}])")
         lines.append(f"trial = ({', '.join(states)},)")
-        if NODES[s] != NODES[s - 1]:
-            lines.append(f"u = forcing(t + {float(NODES[s])!r} * h, c)")
+        if nodes[s] != nodes[s - 1]:
+            lines.append(f"u = forcing(t + {float(nodes[s])!r} * h, c)")
         lines.append(f"k{s} = rhs(trial, u, c)")
         lines.append(f"store_rows(w, base + ROWS.slopes + {s * n * WIDTH}, k{s})")
     lines.append("store_rows(w, base + ROWS.trial, trial)")
@@ -246,13 +280,38 @@ def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
     return (h * h) * total * (1.0 / N_CONTROLLED)
 
 
+def squared_error_of_two(w: Any, base: int, rtol: float, atol: float) -> Any:
+    """Mean square of the scaled error of an attempt, from estimates of two orders.
+
+    With mean squares E and F of the higher and the lower, E**2/(E + F/100): Hairer, Norsett and Wanner,
+    Solving Ordinary Differential Equations I, section II.10.
+    """
+    total, other_total = 0.0 * load(w, base + ROWS.step), 0.0 * load(w, base + ROWS.step)
+    for i in range(N_CONTROLLED):
+        row = base + i * WIDTH
+        slope = load(w, row + ROWS.slopes)
+        error, other = ERROR[0] * slope, OTHER_ERROR[0] * slope
+        for j in range(5, N_STAGES):
+            slope = load(w, row + ROWS.slopes + j * N * WIDTH)
+            error = multiply_add(ERROR[j], slope, error)
+            other = multiply_add(OTHER_ERROR[j], slope, other)
+        size = maximum(absolute(load(w, row + ROWS.state)), absolute(load(w, row + ROWS.trial)))
+        per = 1.0 / (atol + rtol * size)
+        error, other = error * per, other * per
+        total = multiply_add(error, error, total)
+        other_total = multiply_add(other, other, other_total)
+    h = load(w, base + ROWS.step)
+    both = maximum(multiply_add(0.01, other_total, total), 1e-300)
+    return (h * h) * total * (total / both) * (1.0 / N_CONTROLLED)
+
+
 def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> bool:
     """Accept or reject the attempt, lane by lane, and set the next wish and the event.
 
     Return whether a lane of the group has an event.
     """
     e2 = minimum(squared_error(w, base, rtol, atol), 1e20)
-    factor = SAFETY * exp2_rough(log2_rough(maximum(e2, 1e-20)) * -0.1)
+    factor = SAFETY * exp2_rough(log2_rough(maximum(e2, 1e-20)) * (-0.5 / ORDER))
     bounded = minimum(maximum(factor, SHRINK), GROW)
     bounded = where_less(0.5, load(w, base + ROWS.after_rejection), minimum(bounded, 1.0), bounded)
     h = load(w, base + ROWS.step)
@@ -266,6 +325,14 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
     next_wish = where_less(0.5, rejected, h * bounded, next_wish)
     stepped = where_less(0.0, h, 1.0, 0.0)
     next_wish = where_less(0.5, stepped, next_wish, wish)
+    if HAS_EVENTS:
+        aimed = load(w, base + ROWS.aimed)
+        verdict = judge_events(w, base, rejected)
+        taken_back = where_less(absolute(verdict - TAKE_BACK), 0.5, 1.0, 0.0)
+        # the length of an attempt to an event says nothing of what error control allows
+        as_before = maximum(taken_back, where_less(0.0, aimed, 1.0 - rejected, 0.0))
+        next_wish = where_less(0.5, as_before, wish, next_wish)
+        rejected = maximum(rejected, taken_back)
     store(w, base + ROWS.wish, next_wish)
     for i in range(N):
         row = base + i * WIDTH
@@ -284,6 +351,10 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
     store(w, base + ROWS.after_rejection, rejected)
     store(w, base + ROWS.fresh, 0.0 * h)
     event = where_less(0.5, arrived, REACHED, where_less(max_attempts, attempts, TOO_MANY_STEPS, NOTHING))
+    if HAS_EVENTS:
+        lands = where_less(absolute(verdict - LANDED), 0.5, 1.0, 0.0)
+        in_time = where_less(max_attempts, attempts, event, CROSSED)
+        event = where_less(0.5, lands, in_time, event)
     tiny = 1e-15 * load(w, base + ROWS.period)
     event = where_less(next_wish, tiny, UNDERFLOW, event)
     if REWRITES:
@@ -318,15 +389,18 @@ def load_cell(
 ) -> None:
     """Give a lane the constants and edges of a cell; the state stays."""
     constants(frequency, p, scratch)
-    for i in range(NC):
+    for i in range(N_OWN):
         w[base + ROWS.constants + i * WIDTH + lane] = scratch[i]
     period = 1.0 / frequency
     edges(frequency, p, edge_table[0], edge_table[1], edge_table[2])
-    for i in range(NE):
-        edge_table[2, i] = step_ratio(slack / (edge_table[2, i] * edge_table[1, i]))
+    if NE > 0:
+        for i in range(NE):
+            edge_table[2, i] = step_ratio(slack / (edge_table[2, i] * edge_table[1, i]))
     w[base + ROWS.period + lane] = period
     w[base + ROWS.steps + lane] = 0.0
     w[base + ROWS.rejected + lane] = 0.0
+    if HAS_SECTION:
+        w[base + ROWS.level + lane] = p[len(p) - 1]
 
 
 def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
@@ -334,13 +408,15 @@ def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
     w[base + ROWS.time + lane] = 0.0
     w[base + ROWS.attempts + lane] = 0.0
     # the last slope belongs to time `period`, where the forcing can differ from that at time 0 by its
-    # rounding: a branch continued from here by a later call starts from the latter
-    w[base + ROWS.fresh + lane] = 1.0
+    # rounding: a branch continued from here by a later call starts from the latter. After a crossing it is
+    # that of the same state; but a watch that begins now needs values there
+    if WATCHES or not HAS_SECTION:
+        w[base + ROWS.fresh + lane] = 1.0
     if NE > 0 and edge_table[0, 0] == 0.0:
-        set_target(w, base, lane, 0.0, edge_table, 0)
-        return begin_segment(w, base, lane, edge_table, 1)
-    set_target(w, base, lane, 0.0, edge_table, NE)
-    return begin_segment(w, base, lane, edge_table, 0)
+        set_target(w, base, lane, 0.0, edge_table, ZERO)
+        return begin_segment(w, base, lane, edge_table, ZERO + 1)
+    set_target(w, base, lane, 0.0, edge_table, ZERO + NE)
+    return begin_segment(w, base, lane, edge_table, ZERO)
 
 
 def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge: int) -> None:
@@ -357,11 +433,16 @@ def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> i
     w[base + ROWS.start + lane] = w[base + ROWS.target + lane]
     w[base + ROWS.start_width + lane] = w[base + ROWS.target_width + lane]
     w[base + ROWS.start_ratio + lane] = w[base + ROWS.target_ratio + lane]
+    if HAS_SEGMENTS:
+        w[base + ROWS.constants + (NC - 1) * WIDTH + lane] = edge
+        w[base + ROWS.fresh + lane] = 1.0
+        if HAS_SWITCHES:
+            keep_switches(w, base, lane)
     if edge < NE:
         set_target(w, base, lane, edge_table[0, edge], edge_table, edge)
         return edge
     # the next period starts with edge 0 if that is at time 0
-    first = 0 if NE > 0 and edge_table[0, 0] == 0.0 else NE
+    first = ZERO if NE > 0 and edge_table[0, 0] == 0.0 else ZERO + NE
     set_target(w, base, lane, w[base + ROWS.period + lane], edge_table, first)
     return NE
 
@@ -442,6 +523,7 @@ class Cells(NamedTuple):
     n_steps: Any  # int64, accepted
     n_rejected: Any  # int64
     watched: Any  # (..., n_keep, n_watched, 3), see `watching`; no numbers where nothing is watched
+    return_times: Any  # (..., n_keep), s, of a kept section since the last; no numbers without crossings
 
 
 def start_branch(cells: Cells, work: Work, lane: int, branch: int, settings: Any, scratch: Any) -> None:
@@ -475,6 +557,8 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, 
     work.lanes[base + ROWS.fresh + column] = 1.0
     work.lanes[base + ROWS.after_rejection + column] = 0.0
     work.lanes[base + ROWS.event + column] = NOTHING
+    if HAS_EVENTS:
+        begin_events(work.lanes, base, column)
     if WATCHES:
         begin_watch(work, lane, keeps_next(0, work.memory[lane], settings))
 
@@ -491,6 +575,8 @@ def forget(cells: Cells, branch: int, point: int) -> None:
             cells.section[branch, point, i, k] = np.nan
         if WATCHES:
             cells.watched[branch, point, i] = np.nan
+        if HAS_SECTION:
+            cells.return_times[branch, point, i] = np.nan
 
 
 def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
@@ -501,7 +587,7 @@ def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
     cells.n_periods[at] = work.i_period[lane]
     cells.n_steps[at] = int(work.lanes[base + ROWS.steps + column])
     cells.n_rejected[at] = int(work.lanes[base + ROWS.rejected + column])
-    if has_failed(status):
+    if has_failed(status) or status == NO_RETURN:
         forget(cells, work.branch[lane], work.point[lane])
 
 
@@ -524,17 +610,21 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     event = w[base + ROWS.event + column]
     w[base + ROWS.event + column] = NOTHING
     status = PENDING
-    if REWRITES and (event == REACHED or event == DUE):
+    if HAS_EVENTS and event == CROSSED and not act_on_events(w, base, column):
+        return False
+    if REWRITES and (event == REACHED or event == DUE or event == CROSSED):
         renew_state(w, base, column, section, work.memory[lane], settings)
         if event == DUE:
             return False
-    if event == REACHED:
-        if work.edge[lane] < NE:
-            work.edge[lane] = begin_segment(w, base, column, work.edge_table[lane], work.edge[lane] + 1)
-            return False
+    if event == REACHED and work.edge[lane] < NE:
+        work.edge[lane] = begin_segment(w, base, column, work.edge_table[lane], work.edge[lane] + 1)
+        return False
+    if event == (CROSSED if HAS_SECTION else REACHED):
         work.i_period[lane] += 1
         if take_section(w, base, column, section, work.turns[lane]):
             at = (work.branch[lane], work.point[lane])
+            if HAS_SECTION:
+                keep_time(w, base, column, work.memory[lane], cells.return_times[at])
             if WATCHES and work.watching[lane] == 1:
                 keep_extremes(w, base, column, cells.watched[at][n_kept(work.memory[lane])])
             status = observe(
@@ -551,6 +641,8 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     elif not in_bounds(w, base, column):
         # a blow-up within a period shrinks the step before a section could show it
         status = DIVERGED
+    elif event == REACHED:
+        status = NO_RETURN
     elif event == TOO_MANY_STEPS:
         status = STEP_LIMIT
     else:
@@ -563,16 +655,27 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     return False
 
 
+def keep_time(w: Any, base: int, lane: int, memory: Any, out: Any) -> None:
+    """Write the time since the last section to the observer's memory, and to the row of the next to keep."""
+    time = w[base + ROWS.time + lane]
+    memory[len(memory) - 1] = time
+    if n_kept(memory) < len(out):
+        out[n_kept(memory)] = time
+
+
 def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: float, settings: Any) -> None:
     """Integrate all branches, `n_lanes` at a time, and fill the output arrays of `cells`."""
     n_branches = cells.frequency.shape[0]
     active = min(n_lanes, n_branches)
     n_groups = (active + WIDTH - 1) // WIDTH
     size = n_groups * WIDTH
+    n_memory, n_edges = memory_size(settings, N) + HAS_SECTION, max(NE, 1)
+    # each kind of array that numba makes takes a twentieth of a second to compile: all are made flat
     work = Work(
         np.zeros(n_groups * ROWS.size), np.zeros(size, np.int64), np.zeros(size, np.int64),
-        np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros((size, N), np.int64),
-        np.zeros((size, 3, max(NE, 1))), np.zeros((size, memory_size(settings, N))),
+        np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size * N, np.int64).reshape((size, N)),
+        np.zeros(size * 3 * n_edges).reshape((size, 3, n_edges)),
+        np.zeros(size * n_memory).reshape((size, n_memory)),
         np.zeros(size, np.int64), np.zeros(n_groups, np.int64),
     )  # fmt: skip
     scratch = np.zeros(max(NC, N))
@@ -582,12 +685,12 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: 
         start_branch(cells, work, lane, min(lane, n_branches - 1), settings, scratch)
     next_branch = active
     # a field of a tuple is counted by an atomic operation at every use: too slow per lane
-    rows, events = work.lanes, np.zeros(n_groups, np.bool_)
+    rows, events = work.lanes, np.zeros(n_groups, np.int64)
     while active > 0:
         in_use = (active + WIDTH - 1) // WIDTH
         attempt(rows, events, work.n_watching, in_use, cells.slack, rtol, atol, max_attempts)
         for group in range(in_use):
-            if not events[group]:
+            if events[group] == 0:
                 continue
             lane, last = group * WIDTH, min(group * WIDTH + WIDTH, active)
             while lane < last:
@@ -627,7 +730,7 @@ def copy_lane(work: Work, source: int, target: int) -> None:
 _INLINE = (
     "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period",
     "in_bounds", "take_section", "renew_state", "move_lane", "has_failed",
-    "evaluate_watched", "update_extremes", "keep_extremes", "set_watching", "begin_watch",
+    "evaluate_watched", "update_extremes", "keep_extremes", "set_watching", "begin_watch", "keep_time",
 )  # fmt: skip
 _CALLED = (
     "choose_step", "run_stage", "run_stages", "finish_step", "attempt",
@@ -637,6 +740,14 @@ _CALLED = (
 
 def _name(system: System, observer: Observer, watched: tuple[int, ...]) -> str:
     return "_".join([system.label, observer.name, *(["watch"] if watched else []), *map(str, watched)])
+
+
+def _layers_at(system: System) -> Callable[..., Any]:
+    """Return ``system.layers`` with the time in front, whether the system needs it or not."""
+    rates = "dy + (t,)" if system.timed_layers else "dy"
+    scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_layers": system.layers}
+    exec(f"def layers_at(t, y, dy, c):\n    return _layers(y, {rates}, c)\n", scope)
+    return inline(scope["layers_at"])
 
 
 def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> dict[str, Any]:
@@ -651,9 +762,19 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "keeps_next": observer.keeps_next,
         "N": system.n_states,
         "N_CONTROLLED": system.controlled,
-        "NC": system.n_constants,
+        "NC": system.n_constants + system.n_modes,
+        "N_OWN": system.n_constants,
+        "N_STAGES": system.tableau.n_stages,
+        "NODES": system.tableau.nodes,
+        "STAGES": system.tableau.stages,
+        "ERROR": system.tableau.error,
+        "OTHER_ERROR": system.tableau.other_error,
+        "ORDER": float(system.tableau.order),
+        **event_bindings(system),
+        **mode_bindings(system),
         "NE": system.n_edges,
         "HAS_LAYERS": system.has_layers,
+        "LAYERS_FADE": system.layers_fade,
         "REWRITES": observer.rewrites,
         "RENEW_BELOW": observer.renew_below,
         "IS_ANGLE": system.is_angle,
@@ -663,20 +784,27 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "edges": system.edges,
         "forcing": system.forcing,
         "rhs": system.rhs,
-        "layers": system.layers,
+        "layers_at": _layers_at(system),
         "memory_size": observer.memory_size,
         **observer.bindings,
     }
+    short = code_length(system.rhs) + code_length(system.forcing) <= UNROLLED_LENGTH
     for key in observers.HELPERS:
-        bindings[key] = inline(specialise(getattr(observers, key), name, **bindings))
-    bindings["observe"] = inline(specialise(observer.observe, name, **bindings))
-    bindings["renew"] = inline(specialise(observer.renew, name, **bindings))
-    templates: dict[str, Any] = {key: globals()[key] for key in (*_INLINE, *_CALLED)}
-    if system.n_states <= UNROLLED_STATES:
+        bindings[key] = part(specialise(getattr(observers, key), name, **bindings), True, short)
+    bindings["observe"] = part(specialise(observer.observe, name, **bindings), True, short)
+    bindings["renew"] = part(specialise(observer.renew, name, **bindings), True, short)
+    templates: dict[str, Any] = {}
+    for module in (event_templates, mode_templates):
+        templates |= {key: getattr(module, key) for key in (*module.INLINE, *module.CALLED)}
+    templates |= {key: globals()[key] for key in (*_INLINE, *_CALLED)}
+    if system.n_states <= UNROLLED_STATES + short:
         templates["run_stages"] = unrolled_stages(system)
+    if system.tableau.has_two_errors:
+        templates["squared_error"] = squared_error_of_two
+    dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *_INLINE}
     for key, template in templates.items():
         function = specialise(template, name, **bindings)
-        bindings[key] = inline(function) if key in _INLINE else njit(**UNCOUNTED)(function)
+        bindings[key] = part(function, key in dissolving, short)
     return bindings
 
 
@@ -691,6 +819,6 @@ def engine_of(system: System, observer: Observer, watched: tuple[int, ...] = ())
 @cache
 def _engine_of(system: System, observer: Observer, watched: tuple[int, ...]) -> Callable[..., None]:
     bindings = engine_bindings(system, observer, watched)
-    kept = observer.n_kept, observer.keeps_next
-    cached = is_covered(*system.functions, observer.observe, observer.memory_size, observer.renew, *kept)
-    return kernel(specialise(advance, _name(system, observer, watched), **bindings), cached)
+    rest = observer.n_kept, observer.keeps_next
+    kept = keeping(*system.functions, observer.observe, observer.memory_size, observer.renew, *rest)
+    return kernel(specialise(advance, _name(system, observer, watched), **bindings), kept)

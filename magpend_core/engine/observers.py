@@ -5,7 +5,8 @@ An observer is a pair of functions bound at compile time.
 ``observe(section, turns, i_period, memory, record, measures, settings) -> status``
     Called after period number `i_period` (1, 2, ...) of a cell. `section` is the state, angles in
     (-pi, pi]; `turns` counts the full turns of each angle since the branch's start; `memory` is the
-    cell's own scratch vector, zero at the start; `record` (n_keep, n_states) and `measures` are the
+    cell's own scratch vector, zero at the start (with a section by crossing it has one entry more, the
+    last: the time since the section before [s]); `record` (n_keep, n_states) and `measures` are the
     cell's outputs. Returns ``PENDING`` to go on, any other status to end the cell.
 ``memory_size(settings, n_states) -> int``
     Length of `memory`.

@@ -11,14 +11,15 @@ The functions here are templates, bound to a system by `sampler_of` (see `lanes`
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
-from magpend_core.engine.jit import UNCOUNTED, inline, is_covered, kernel, specialise
+from magpend_core.engine.jit import keeping, kernel, part, specialise
 from magpend_core.engine.lanes import (
+    CROSSED,
     DIVERGED,
     FIRST_STEP,
     NOTHING,
@@ -91,6 +92,8 @@ def begin_interval(samples: Samples, seats: Seats, lane: int, scratch: Any) -> N
     frequency = 1.0 / samples.durations[at]
     load_cell(w, base, column, frequency, p, samples.slack, scratch, seats.edge_table[lane])
     seats.edge[lane] = begin_period(w, base, column, seats.edge_table[lane])
+    if HAS_SWITCHES:
+        keep_switches(w, base, column)
     w[base + ROWS.steps + column] = steps
     w[base + ROWS.rejected + column] = rejected
 
@@ -115,6 +118,8 @@ def begin_trajectory(samples: Samples, seats: Seats, lane: int, number: int, scr
         seats.edge[lane] = begin_segment(w, base, column, table, seats.edge[lane] + 1)
     seats.clock[lane, 1] = -late
     take_section(w, base, column, scratch, seats.turns[lane])
+    if HAS_EVENTS:
+        begin_events(w, base, column)
     w[base + ROWS.fresh + column] = 1.0
     w[base + ROWS.after_rejection + column] = 0.0
     w[base + ROWS.event + column] = NOTHING
@@ -180,6 +185,9 @@ def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
         if seats.done[lane] == wanted:
             return BOUNDED if in_bounds(w, base, column) else DIVERGED
     if event == NOTHING:
+        return PENDING
+    if HAS_EVENTS and event == CROSSED:
+        act_on_events(w, base, column)
         return PENDING
     if event == REACHED and seats.edge[lane] < NE:
         table = seats.edge_table[lane]
@@ -272,8 +280,8 @@ _CALLED = ("begin_interval", "begin_trajectory", "write_due", "go_on", "end_traj
 @cache
 def sampler_of(system: System) -> Callable[..., None]:
     """Compile `follow_all` for a system."""
-    bindings = engine_bindings(system, RECORD_LAST)
+    bindings = engine_bindings(replace(system, method="dopri5"), RECORD_LAST)
     for key in (*_INLINE, *_CALLED):
         function = specialise(globals()[key], system.label, **bindings)
-        bindings[key] = inline(function) if key in _INLINE else njit(**UNCOUNTED)(function)
-    return kernel(specialise(follow_all, system.label, **bindings), is_covered(*system.functions))
+        bindings[key] = part(function, key in _INLINE)
+    return kernel(specialise(follow_all, system.label, **bindings), keeping(*system.functions))

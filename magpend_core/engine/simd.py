@@ -30,6 +30,9 @@ from numba.extending import (
 WIDTH = 16
 """Lanes in a group."""
 
+# halves and negates the exponent of a number whose bits are halved and taken from it (Lomont 2003)
+_INVERSE_ROOT = 0x5FE6EB50C7B537A9
+
 _CONTRACT = ("contract",)
 _DOUBLE = ir.DoubleType()
 _INT64 = ir.IntType(64)
@@ -187,6 +190,23 @@ def copysign(x: Any, sign: Any) -> Any:
     return np.copysign(x, sign)
 
 
+def floor(x: Any) -> Any:
+    """Largest whole number that is not above `x`."""
+    return np.floor(x)
+
+
+def upper(x: Any) -> Any:
+    """`x` cut off after 26 binary digits: products of two such numbers are exact."""
+    bits = np.asarray(x, np.float64).view(np.int64) & np.int64(-(2**27))
+    return bits.view(np.float64)[()]
+
+
+def inverse_sqrt_rough(x: Any) -> Any:
+    """One over the square root of a positive normal number, to 3.5 %."""
+    bits = np.int64(_INVERSE_ROOT) - (np.asarray(x, np.float64).view(np.int64) >> np.int64(1))
+    return bits.view(np.float64)[()]
+
+
 def where_less(a: Any, b: Any, yes: Any, no: Any) -> Any:
     """`yes` where ``a < b``, else `no`; a NaN on either side counts as not less."""
     return np.where(a < b, yes, no)[()]
@@ -276,7 +296,20 @@ def _emit_mantissa(builder: Any, numba_type: Any, x: Any) -> Any:
     return builder.bitcast(number, _ir_type(numba_type))
 
 
+def _emit_upper(builder: Any, numba_type: Any, x: Any) -> Any:
+    bits = builder.and_(builder.bitcast(x, _int_type(numba_type)), _int_constant(numba_type, -(2**27)))
+    return builder.bitcast(bits, _ir_type(numba_type))
+
+
+def _emit_inverse_sqrt_rough(builder: Any, numba_type: Any, x: Any) -> Any:
+    half = builder.ashr(builder.bitcast(x, _int_type(numba_type)), _int_constant(numba_type, 1))
+    return builder.bitcast(builder.sub(_int_constant(numba_type, _INVERSE_ROOT), half), _ir_type(numba_type))
+
+
 _primitive(sqrt, _call("sqrt"))
+_primitive(inverse_sqrt_rough, _emit_inverse_sqrt_rough)
+_primitive(floor, _call("floor"))
+_primitive(upper, _emit_upper)
 _primitive(absolute, _call("fabs"))
 _primitive(multiply_add, _call("fmuladd"))
 _primitive(copysign, _call("copysign"))

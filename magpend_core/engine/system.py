@@ -7,7 +7,10 @@ import math
 from collections import namedtuple
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magpend_core.engine.tableau import Tableau
 
 
 def positions(names: Iterable[str]) -> Any:
@@ -68,6 +71,9 @@ class System:
         ``forcing(t, c)``: the explicit time dependence, a number, at time `t` [s] since the last
         section; `c` is the tuple of constants. It has the period 1/frequency. None for none: the system is
         autonomous, and the period is the time between two looks at it.
+    forcing_is_time : bool
+        Whether `forcing` returns `t` itself, because time enters `rhs` by more than one number; then `rhs`
+        has the period 1/frequency in it.
     rhs : callable
         ``rhs(y, u, c)``: time derivatives as a tuple, from the states `y` and the forcing `u`.
     jacobian : callable
@@ -94,12 +100,55 @@ class System:
         1/(half_width * jump), with the change of the right-hand side across the layer. None for none.
     has_layers : bool
         False if there are none; then `layers` is never called.
+    layers_fade : bool
+        Whether every layer falls off exponentially, like tanh and unlike atan: exp(-pi m) of its change
+        is left at m half-widths.
+    timed_layers : bool
+        Whether `layers` needs the time [s since the last section]; it then finds it behind the rates, as
+        ``dy[n_states]``.
     n_controlled : int or None
         How many of the states, from the first, enter the error control; None for all.
+    n_modes : int
+        Numbers that `rhs`, `jacobian` and `quantities` find behind the constants, ``c[n_constants + k]``,
+        and that change at events and edges alone: each stage of a step sees the same. First one for each
+        switch, last the segment if `has_segments`.
+    n_switches : int
+        Number of surfaces at which the right-hand side jumps. Mode k is the side on which switch k is,
+        -1.0 or +1.0; `rhs` uses it where it says ``sign(value)``. A step ends on the surface, and the mode
+        changes.
+    switches : callable
+        ``switches(t, y, dy, c)``: a tuple of ``(value, rate)``, a function of time and state and its time
+        derivative, which is linear in `dy`. While mode k is 0 (see `slides`), pair k is instead
+        ``1 - sigma**2`` and its rate, where sigma in [-1, 1] is what stands for the mode in the equivalent
+        control.
+    slides : tuple of bool
+        For which switches sliding is looked for; empty for none. Where the right-hand sides of both sides
+        point to the surface, the mode becomes 0.0, and `rhs` is to give the motion along it (Filippov's
+        equivalent control). It ends where sigma leaves [-1, 1].
+    has_segments : bool
+        Whether the last mode, ``c[n_constants + n_modes - 1]``, is the number of edges passed in this period:
+        0.0 before the first, and so on. A forcing with true jumps is then on the right side of an edge at all
+        stages; its half-width may be infinite.
+    n_impacts : int
+        Number of surfaces at which the state jumps.
+    impacts : callable
+        ``impacts(t, y, dy, c)``: a tuple of ``(value, rate)``, as for `switches`.
+    impact_directions : tuple of int
+        +1 where an impact happens as its value rises through zero, -1 as it falls.
+    reset : callable
+        ``reset(k, t, y, c)``: the states after impact number `k` as a tuple, from those before. Runs on plain
+        numbers, so that ``if k == 0`` is allowed.
+    section : (int, int) or None
+        Number of the state at whose crossing of a level a period ends, and the direction, +1 rising or
+        -1 falling; the level is the last parameter. See `crossing.with_section`.
     quantity_names : tuple of str
     quantities : callable or None
         ``quantities(t, y, dy, u, c)``: a tuple of the named quantities at time `t` [s] since the last
         section, from the states, their rates, the forcing and the constants.
+    method : str
+        Of `tableau.METHODS`: ``"dopri5"`` of order 5, or ``"dop853"`` of order 8, which needs a half or a
+        quarter of the time for smooth equations at tolerances below 1e-6. Where layers decide the steps it
+        gains nothing. Quantities are watched, and trajectories sampled, with the first alone.
     tangents_of : System or None
         The system whose tangent vectors this one carries along (see `variational.with_tangents`).
     recorded_for : System or None
@@ -137,6 +186,7 @@ class System:
     rhs: Callable[..., Any]
     # None stands for a function that does nothing, put in place below: what is read is never None
     forcing: Callable[..., Any] = None  # type: ignore[assignment]
+    forcing_is_time: bool = False
     jacobian: Callable[..., Any] | None = None
     is_angle: tuple[bool, ...] = ()
     scales: tuple[float, ...] = ()
@@ -145,9 +195,22 @@ class System:
     edges: Callable[..., Any] = None  # type: ignore[assignment]
     layers: Callable[..., Any] = None  # type: ignore[assignment]
     has_layers: bool = True
+    timed_layers: bool = False
+    layers_fade: bool = False
     n_controlled: int | None = None
+    n_modes: int = 0
+    n_switches: int = 0
+    switches: Callable[..., Any] | None = None
+    slides: tuple[bool, ...] = ()
+    has_segments: bool = False
+    n_impacts: int = 0
+    impacts: Callable[..., Any] | None = None
+    impact_directions: tuple[int, ...] = ()
+    reset: Callable[..., Any] | None = None
+    section: tuple[int, int] | None = None
     quantity_names: tuple[str, ...] = ()
     quantities: Callable[..., Any] | None = None
+    method: str = "dopri5"
     tangents_of: System | None = field(default=None, compare=False, repr=False)
     recorded_for: System | None = field(default=None, compare=False, repr=False)
 
@@ -158,10 +221,11 @@ class System:
         absent = {
             "is_angle": (False,) * n, "scales": (1.0,) * n, "escape": (math.inf,) * n,
             "forcing": no_forcing, "edges": no_edges, "layers": no_layers,
+            "slides": (False,) * self.n_switches,
         }  # fmt: skip
         kinds = {
             "state_names": str, "parameter_names": str, "quantity_names": str,
-            "is_angle": bool, "scales": float, "escape": float,
+            "is_angle": bool, "scales": float, "escape": float, "slides": bool, "impact_directions": int,
         }  # fmt: skip
         for name, kind in kinds.items():  # lists cannot be hashed, integers among numbers not be looped over
             object.__setattr__(self, name, tuple(kind(value) for value in getattr(self, name)))
@@ -174,16 +238,39 @@ class System:
     def functions(self) -> tuple[Callable[..., Any], ...]:
         """All compiled functions."""
         always = self.constants, self.forcing, self.rhs, self.edges, self.layers
-        return (*always, *(f for f in (self.jacobian, self.quantities) if f is not None))
+        others = self.jacobian, self.quantities, self.switches, self.impacts, self.reset
+        return (*always, *(f for f in others if f is not None))
 
     @property
     def label(self) -> str:
         """Name of the compiled code: `name`, and a digest of the data that goes into the code."""
         data = (
             self.state_names, self.is_angle, self.scales, self.parameter_names, self.n_constants,
-            self.n_edges, self.has_layers, self.escape, self.controlled,
+            self.n_edges, self.has_layers, self.layers_fade, self.escape, self.controlled,
         )  # fmt: skip
+        if self.n_events or self.n_modes:
+            data += (  # type: ignore[assignment]
+                self.n_modes, self.n_switches, self.slides, self.has_segments, self.n_impacts,
+                self.impact_directions, self.section,
+            )  # fmt: skip
+        if self.method != "dopri5":
+            data += (self.method,)  # type: ignore[assignment]
         return f"{self.name}_{hashlib.sha256(repr(data).encode()).hexdigest()[:8]}"
+
+    @property
+    def tableau(self) -> Tableau:
+        """The method's."""
+        from magpend_core.engine.tableau import METHODS
+
+        if self.method not in METHODS:
+            known = ", ".join(METHODS)
+            raise ValueError(f"method = {self.method!r}: {self.name} can be integrated by {known}.")
+        return METHODS[self.method]
+
+    @property
+    def n_events(self) -> int:
+        """Number of functions on whose zeros steps end."""
+        return self.n_switches + self.n_impacts + (self.section is not None)
 
     @property
     def controlled(self) -> int:

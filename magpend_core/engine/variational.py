@@ -19,6 +19,9 @@ from typing import Any
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
 
+DIVERGENCE = "divergence"
+"""Name of the state that integrates the trace of the Jacobian."""
+
 
 def _first(n: int) -> str:
     return ", ".join(f"y[{i}]" for i in range(n))
@@ -36,7 +39,7 @@ def _products(n: int, n_vectors: int) -> str:
 def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict[str, Any]) -> Any:
     """Compile a one-function source; numba cannot build a tuple of given length in a loop.
 
-    It passes for a function of the module of `wrapped`, which it calls (see `jit.is_covered`).
+    It passes for a function of the module of `wrapped`, which it calls (see `jit.keeping`).
     """
     scope: dict[str, Any] = {"__name__": wrapped.__module__, **bindings}
     exec(source, scope)
@@ -82,13 +85,24 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> S
         system.rhs,
         bindings,
     )
-    rates = ", ".join(f"dy[{i}]" for i in range(n))
+    behind = [n * (1 + n_vectors) + divergence] if system.timed_layers else []  # where the time is
+    rates = ", ".join(f"dy[{i}]" for i in (*range(n), *behind))
     layers = _compile(
         f"def layers(y, dy, c):\n    return _layers(({_first(n)},), ({rates},), c)\n",
         "layers",
         system.layers,
         bindings,
     )
+    events = {
+        name: _compile(
+            f"def {name}(t, y, dy, c):\n    return _{name}(t, ({_first(n)},), ({rates},), c)\n",
+            name,
+            function,
+            {f"_{name}": function},
+        )
+        for name, function in (("switches", system.switches), ("impacts", system.impacts))
+        if function is not None
+    }
     entries = n * n_vectors + divergence
     return dataclasses.replace(
         system,
@@ -96,7 +110,7 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> S
         state_names=(
             *system.state_names,
             *(f"d{s}_{k}" for k in range(n_vectors) for s in system.state_names),
-            *["divergence"] * divergence,
+            *[DIVERGENCE] * divergence,
         ),
         is_angle=(*system.is_angle, *[False] * entries),
         scales=(*system.scales, *[1.0] * entries),
@@ -104,6 +118,7 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> S
         n_controlled=system.controlled,
         rhs=rhs,
         layers=layers,
+        **events,
         quantity_names=(),
         quantities=None,
         tangents_of=system,
@@ -133,7 +148,17 @@ def with_parameter_tangent(system: System) -> System:
     System
         With 2 n_states states, and three sets of parameters followed by ``per_step``: the system's own, then
         those ending on ``_plus`` and ``_minus``.
+
+    Raises
+    ------
+    ValueError
+        If the system has switches, impacts or segments, of which the parameters' effect is not followed.
     """
+    if system.n_modes or system.n_events:
+        raise ValueError(
+            f"{system.name} has switches, impacts or segments: tangent vectors of parameters do not go "
+            "through them; let the fit take its slopes as differences of trajectories."
+        )
     n, m, nc = system.n_states, len(system.parameter_names), system.n_constants
     bindings = {
         "_rhs": system.rhs, "_jacobian": system.jacobian, "_layers": system.layers, "_edges": system.edges,
@@ -155,6 +180,7 @@ def with_parameter_tangent(system: System) -> System:
         + f" + (f1[{i}] - f2[{i}]) * c[{3 * nc}]"
         for i in range(n)
     )
+    own_rates = f"dy[:{n}]" + (f" + (dy[{2 * n}],)" if system.timed_layers else "")
     own = ", ".join(f"f0[{i}]" for i in range(n))
     return dataclasses.replace(
         system,
@@ -177,7 +203,7 @@ def with_parameter_tangent(system: System) -> System:
             *(f"f{k} = _rhs(base, u{k}, c{k})" for k in range(3)),
             "jacobian = _jacobian(base, u0, c0)", f"return ({own}, {changes})",
         ),
-        layers=compiled("y, dy, c", f"return _layers(y[:{n}], dy[:{n}], c[:{nc}])"),
+        layers=compiled("y, dy, c", f"return _layers(y[:{n}], {own_rates}, c[:{nc}])"),
         edges=compiled("frequency, p, at, widths, jumps", f"_edges(frequency, p[:{m}], at, widths, jumps)"),
         jacobian=None,
         quantity_names=(),

@@ -31,7 +31,7 @@ from magpend_core.engine.simd import (
     where_less,
 )
 from magpend_core.engine.system import System
-from magpend_core.engine.tableau import MIDDLE, N_STAGES
+from magpend_core.engine.tableau import MIDDLE
 
 LOWEST, HIGHEST, MEAN = 0, 1, 2
 """Entries of the last dim of `Cells.watched`."""
@@ -42,7 +42,7 @@ def watched_function(system: System, watched: tuple[int, ...]) -> Callable[..., 
 
     `watched` are numbers in ``system.state_names + system.quantity_names``. numba cannot pick entries of
     a tuple by numbers known at run time only, so the function is written out. It passes for one of the
-    system's module (see `jit.is_covered`).
+    system's module (see `jit.keeping`).
     """
     n = system.n_states
     picked = ", ".join(f"y[{i}]" if i < n else f"values[{i - n}]" for i in watched)
@@ -108,7 +108,8 @@ def keep_extremes(w: Any, base: int, lane: int, out: Any) -> None:
         row = base + i * WIDTH + lane
         out[i, LOWEST] = w[row + ROWS.lowest]
         out[i, HIGHEST] = w[row + ROWS.highest]
-        out[i, MEAN] = w[row + ROWS.integral] / w[base + ROWS.period + lane]
+        length = ROWS.time if HAS_SECTION else ROWS.period
+        out[i, MEAN] = w[row + ROWS.integral] / w[base + length + lane]
 
 
 def set_watching(work: Any, lane: int, watching: int) -> None:

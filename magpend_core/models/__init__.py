@@ -1,14 +1,21 @@
 """The models that ship with magpend, and the door through which everyone else sees them.
 
-`load_model` finds a model by name. Nothing here imports the compiler.
+`load_model` finds a model by name, or reads what a run keeps of it. Nothing here imports the compiler.
 """
 
 from __future__ import annotations
 
 import importlib
-from functools import cache
+import json
+from collections.abc import Mapping
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
 
+from magpend_core.models import imported
+from magpend_core.models.imported import import_model as import_model
 from magpend_core.models.model import Model
+from magpend_core.models.model import ModelError as ModelError
 from magpend_core.models.parameters import ParameterError, Parameters, near_names
 
 DEFAULT = "pendulum"
@@ -18,8 +25,8 @@ ROOMS = ("pendulum", "double_pendulum", "duffing")
 """Modules here that have a tuple ``MODELS``."""
 
 
-class ModelError(ParameterError):
-    """There is no model of this name."""
+LIBRARY = Path(__file__).with_name("library")
+"""Models that ship as text: a file each, named after the model."""
 
 
 @cache
@@ -28,23 +35,85 @@ def _models() -> dict[str, Model]:
     return {model.name: model for room in rooms for model in room.MODELS}
 
 
+@cache
+def _texts() -> dict[str, Path]:
+    return {path.stem: path for path in sorted(LIBRARY.glob("*.toml"))}
+
+
 def model_names() -> tuple[str, ...]:
-    """Names of the models that ship."""
-    return tuple(_models())
+    """Names of the models that ship; those that are text are not read for it."""
+    return (*_models(), *_texts())
 
 
-def load_model(name: str = DEFAULT) -> Model:
-    """Return a model by name.
+def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
+    """Return a model by name, or as text; equal texts give one object. Nothing is imported or executed.
+
+    Parameters
+    ----------
+    reference
+        Name of a model that ships; or what `Model.reference` gives, as a table or as its JSON text: a model
+        as text, or the description of a Python object (see `import_model`). A model is returned as it is.
 
     Raises
     ------
     ModelError
-        If there is none, with the nearest names.
+        If there is none, with the nearest names; if a text is no model, with all its problems.
     """
-    models = _models()
-    if name not in models:
-        raise ModelError([f"model {name!r} does not exist; {near_names(name, models, 'models')}"])
-    return models[name]
+    if isinstance(reference, Model):
+        return reference
+    if isinstance(reference, Mapping):
+        return _of_table(reference)
+    if reference.lstrip().startswith("{"):
+        try:
+            return _of_table(json.loads(reference))
+        except (ValueError, RecursionError) as error:
+            raise ModelError([f"the text of a model is damaged ({error})."]) from None
+    if imported.is_object_path(reference):
+        if (known := imported.known_model({imported.KEY: reference})) is not None:
+            return known
+        raise ModelError([
+            f"model {reference!r} is a Python object, which is imported where a specification names it, by "
+            f"--import-model {reference}, or by magpend.import_model."
+        ])  # fmt: skip
+    if reference in _models():
+        return _models()[reference]
+    if reference in _texts():
+        return _shipped(reference)
+    hint = near_names(reference, model_names(), "models")
+    raise ModelError([f"model {reference!r} does not exist; {hint}"])
+
+
+def _of_table(table: Mapping[str, Any]) -> Model:
+    """Read a model's table: one object for all texts that are written the same in the end."""
+    try:
+        # not sorted: the order of the states is the model's
+        text = json.dumps(table)
+        if imported.KEY in table:
+            return imported.known_model(table) or _described(text)
+        return _read(json.dumps(_read(text).reference))
+    except ParameterError as error:
+        raise ModelError(error.problems) from None
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ModelError([f"the text of a model is no plain data ({error})."]) from None
+
+
+@lru_cache(maxsize=64)
+def _described(text: str) -> Model:
+    return imported.described_model(json.loads(text))
+
+
+@lru_cache(maxsize=64)
+def _read(text: str) -> Model:
+    from magpend_core.models.text import read_model
+
+    return read_model(json.loads(text))
+
+
+@cache
+def _shipped(name: str) -> Model:
+    from magpend_core.models.text import read_shipped
+
+    return read_shipped(_texts()[name])
 
 
 def load_preset(name: str | None = None, **overrides: float) -> Parameters:

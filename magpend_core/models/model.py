@@ -23,7 +23,12 @@ from magpend_core.models.presets import Preset as Preset
 from magpend_core.models.presets import completed, find_preset
 
 if TYPE_CHECKING:
+    from magpend_core.crossing import Crossing
     from magpend_core.engine.system import System
+
+
+class ModelError(ParameterError):
+    """There is no model of this name, or what describes one does not hold together."""
 
 
 @dataclass(frozen=True)
@@ -173,6 +178,10 @@ class Model:
         Dim of what there is one of per angle, such as full turns.
     relations : callable
         Sentences on values that are in bounds each, but not together.
+    autonomous : bool
+        Whether nothing depends on time but through the states.
+    text : mapping, optional
+        The table that the model was read from, if it was text; plain data, see `reference`.
     """
 
     name: str
@@ -189,6 +198,28 @@ class Model:
     drawing: Drawing | None = None
     angle_dim: str = "angle"
     relations: Callable[[Mapping[str, float]], list[str]] = field(default=_no_relations)
+    autonomous: bool = False
+    text: Mapping[str, Any] | None = None
+
+    @property
+    def reference(self) -> str | Mapping[str, Any]:
+        """What runs keep of the model, and `load_model` finds it by: its name, or its text."""
+        return self.name if self.text is None else self.text
+
+    @property
+    def crossing(self) -> Crossing | None:
+        """The section by crossing that the model is seen through; None at the period of a drive."""
+        return None
+
+    @property
+    def flow(self) -> Model:
+        """The model without a section by crossing: its trajectories are the same."""
+        return self
+
+    @property
+    def section_states(self) -> tuple[str, ...]:
+        """Names of the states that differ from section to section, in order."""
+        return self.state_names
 
     @property
     def state_names(self) -> tuple[str, ...]:

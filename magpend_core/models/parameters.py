@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 if TYPE_CHECKING:
+    from magpend_core.crossing import Crossing
     from magpend_core.models.model import Model
 
 POSITIVE = "greater than 0"
@@ -56,12 +57,15 @@ class Parameter:
         A short phrase for tables and axes.
     bound : str
         One of `BOUNDS`.
+    symbol : str
+        LaTeX without dollar signs; empty for the name.
     """
 
     name: str
     unit: str
     meaning: str
     bound: str = FINITE
+    symbol: str = ""
 
     def problem(self, value: Any) -> str | None:
         """Return the sentence for a bad value, or None."""
@@ -148,7 +152,7 @@ class Parameters(Mapping[str, float]):
         return self.model is other.model and self._values == other._values
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _again, (self.model.name, self._values)
+        return _again, (self.model.reference, self._values, self.model.crossing)
 
     def __repr__(self) -> str:
         return f"Parameters({self.model.name}: {', '.join(f'{n}={v:g}' for n, v in self.items())})"
@@ -182,8 +186,12 @@ class Parameters(Mapping[str, float]):
         return type(self)(self.model, {**self._values, **overrides})
 
 
-def _again(model: str, values: dict[str, float]) -> Parameters:
-    """Unpickle: models are known by name."""
+def _again(
+    model: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None
+) -> Parameters:
+    """Unpickle: models are known by name, or by their text, and by the section that they are seen through."""
     from magpend_core.models import load_model
+    from magpend_core.models.sectioned import sectioned
 
-    return Parameters(load_model(model), values)
+    found = load_model(model)
+    return Parameters(found if crossing is None else sectioned(found, crossing), values)

@@ -152,7 +152,7 @@ def completed(preset: Preset, model: Model) -> Preset:
     if not preset.model:
         raise ParameterError([f'{where}: model: missing; add model = "{model.name}".'])
     try:
-        owner = load_model(preset.model)
+        owner = model if preset.model == model.name else load_model(preset.model)
     except ParameterError as error:
         raise ParameterError([f"{where}: {p}" for p in error.problems]) from None
     if owner.presets != model.presets:
@@ -194,7 +194,7 @@ def value_problems(model: Model, values: Mapping[str, Any], sources: Mapping[str
 
 def write_preset(
     path: str | Path,
-    model: str,
+    model: str | Model,
     values: Mapping[str, float],
     sources: Mapping[str, str],
     title: str = "",
@@ -208,7 +208,7 @@ def write_preset(
     path
         Ends in ``.toml``; written whole or not at all, over what was there.
     model
-        Name of the model.
+        The model, or the name of one that ships.
     values
         By parameter name, in the model's units; numbers that read back the same.
     sources
@@ -235,8 +235,8 @@ def write_preset(
     if isinstance(base, Preset) and base.model:  # from a file, which may be gone when this one is read
         values, sources = {**base.values, **values}, {**base.provenance, **sources}
         shipped = base.base
-    preset = Preset(path.stem, values, sources, model, shipped, title)
     chosen = load_model(model)
+    preset = Preset(path.stem, values, sources, chosen.name, shipped, title)
     chosen.load(preset)
     whole = path.with_name(f".{path.name}.{os.getpid()}")
     whole.write_text(_text(preset, chosen), "utf-8")

@@ -17,6 +17,7 @@ from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.identify import identify_app
 from pipeline.cli.magnet import fit_magnet
 from pipeline.cli.measured import measured_app
+from pipeline.cli.model import model_app
 from pipeline.cli.models import models, presets
 from pipeline.cli.options import speaking
 from pipeline.cli.plot import plot_app
@@ -61,6 +62,7 @@ for _command, _settings in (
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(plot_app, name="plot")
+app.add_typer(model_app, name="model")
 app.add_typer(measured_app, name="measured")
 app.add_typer(recordings_app, name="recordings")
 app.add_typer(identify_app, name="identify")

@@ -19,6 +19,7 @@ from pipeline.cli.options import speaking
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magpend_core.models.model import Model
     from magpend_core.models.parameters import Parameters
     from pipeline.rig.measured.measuring import Way
     from pipeline.rig.recordings import Mapping
@@ -67,9 +68,11 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
             f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each."
         ])  # fmt: skip
     loaded = [load_mapping(m) for m in mappings] * (len(paths) if len(mappings) == 1 else 1)
-    models = sorted({m.model for m in loaded})
+    models = sorted({m.system for m in loaded}, key=lambda model: model.name)
     if len(models) > 1:
-        raise SpecError([f"--mapping: of the models {', '.join(models)}; a diagram is one model's."])
+        raise SpecError(
+            [f"--mapping: of the models {', '.join(m.name for m in models)}; a diagram is one model's."]
+        )
     return loaded
 
 
@@ -96,10 +99,8 @@ def _way(
     return Way(transient, window, window_s, hysteresis=hysteresis, max_period=max_period)
 
 
-def _loaded(model: str, preset: str | None, settings: list[str] | None) -> Parameters:
-    from magpend_core.models import load_model
-
-    return load_model(model).load(preset, **read_pairs("--set", settings or [], "q=1.5"))
+def _loaded(model: Model, preset: str | None, settings: list[str] | None) -> Parameters:
+    return model.load(preset, **read_pairs("--set", settings or [], "q=1.5"))
 
 
 def _check_targets(out: Path | None, csv: str | None = None) -> None:
@@ -143,7 +144,7 @@ def steps(
     _check_targets(None, csv)
     way = _way(transient, window, window_s, hysteresis, max_period)
     mappings = _load(recordings, mapping)
-    parameters = _loaded(mappings[0].model, preset, settings)
+    parameters = _loaded(mappings[0].system, preset, settings)
     tell(steps_table(measure(_read(recordings, mappings), way, parameters=parameters)), csv, as_json)
 
 
@@ -182,7 +183,7 @@ def diagram(
         from pipeline.runs.derive import AnalysedRun
 
         pairs = read_pairs("--at", at or [], "q=1.5")
-        cube, parameters = cube_and_parameters(AnalysedRun.of(run), mappings[0].model, pairs)
+        cube, parameters = cube_and_parameters(AnalysedRun.of(run), mappings[0].system, pairs)
     found = measure(_read(recordings, mappings), way, parameters=parameters)
     with refused(run or out):
         figure = plot_measured(
@@ -232,9 +233,9 @@ def compare(
     pairs = read_pairs("--at", at or [], "q=1.5")
     run = AnalysedRun.of(directory, console.note)
     mappings = _load(recordings, mapping)
-    _, parameters = cube_and_parameters(run, mappings[0].model, pairs)
+    _, parameters = cube_and_parameters(run, mappings[0].system, pairs)
     found = measure(_read(recordings, mappings), way, parameters=parameters)
-    computed = Computed.of(run, mappings[0].model, pairs)
+    computed = Computed.of(run, mappings[0].system, pairs)
     compared = compare_with(found, computed)
     with refused(directory):
         written = write_comparison(compared, computed, out, state=state, degrees=degrees, frame=Frame(width))
@@ -277,7 +278,7 @@ def series(
 
     _check_targets(out)
     mappings = _load([recording], [mapping])
-    parameters = _loaded(mappings[0].model, preset, settings)
+    parameters = _loaded(mappings[0].system, preset, settings)
     (found,) = _read([recording], mappings)
     ds = series_of(
         found, parameters, start_s=start_s, n_periods=periods, window_s=window_s, hysteresis=hysteresis

@@ -29,7 +29,10 @@ def names() -> Iterable[str]:
 def models(
     name: Annotated[
         str | None,
-        typer.Argument(help="Show this model alone, with all it has.", autocompletion=completing(names)),
+        typer.Argument(
+            help="Show this model alone, with all it has; or a file of one, FILE.toml.",
+            autocompletion=completing(names),
+        ),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -37,11 +40,12 @@ def models(
     from magpend_core.models import load_model, model_names
     from pipeline.cli.common import tell
     from pipeline.products.product import Table
+    from pipeline.spec.models import find_model
 
-    chosen = [load_model(name)] if name else [load_model(n) for n in model_names()]
-    rows = [_described(model) for model in chosen]
+    chosen = [find_model(name, at="model")] if name else [load_model(n) for n in model_names()]
+    rows = [described(model) for model in chosen]
     if name:
-        lines = _all_of(chosen[0])
+        lines = all_of(chosen[0])
     else:
         width = max(len(model.name) for model in chosen)
         lines = [f"{m.name:{width}}  {m.title}; states {', '.join(m.state_names)}" for m in chosen]
@@ -49,7 +53,8 @@ def models(
     tell(Table(rows, lines), None, json)
 
 
-def _described(model: Model) -> dict[str, Any]:
+def described(model: Model) -> dict[str, Any]:
+    """What a model has, for programs."""
     about = [
         {"name": s.name, "unit": s.unit, "meaning": s.meaning, "on_circle": s.on_circle, "scale": s.scale}
         for s in model.states
@@ -65,8 +70,11 @@ def _described(model: Model) -> dict[str, Any]:
     }
 
 
-def _all_of(model: Model) -> list[str]:
-    lines = [f"{model.name}: {model.title}", f"sections are taken at {model.section}", "", "states"]
+def all_of(model: Model) -> list[str]:
+    """Lines on all that a model has."""
+    seen = "no drive: time enters through the states alone" if model.autonomous else ""
+    seen = seen or f"period 1/f, f the drive's frequency [Hz]; sections are taken at {model.section}"
+    lines = [f"{model.name}: {model.title}", seen, "", "states"]
     lines += _table([(s.name, s.unit, s.meaning) for s in model.states])
     lines += ["", "parameters"]
     lines += _table([(p.name, p.unit, p.meaning) for p in model.parameters])
@@ -103,16 +111,20 @@ def presets(
         str | None, typer.Argument(help="Show this preset alone; or a file of one, FILE.toml.")
     ] = None,
     model: Annotated[
-        str, typer.Option(help="Whose presets; a file names its own.", autocompletion=completing(names))
+        str,
+        typer.Option(
+            help="Whose presets: a name or a file; a preset's file names its own.",
+            autocompletion=completing(names),
+        ),
     ] = DEFAULT,
 ) -> None:
     """List the presets of a model: values, units, and where each comes from."""
-    from magpend_core.models import load_model
     from magpend_core.models.presets import find_preset
     from pipeline.cli import console
+    from pipeline.spec.models import find_model
 
     found = find_preset(name) if name else None
-    chosen = load_model(getattr(found, "model", "") or model)
+    chosen = find_model(model if model != DEFAULT else getattr(found, "model", "") or model, at="--model")
     for preset in [found] if found else chosen.preset_names:
         for line in _preset(chosen, preset):
             console.result(line)

@@ -22,21 +22,34 @@ VERBOSE = Annotated[bool, typer.Option("--verbose", "-v", help="Say more, and sh
 LOGFILE = Annotated[
     Path | None, typer.Option("--log", metavar="FILE", help="Write a log, with times, to this file, too.")
 ]
+IMPORT = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MODULE:NAME",
+        help="Import this Python object, the model of a run; opening one imports nothing by itself.",
+    ),
+]
 _METAVARS = {int: "N", float: "X", str: "TEXT"}
 _VOICES = {"quiet": (QUIET, False), "verbose": (VERBOSE, False), "log": (LOGFILE, None)}
+_IMPORTED = "import_model"
 
 
 def speaking(command: Command) -> Command:
-    """Give a command ``--quiet``, ``--verbose`` and ``--log``, and show the progress of what it does."""
+    """Give a command ``--quiet``, ``--verbose``, ``--log`` and ``--import-model``, and show its progress."""
 
     def run(*args: Any, **given: Any) -> None:
         from pipeline.cli import console
 
         console.configure(**{name: given.pop(name) for name in _VOICES})
+        if (path := given.pop(_IMPORTED)) is not None:
+            from magpend_core.models import import_model
+
+            import_model(path, ".")
         with console.progress(command.__name__):
             command(*args, **given)
 
     voices = [_keyword(name, kind, default) for name, (kind, default) in _VOICES.items()]
+    voices.append(_keyword(_IMPORTED, IMPORT, None))
     return _signed(run, command, [*_own(command), *voices])
 
 

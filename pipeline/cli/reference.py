@@ -77,7 +77,7 @@ def _options(command: Any) -> list[tuple[str, str]]:
     return [
         (f"`{', '.join((*p.opts, *p.secondary_opts))}{_metavar(p)}`", _help(p))
         for p in command.params
-        if p.param_type_name == "option" and p.name not in ("help", "quiet", "verbose", "log")
+        if p.param_type_name == "option" and p.name not in ("help", "quiet", "verbose", "log", "import_model")
     ]
 
 
@@ -143,7 +143,7 @@ def workflows() -> str:
 
 def specification() -> str:
     """Keys of a specification, table by table."""
-    from pipeline.spec import recorded, starts, tables
+    from pipeline.spec import recorded, section, starts, tables
 
     parts = [
         ("[parameters]", tables.ParametersTable, ""),
@@ -158,6 +158,11 @@ def specification() -> str:
             '[initial_conditions] kind = "random"',
             starts.RandomStarts,
             _STATES.format("a number or [low, high]"),
+        ),
+        (
+            "[section]",
+            section.SectionTable,
+            "For models without a drive: see [Flows](../flows.md). Then no frequency is given.",
         ),
         ("[continuation]", tables.Continuation, 'For `kind = "continuation"` alone.'),
         (
@@ -276,11 +281,12 @@ def _bounds(info: Any) -> str:
 def variables() -> str:
     """Variables of a cube, those of products last."""
     from magpend_core.models import load_model
-    from pipeline.layout.schema import base_variables
+    from pipeline.layout.schema import REST_STATE, RETURN_TIME, base_variables
     from pipeline.products.registry import CELL_PRODUCTS
 
     model, examples = load_model(), {"extremes": {"quantities": ("energy",)}}
     found = [("", variable) for variable in base_variables(model)]
+    found += [("`[section]`", variable) for variable in (RETURN_TIME, REST_STATE)]
     for name, product in CELL_PRODUCTS.items():
         options = product.settle(product.options(**examples.get(name, {})), model)
         found += [(name, variable) for variable in product.variables(options, model)]

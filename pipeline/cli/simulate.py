@@ -25,12 +25,18 @@ EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
 def simulate(
     context: typer.Context,
     model: Annotated[
-        str, typer.Option(help="Which one; see magpend models.", autocompletion=completing(names))
+        str,
+        typer.Option(
+            help="Which one: a name (see magpend models), a file with its text, or package.module:NAME.",
+            autocompletion=completing(names),
+        ),
     ] = DEFAULT,
     frequency_hz: Annotated[
         float | None,
         typer.Option(
-            "--frequency-hz", "--frequency", help=f"Drive frequency [Hz]; by default {DEFAULT_HZ:g}."
+            "--frequency-hz",
+            "--frequency",
+            help=f"Drive frequency [Hz]; by default {DEFAULT_HZ:g}. Without a drive periods are of 1 s.",
         ),
     ] = None,
     drive: Annotated[
@@ -66,20 +72,22 @@ def simulate(
     """
     from pipeline.cli import console
     from pipeline.compute import simulate as simulation
+    from pipeline.spec.models import find_model
     from pipeline.store.provenance import provenance, versions
 
+    chosen = find_model(model, at="--model")
     simulation.check_output(out)
     target = figure or out.with_suffix(".png")
     if not no_figure:
         check_figure_path(target)
     overrides = read_pairs("--set", settings or [], "q=1.5")
     frequency = overrides.pop("frequency_hz", overrides.pop("frequency", frequency_hz))
-    if frequency is None and drive is None:
+    if frequency is None and drive is None and not chosen.autonomous:
         frequency = DEFAULT_HZ
     ds = simulation.simulate(
-        frequency, simulation.start_of(model, _states(context.args)), drive=drive, model=model, preset=preset,
-        overrides=overrides, n_transient=transient, n_periods=periods, samples_per_period=samples,
-        rtol=rtol, atol=atol,
+        frequency, simulation.start_of(chosen, _states(context.args)), drive=drive, model=chosen,
+        preset=preset, overrides=overrides, n_transient=transient, n_periods=periods,
+        samples_per_period=samples, rtol=rtol, atol=atol,
     )  # fmt: skip
     ds = ds.assign_attrs(versions=json.dumps(versions()), **provenance())
     console.result(f"series: {simulation.write_series(ds, out)}")

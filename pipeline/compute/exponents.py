@@ -13,6 +13,9 @@ AUDIT = 0.01
 """Largest allowed difference between the sum of the exponents and the divergence, in units of the sum of
 their moduli."""
 
+SIGMA = 5.0
+"""Standard errors by which the exponent of a flow that is 0 may differ from it."""
+
 
 def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
     """Return `LYAPUNOV_VARIABLES` for the cells of a task.
@@ -43,7 +46,7 @@ def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
         "lyapunov_stderr": found.stderr,
         "lyapunov_blocks": found.blocks,
         "divergence": found.divergence,
-        "lyapunov_flag": flags(found),
+        "lyapunov_flag": flags(found, is_flow=job.system.section is not None),
     }
     filled = {}
     for variable in LYAPUNOV_VARIABLES:
@@ -57,12 +60,22 @@ def _falling(rates: np.ndarray) -> np.ndarray:
     return np.sort(rates, axis=1)[:, ::-1]
 
 
-def flags(found: LyapunovExponents) -> np.ndarray:
-    """Codes of `LyapunovFlag`; only a whole spectrum can be held against the divergence."""
+def flags(found: LyapunovExponents, *, is_flow: bool = False) -> np.ndarray:
+    """Codes of `LyapunovFlag`; only a whole spectrum can be held against the divergence.
+
+    One exponent of a flow is 0, wherever the motion does not come to rest.
+    """
     flag = np.full(len(found.status), LyapunovFlag.GOOD, np.int8)
     if found.is_whole:
         missing = np.abs(found.exponents.sum(axis=1) - found.divergence)
-        flag[missing > AUDIT * np.abs(found.exponents).sum(axis=1)] = LyapunovFlag.AUDIT_FAILED
+        moduli = np.abs(found.exponents)
+        allowed = AUDIT * moduli.sum(axis=1)
+        flag[missing > allowed] = LyapunovFlag.AUDIT_FAILED
+        if is_flow:
+            nearest = moduli.argmin(axis=1)[:, None]
+            error = np.take_along_axis(found.stderr, nearest, axis=1)[:, 0]
+            least = np.take_along_axis(moduli, nearest, axis=1)[:, 0]
+            flag[least > np.maximum(allowed, SIGMA * error)] = LyapunovFlag.AUDIT_FAILED
     flag[found.loss > MOST_LOSS] = LyapunovFlag.UNRESOLVED
     flag[found.status != Status.BOUNDED] = LyapunovFlag.FAILED
     return flag

@@ -14,9 +14,12 @@ import numpy as np
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model, Quantity, State
 from magpend_core.models.presets import Preset
+from pipeline.layout.domains import check_states
+from pipeline.layout.vocabulary import model_attribute
 from pipeline.spec.drives import RecordedDrive, load_drive
 from pipeline.spec.problems import SpecError, unknown_name
 from pipeline.spec.recorded import model_problems
+from pipeline.spec.tables import FREQUENCY
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -27,6 +30,8 @@ SUFFIXES = (".csv", ".nc")
 MAX_SAMPLES = 100_000_000
 DEGREES = "_deg"
 DEFAULT_PERIODS = 10
+CLOCK_HZ, FLOW_PERIODS = 1.0, 50
+"""Without a drive time is counted in seconds, and a series has more of them."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,7 @@ def simulate(
     initial_state: Sequence[float],
     *,
     drive: str | Path | None = None,
-    model: str = DEFAULT,
+    model: str | Mapping[str, Any] | Model = DEFAULT,
     preset: str | Path | Preset | None = None,
     overrides: Mapping[str, float] | None = None,
     n_transient: int = 0,
@@ -59,13 +64,13 @@ def simulate(
     Parameters
     ----------
     frequency_hz
-        Drive frequency [Hz]; None under a recorded drive.
+        Drive frequency [Hz]; None under a recorded drive, and without a drive, where periods are seconds.
     initial_state
         The model's states at time 0, or where the recorded drive begins, in their units.
     drive
         A drive file (see `pipeline.spec.drives`): the drive is a recording.
     model
-        Name of a model, see `magpend_core.load_model`.
+        A model, or what `magpend_core.load_model` takes for one.
     preset, overrides
         Name or file of a preset and parameters by name, see `magpend_core.models.model.Model.load`.
     n_transient
@@ -92,6 +97,9 @@ def simulate(
     from magpend_core.models.parameters import ParameterError
 
     chosen = load_model(model)
+    if chosen.autonomous and drive is None:
+        frequency_hz = CLOCK_HZ if frequency_hz is None else frequency_hz
+        n_periods = FLOW_PERIODS if n_periods is None else n_periods
     series = Series(n_transient, n_periods, samples_per_period, rtol, atol)
     problems = _problems(series) + _state_problems(chosen, initial_state)
     recording = _recording(drive, frequency_hz, chosen, series, problems)
@@ -103,6 +111,7 @@ def simulate(
     if problems:
         raise SpecError(problems)
     state = np.array(initial_state, dtype=np.float64)
+    check_states(chosen, state[None], [{**parameters, FREQUENCY: frequency_hz}])
     if recording is None:
         assert frequency_hz is not None
         ds = _at_frequency(parameters, frequency_hz, state, series)
@@ -155,7 +164,8 @@ def _at_frequency(
     names = [q.name for q in parameters.model.quantities]
     values = evaluate(names, time, states, parameters, frequency_hz)
     ds = _labelled(parameters, time, f"time since {parameters.model.section}", states, values)
-    return ds.assign_attrs(frequency_hz=float(frequency_hz))
+    # a flow has no drive, and no section at even times
+    return ds if parameters.model.autonomous else ds.assign_attrs(frequency_hz=float(frequency_hz))
 
 
 def _under_recording(
@@ -196,20 +206,20 @@ def _labelled(
     }
     attrs = {
         "title": f"trajectory of the {model.title}",
-        "model": model.name,
+        "model": model_attribute(model),
         "parameters": "\n".join(f"{name} = {value!r}" for name, value in parameters.as_dict().items()),
     }
     axis = ("time", time, {"units": "s", "long_name": clock})
     return xr.Dataset(variables, coords={"time": axis}, attrs=attrs)
 
 
-def start_of(model: str, given: Mapping[str, float]) -> tuple[float, ...]:
+def start_of(model: str | Model, given: Mapping[str, float]) -> tuple[float, ...]:
     """Initial state of a model from values by name: a state's, or an angle's or rate's in degrees.
 
     Parameters
     ----------
     model
-        Its name.
+        The model, or its name.
     given
         By name: ``x``, or ``x_deg`` of a state in rad or rad/s; the others are 0.
 
@@ -224,7 +234,7 @@ def start_of(model: str, given: Mapping[str, float]) -> tuple[float, ...]:
     for name, value in given.items():
         plain = name.removesuffix(DEGREES) if name in in_degrees else name
         if plain not in values:
-            problems.append(unknown_name(f"state of {model}", name, (*found.state_names, *in_degrees)))
+            problems.append(unknown_name(f"state of {found.name}", name, (*found.state_names, *in_degrees)))
         elif plain != name and plain in given:
             problems.append(f"{plain} and {name} are both given; keep one.")
         else:

@@ -16,15 +16,16 @@ import numpy as np
 
 from magpend_core import Sections, Status, kernel_version, run_branches
 from magpend_core.engine.system import System
+from magpend_core.models import import_model
 from pipeline.compute.recorded import under_recording
 from pipeline.compute.refinement import infer
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.schema import base_variables
+from pipeline.layout.schema import REST_STATE, base_variables
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.spec.parsing import Spec, parse_spec
+from pipeline.spec.parsing import Spec, kept_spec
 from pipeline.store.commits import write_task
 from pipeline.store.errors import RefusedError
 from pipeline.store.runfile import RunInfo, read_run
@@ -49,15 +50,19 @@ class Job:
 
     @property
     def system(self) -> System:
-        """What was integrated."""
-        return self.spec.model.system
+        """What was integrated, by which method."""
+        return replace(self.spec.model.system, method=self.spec.integration.method)
 
 
 @lru_cache(maxsize=4)
-def _prepare(directory: str, digest: str) -> tuple[RunInfo, Spec, Plan, CellMap]:
+def _prepare(
+    directory: str, digest: str, origin: tuple[str, str] | None
+) -> tuple[RunInfo, Spec, Plan, CellMap]:
     """Read a run once per worker, and make sure that this installation would compute the same."""
+    if origin is not None:
+        import_model(*origin)
     info = read_run(Path(directory))
-    spec = parse_spec(info.spec)
+    spec = kept_spec(info.spec)
     plan = make_plan(spec)
     identity = identity_of(spec, plan, kernel_version())
     if digest != info.digest or digest_of(identity) != digest:
@@ -75,6 +80,7 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
     for name, options in spec.products.items():
         keywords |= CELL_PRODUCTS[name].integrate(options)
     if spec.recorded is not None:
+        del keywords["method"]  # the specification allows no other
         cells = under_recording(spec.recorded, inputs, system=spec.model.system, **keywords)
     else:
         cells = run_branches(
@@ -84,11 +90,24 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
             system=spec.model.system,
             **keywords,
         )
-    values = {v.name: np.asarray(getattr(cells, v.name), dtype=v.dtype) for v in base_variables(spec.model)}
+    own = {REST_STATE.name: rest_states(cells)} if spec.section is not None else {}
+    values = {
+        v.name: np.asarray(own.get(v.name, getattr(cells, v.name, None)), dtype=v.dtype)
+        for v in base_variables(spec.model)
+    }
     job = Job(spec, inputs, cells)
     for name, options in spec.products.items():
         values |= function_of(CELL_PRODUCTS[name].compute)(job, options)
     return values
+
+
+def rest_states(cells: Sections) -> np.ndarray:
+    """States in which cells that did not come back to the section were left, NaN for all others.
+
+    A walk ends with such a cell, so that it is left where the walk is.
+    """
+    is_left = cells.status == Status.NO_RETURN
+    return np.where(is_left[..., None], cells.final_state[:, None], np.nan)
 
 
 def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
@@ -109,15 +128,24 @@ def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, n
     return {name: cells.outputs(block, array) for name, array in values.items()}
 
 
-def run_task(directory: str, digest: str, index: int) -> dict[str, Any]:
+def run_task(
+    directory: str, digest: str, index: int, *, origin: tuple[str, str] | None = None
+) -> dict[str, Any]:
     """Compute a task and commit it.
+
+    Parameters
+    ----------
+    directory, digest, index
+        Which one.
+    origin
+        Where the model is a Python object: its place and folder, as the person who began the run named them.
 
     Returns
     -------
     dict
         Task, cells, cells by status, and the seconds taken by the kernel and by writing.
     """
-    info, spec, plan, cells = _prepare(directory, digest)
+    info, spec, plan, cells = _prepare(directory, digest, origin)
     started = time.perf_counter()
     values = compute(spec, cells, plan.task(index))
     computed = time.perf_counter()
@@ -143,6 +171,12 @@ def warm_up(spec: Spec) -> float:
     short = Inputs(
         spec.values.pack().reshape(1, 1, -1), np.ones((1, 1)), np.zeros((1, len(spec.model.states)))
     )
+    if spec.section is not None:  # products go on from cells that return, so from one that may
+        cells = CellMap(spec)
+        short = cells.inputs(
+            tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
+        )
+        short = Inputs(short.parameters[:1, :1], short.frequency_hz[:1, :1], short.initial_states[:1])
     integration = spec.integration.model_copy(update={"n_transient": 0, "n_keep": 1})
     products = {name: CELL_PRODUCTS[name].shortest(options) for name, options in spec.products.items()}
     integrate(replace(spec, integration=integration, products=products), short)

@@ -148,7 +148,7 @@ def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
         Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, model))
         for a in parameter_axes(spec)
     ]
-    if FREQUENCY not in spec.axes:
+    if FREQUENCY not in spec.axes and spec.section is None:
         attrs = _parameter_attrs(FREQUENCY, model)
         if spec.recorded is not None:
             attrs = {**attrs, "long_name": "mean frequency of the recorded drive"}

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 from magpend_core.models.model import Model
 from magpend_core.status import Status
+from pipeline.layout.words import periods_of
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable, flag_attrs
@@ -25,21 +27,37 @@ REFINEMENT = 1
 def base_variables(model: Model) -> tuple[Variable, ...]:
     """Return the variables that every cube of a model has, in order."""
     wrapped = ", angles wrapped to (-pi, pi]" if model.angles else ""
+    units = {"comment": "units of the components: see state_units"}
     section = Variable(
         "section", ("period_index", "state"), "float64", math.nan, "", f"state at {model.section}{wrapped}",
-        {"comment": "units of the components: see state_units"},
+        units,
     )  # fmt: skip
-    turns = Variable("turns", (model.angle_dim,), "int32", 0, "1", "full turns over the kept periods")
-    return (section, *([turns] if model.angles else []), *COUNTS)
+    turns = Variable(
+        "turns", (model.angle_dim,), "int32", 0, "1", f"full turns over the kept {periods_of(model)}"
+    )
+    flow = (RETURN_TIME, replace(REST_STATE, attrs=units)) if model.crossing is not None else ()
+    return (section, *([turns] if model.angles else []), *_counts(periods_of(model)), *flow)
 
 
-COUNTS = (
-    Variable("status", (), "int8", int(Status.PENDING), "1", "what became of the cell", flag_attrs(Status)),
-    Variable("orbit_period", (), "int16", 0, "1", "period of the closed orbit [drive periods]; 0: none"),
-    Variable("n_periods", (), "int32", 0, "1", "drive periods integrated in all"),
-    Variable("n_steps", (), "int32", 0, "1", "accepted integration steps"),
-    Variable("n_rejected", (), "int32", 0, "1", "rejected integration steps"),
-)  # fmt: skip
+RETURN_TIME = Variable(
+    "return_time", ("period_index",), "float64", math.nan, "s", "time since the crossing before"
+)
+REST_STATE = Variable(
+    "rest_state", ("state",), "float64", math.nan, "", "state in which a cell that does not return was left"
+)
+"""What cubes of sections by crossing have besides."""
+
+
+def _counts(periods: str) -> tuple[Variable, ...]:
+    """Numbers of a cell, with the word for its periods."""
+    codes = flag_attrs(Status)
+    return (
+        Variable("status", (), "int8", int(Status.PENDING), "1", "what became of the cell", codes),
+        Variable("orbit_period", (), "int16", 0, "1", f"period of the closed orbit [{periods}]; 0: none"),
+        Variable("n_periods", (), "int32", 0, "1", f"{periods} integrated in all"),
+        Variable("n_steps", (), "int32", 0, "1", "accepted integration steps"),
+        Variable("n_rejected", (), "int32", 0, "1", "rejected integration steps"),
+    )  # fmt: skip
 
 
 def variables_of(model: Model, products: Mapping[str, Options]) -> tuple[Variable, ...]:

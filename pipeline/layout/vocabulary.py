@@ -5,12 +5,17 @@ Imports no kernel, so that figures need none.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
+from magpend_core.crossing import Crossing
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
+from magpend_core.models.sectioned import sectioned
 from magpend_core.status import Status
 from pipeline.spec.tables import FREQUENCY
 
@@ -25,12 +30,13 @@ FREQUENCY_DIM = "frequency"
 BRANCH, START = "branch", "initial_condition"
 """Dims of a continuation's walks, and of starts that are no grid."""
 
-ABSENT, CLOSED_ORBIT, BOUNDED_SET = range(3)
+KINDS = ("absent", "closed_orbit", "bounded_set", "equilibrium")
+ABSENT, CLOSED_ORBIT, BOUNDED_SET, EQUILIBRIUM = range(len(KINDS))
 """Values of `kind`, see `pipeline.analysis.attractors`."""
 
-PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED = Status
+PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED, NO_RETURN = Status
 
-FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED)
+FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, NO_RETURN)
 """What became of cells that could not be integrated to the end."""
 
 _GRID_SUFFIX = "_0"
@@ -72,9 +78,65 @@ def parameter_name(axis: str) -> str:
     return FREQUENCY if axis in (FREQUENCY, FREQUENCY_DIM) else axis
 
 
+def model_attribute(model: Model) -> str:
+    """Return the attribute ``model`` of a dataset: a model's name, or its text as JSON."""
+    reference = model.reference
+    return reference if isinstance(reference, str) else json.dumps(reference, ensure_ascii=False)
+
+
 def model_of(ds: xr.Dataset) -> Model:
-    """Return the model of a cube, or of what was derived from it, by its attribute ``model``."""
-    return load_model(str(ds.attrs.get("model", DEFAULT)))
+    """Return the model of a cube, or of what was derived from it, by its attribute ``model``.
+
+    Seen through its section, if the attributes ``section_...`` name one.
+
+    Raises
+    ------
+    ModelError
+        If it is none. Nothing is imported: of a Python object the description is enough to draw.
+    """
+    model = load_model(str(ds.attrs.get("model", DEFAULT)))
+    of = ds.attrs.get(f"{_SECTION}of")
+    if of is None:
+        return model
+    value, longest = (float(ds.attrs[f"{_SECTION}{key}"]) for key in ("value", "longest"))
+    return sectioned(model, Crossing(str(of), value, ds.attrs[f"{_SECTION}direction"], longest))
+
+
+_SECTION = "section_"
+"""Beginning of the names of attributes that tell a section by crossing."""
+
+
+def section_attributes(crossing: Crossing | None) -> dict[str, Any]:
+    """Attributes of a dataset that tell its section; `model_of` reads them."""
+    if crossing is None:
+        return {}
+    return {f"{_SECTION}{key}": value for key, value in asdict(crossing).items()}
+
+
+def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return those of a dataset's attributes that tell what was integrated."""
+    return {
+        str(key): value
+        for key, value in attrs.items()
+        if key in ("model", "parameters") or str(key).startswith(_SECTION)
+    }
+
+
+def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
+    """Drive frequency at a parameter point [Hz], NaN if nothing tells.
+
+    Of a flow seen at crossings it is one over the longest wait for the next: what the engine takes for it.
+
+    Parameters
+    ----------
+    model
+        What is integrated.
+    values
+        Coordinates of the point by name.
+    """
+    if model is not None and model.crossing is not None:
+        return model.crossing.frequency_hz
+    return float(values.get(FREQUENCY_DIM, math.nan))
 
 
 def parameters_of(ds: xr.Dataset) -> Parameters:

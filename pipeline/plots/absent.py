@@ -17,6 +17,7 @@ LOOKS: dict[str, dict[str, Any]] = {
     "pending": {"facecolor": "0.92", "edgecolor": "0.6", "linewidth": 0.4},
     "failed": {"facecolor": "0.1", "edgecolor": "0.1", "linewidth": 0.8},
     "not reached": {"facecolor": "0.62", "edgecolor": "0.62", "linewidth": 0.8},
+    "no return": {"facecolor": "0.8", "edgecolor": "0.3", "linewidth": 0.6},
 }
 
 

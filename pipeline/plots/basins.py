@@ -13,6 +13,7 @@ from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.vocabulary import CLOSED_ORBIT, INFERRED, grid_dim, model_of
+from pipeline.layout.words import periods_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import BasinFigureOptions
@@ -41,9 +42,9 @@ def plot_basins(
     degrees
         Degrees instead of radians.
     n_periods
-        Drive periods that each cell took, of the same cube; if given, cells that took longer to close are
-        darker, on a logarithmic scale from the 1st to the 99th percentile. Inferred cells took none and
-        keep the plain colour.
+        Drive periods or returns that each cell took, of the same cube; if given, cells that took longer to
+        close are darker, on a logarithmic scale from the 1st to the 99th percentile. Inferred cells took
+        none and keep the plain colour.
     frame
         Width of the figure and ranges of its axes.
 
@@ -78,7 +79,7 @@ def plot_basins(
     style.limits(ax, frame)
     _dress(ax, attractors, axes, degrees)
     if scale is not None:
-        _draw_scale(fig, ax, scale)
+        _draw_scale(fig, ax, scale, periods_of(model_of(attractors)))
     style.complete(fig, ax, labels.caption(part, drop=axes))
     _write_letters(ax, codes, cast)
     return fig
@@ -206,7 +207,7 @@ def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[
     return entries
 
 
-def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm) -> None:
+def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -> None:
     """Draw how dark which time is, below the image."""
     ramp = LinearSegmentedColormap.from_list("time", [(0.85,) * 3, (0.85 * (1.0 - _DARKEST),) * 3])
     bar = fig.colorbar(
@@ -214,7 +215,7 @@ def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm) -> None:
     )
     bar.outline.set_linewidth(style.LINE_PT)
     bar.ax.set_gid("time")
-    bar.set_label("drive periods to converge", fontsize=fig.look.legend, labelpad=2.0)
+    bar.set_label(f"{periods} to converge", fontsize=fig.look.legend, labelpad=2.0)
     bar.ax.tick_params(labelsize=fig.look.tick, width=style.LINE_PT, length=2.5, pad=1.5)
     bar.ax.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 3.0, 5.0, 7.0), numticks=12))
     bar.ax.xaxis.set_major_formatter(ScalarFormatter())

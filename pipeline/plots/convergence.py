@@ -10,9 +10,10 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from pipeline.analysis.chaos.lyapunov import GOOD, Motion, pooled_mean, summarise
+from pipeline.analysis.chaos.lyapunov import GOOD, Motion, period_seconds, pooled_mean, summarise
 from pipeline.analysis.selection import select_points
-from pipeline.layout.vocabulary import split_dims
+from pipeline.layout.vocabulary import model_of, split_dims
+from pipeline.layout.words import period_of, periods_of
 from pipeline.plots import labels, style
 from pipeline.plots.door import Run, frame_of, noted, values_of
 from pipeline.plots.lyapunov import UNITS
@@ -51,7 +52,7 @@ def plot_convergence(
     exponent
         Which one, 1 the largest.
     per
-        ``s``: per unit time [1/s]; ``period``: per drive period.
+        ``s``: per unit time [1/s]; ``period``: per drive period or return.
     at
         Values of swept parameters.
     frame
@@ -103,7 +104,8 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
     if not 1 <= exponent <= part.sizes["exponent"]:
         raise ValueError(f"exponent is {exponent}, and the cube has 1 to {part.sizes['exponent']}")
     place = labels.caption(part, with_start=False)
-    scale = 1.0 / float(part["frequency"].values.ravel()[0]) if per == "period" else 1.0
+    model = model_of(part)
+    scale = period_seconds(part) if per == "period" else 1.0
     chosen = xr.Dataset(
         {
             "running": summary["lyapunov_running"] * scale,
@@ -120,11 +122,11 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
     )
     n, length = data.sizes["period"], int(part.attrs.get("lyapunov_n_periods", 0))
     axis = np.arange(1, n + 1) * (length / n if length else 1.0)
-    text = "drive periods" if length else "blocks"
+    text = periods_of(model) if length else "blocks"
     data = data.assign_coords(period=("period", axis, {"long_name": text}))
     for name in ("running", "in_block", "exponent_value", "exponent_stderr"):
         data[name].attrs.update(
-            units="1/s" if per == "s" else "1", per="unit time" if per == "s" else "drive period"
+            units="1/s" if per == "s" else "1", per="unit time" if per == "s" else period_of(model)
         )
     return data.drop_vars([c for c in data.coords if c != "period"]).assign_attrs(
         title="convergence of a Lyapunov exponent", place=place, exponent=exponent

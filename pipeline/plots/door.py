@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import xarray as xr
 
 from pipeline.analysis.selection import place, snap
+from pipeline.layout.vocabulary import told_by
 from pipeline.plots.files import with_provenance
 from pipeline.plots.style import DataFigure, Frame
 from pipeline.products.product import FigureOptions, Options, function_of
@@ -88,7 +89,7 @@ def run_provenance(run: Run) -> dict[str, Any]:
         "source": str(attrs.get("source", "magpend")), "run": info.title, "digest": info.digest,
         "cube_digest": run.digest, "versions": info.versions, **getattr(info, "provenance", {}),
     }  # fmt: skip
-    return found | {key: str(attrs[key]) for key in ("model", "parameters") if key in attrs}
+    return found | {key: str(value) for key, value in told_by(attrs).items()}
 
 
 def frame_of(options: FigureOptions) -> Frame:

@@ -34,7 +34,7 @@ def plot_lyapunov_map(
     ds
         Cube with the product ``lyapunov`` over two swept parameters.
     per
-        ``s``: per unit time [1/s]; ``period``: per drive period.
+        ``s``: per unit time [1/s]; ``period``: per drive period or return.
     at
         Values of further swept parameters.
     frame

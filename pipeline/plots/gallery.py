@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import model_of, parameters_of
+from pipeline.layout.vocabulary import model_of, parameters_of, told_by
+from pipeline.layout.words import once
 from pipeline.plots import labels, palette, style
 from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
 from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
@@ -40,7 +41,7 @@ def plot_gallery(
     Returns
     -------
     DataFigure
-        Lines are the motion, dots its stroboscopic section. The portrait of an angle that turns over is
+        Lines are the motion, dots its section. The portrait of an angle that turns over is
         drawn on the circle, from -pi to pi. The `MAX_ROWS` attractors with the largest share are
         drawn, in the order of their ids. Its `data` are the portraits of these.
 
@@ -55,9 +56,7 @@ def plot_gallery(
     if n == 0:
         raise ValueError("there is no attractor at this parameter point: nothing to draw")
     ranked = np.argsort(-portraits["share"].values, kind="stable")[:MAX_ROWS]
-    data = portraits.isel(attractor=np.sort(ranked)).assign_attrs(
-        {k: v for k, v in attractors.attrs.items() if k in ("model", "parameters")}
-    )
+    data = portraits.isel(attractor=np.sort(ranked)).assign_attrs(told_by(attractors.attrs))
     cast = palette.cast_of(attractors, _described(attractors, portraits))
     each = len(model.portraits) + (model.drawing is not None)
     layout = _Layout.of(frame, data.sizes["attractor"], each)
@@ -167,7 +166,7 @@ def _head(fig: style.DataFigure, data: xr.Dataset, portraits: xr.Dataset, n: int
     size = fig.look.legend
     room = width - 0.2 if fig.frame.compact else 0.62 * width
     fig.text(0.08 / width, 1.0 - 0.06 / height, style.folded(text, room, size), fontsize=size, va="top")
-    handles: list[Any] = [style.dot("once per drive period", "black", 3.0), *_fixed_handles(data, shown)]
+    handles: list[Any] = [style.dot(once(model_of(data)), "black", 3.0), *_fixed_handles(data, shown)]
     fig.legend(
         handles=handles, loc="upper right" if not fig.frame.compact else "upper left", frameon=False,
         bbox_to_anchor=(1.0 - 0.05 / width, 1.0 - 0.04 / height)

@@ -83,7 +83,7 @@ def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Mea
     ds
         Of a run, so that its model is known.
     state
-        Name; by default the model's first.
+        Name; by default the model's first that differs from section to section.
     degrees
         Degrees for angles and their rates.
 
@@ -93,7 +93,7 @@ def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Mea
         If the model has no such state, or degrees are asked for of one that is no angle.
     """
     model = model_of(ds)
-    state = state or model.state_names[0]
+    state = state or model.section_states[0]
     check_choice("state", state, model.state_names)
     one = model.state(state)
     return _measure(one.name, one.symbol, one.unit, degrees, one.on_circle)
@@ -218,7 +218,9 @@ def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True
         if coordinate.size != 1 or coordinate.dtype.kind != "f" or key in axes:
             continue
         (starts if is_start else parameters).append(_value(ds, coordinate, is_start))
-    return join([*parameters, *(starts if with_start else [])])
+    crossing = model_of(ds).crossing
+    section = [] if crossing is None else [f"section {crossing.sentence}"]
+    return join([*parameters, *section, *(starts if with_start else [])])
 
 
 def _value(ds: xr.Dataset, coordinate: xr.DataArray, is_start: bool) -> str:

@@ -11,7 +11,9 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
-from pipeline.analysis.chaos.lyapunov import GOOD
+from pipeline.analysis.chaos.lyapunov import GOOD, period_seconds
+from pipeline.layout.vocabulary import model_of
+from pipeline.layout.words import period_of
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import Diagram, with_diagram
 from pipeline.plots.door import Run, frame_of, noted, values_of
@@ -44,7 +46,7 @@ def plot_lyapunov(
     spectrum
         All stored exponents, each in its colour; else the largest, coloured by the kind of motion.
     per
-        ``s``: per unit time [1/s]; ``period``: per drive period.
+        ``s``: per unit time [1/s]; ``period``: per drive period or return.
     state, degrees
         Of the diagram, as for `plot_bifurcation`.
     at
@@ -97,7 +99,7 @@ def demand(ds: xr.Dataset) -> None:
 
 def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
     """Return what is drawn: exponents and errors in the unit asked for, flags and kinds of motion."""
-    scale = 1.0 / part["frequency"] if per == "period" else xr.DataArray(1.0)
+    scale = period_seconds(part) if per == "period" else xr.DataArray(1.0)
     chosen = part if spectrum else part.isel(exponent=slice(1))
     dims = chosen["lyapunov"].dims
     variables = {
@@ -110,7 +112,7 @@ def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
     data = xr.Dataset(variables).load()
     for name in ("exponent_value", "exponent_stderr"):
         data[name].attrs.update(
-            units="1/s" if per == "s" else "1", per="unit time" if per == "s" else "drive period"
+            units="1/s" if per == "s" else "1", per="unit time" if per == "s" else period_of(model_of(part))
         )
     # words of objects are no NetCDF; the numbers of branches and starts say enough
     keep = {"exponent", *data["lyapunov_flag"].dims}
@@ -120,7 +122,8 @@ def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
 
 def rate_unit(data: xr.Dataset) -> str:
     """Unit of the exponents for an axis."""
-    return "1/period" if data["exponent_value"].attrs["per"] == "drive period" else "1/s"
+    per = str(data["exponent_value"].attrs["per"])
+    return "1/s" if per == "unit time" else f"1/{per.split()[-1]}"
 
 
 def _draw_exponents(

@@ -22,7 +22,7 @@ from scipy.ndimage import distance_transform_edt
 
 from pipeline.layout import vocabulary
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import model_of
+from pipeline.layout.vocabulary import BOUNDED_SET, CLOSED_ORBIT, EQUILIBRIUM, model_of
 from pipeline.plots import style
 
 COLOURS = (
@@ -34,12 +34,13 @@ OTHERS = "#C8E6C0"
 UNASSIGNED: dict[str, tuple[int, ...]] = {
     "undecided": (vocabulary.PERIODIC, vocabulary.BOUNDED, vocabulary.INFERRED),
     "diverged": (vocabulary.DIVERGED,),
-    "failed": vocabulary.FAILED,
+    "failed": tuple(code for code in vocabulary.FAILED if code != vocabulary.NO_RETURN),
+    "no return": (vocabulary.NO_RETURN,),
     "pending": (vocabulary.PENDING,),
 }
 """What a cell without an attractor is called, by its status."""
 
-GREYS = {"undecided": "0.75", "diverged": "0.0", "failed": "0.45", "pending": "0.95"}
+GREYS = {"undecided": "0.75", "diverged": "0.0", "failed": "0.45", "no return": "0.17", "pending": "0.95"}
 
 
 @dataclass(frozen=True)
@@ -91,17 +92,35 @@ def describe(one: xr.Dataset) -> str:
     if not present.any():
         return "absent"
     words = _words(one, one["side"].values.ravel()[present]) if "side" in one else ""
-    return style.join([_periods(one["orbit_period"].values.ravel()[present]), words + _turns(one, present)])
+    kinds, periods = (one[name].values.ravel()[present] for name in ("kind", "orbit_period"))
+    told = _periods(periods, kinds, model_of(one).autonomous) + _seconds(one)
+    return style.join([told, (words + _turns(one, present)).lstrip("\u00a0")])
 
 
-def _periods(periods: np.ndarray) -> str:
+def _seconds(one: xr.Dataset) -> str:
+    """Range of a limit cycle's period in seconds; of a forced system nothing: the drive tells."""
+    if not model_of(one).autonomous or "period_s" not in one:
+        return ""
+    known = one["period_s"].values[np.isfinite(one["period_s"].values)]
+    if not known.size:
+        return ""
+    low, high = (f"{value:.4g}" for value in (known.min(), known.max()))
+    return f" ({low if low == high else f'{low} to {high}'}\u00a0s)"
+
+
+def _periods(periods: np.ndarray, kinds: np.ndarray, is_flow: bool) -> str:
     closed = sorted({int(p) for p in periods if p > 0})
     parts = []
     if closed:
         listed = ", ".join(map(str, closed)) if len(closed) < 4 else f"{closed[0]} to {closed[-1]}"
         parts.append(f"period {listed}")
-    if (periods == 0).any():
-        parts.append("not periodic")
+    for kind, text in (
+        (CLOSED_ORBIT, "limit cycle" if is_flow else "not periodic"),
+        (BOUNDED_SET, "not periodic"),
+        (EQUILIBRIUM, "at rest"),
+    ):
+        if ((periods == 0) & (kinds == kind)).any() and text not in parts:
+            parts.append(text)
     return " or ".join(parts)
 
 

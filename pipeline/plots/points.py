@@ -19,6 +19,7 @@ ABSENT = {
     "pending": (vocabulary.PENDING,),
     "failed": (vocabulary.DIVERGED, vocabulary.STEP_LIMIT, vocabulary.STEP_UNDERFLOW),
     "not reached": (vocabulary.UNREACHED,),
+    "no return": (vocabulary.NO_RETURN,),
 }
 """What became of cells that have no point to draw."""
 

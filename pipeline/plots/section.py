@@ -1,4 +1,4 @@
-"""Stroboscopic section: the points of one parameter point in the plane of two states, and its zooms."""
+"""Section: the points of one parameter point in the plane of two states, and its zooms."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from magpend_core.models.model import Model
 from pipeline.layout.vocabulary import model_of, split_dims
+from pipeline.layout.words import section_name
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.absent import absent_handles, say_empty
 from pipeline.plots.bifurcation import fixed_of
@@ -81,20 +83,31 @@ def plot_section(
     data = pixels.draw_points([pixels.Panel(ax, (0,))], view, diameter)
     for axis, m in zip("xy", measures, strict=True):
         data[axis].attrs = {"units": m.unit, "long_name": m.name}
-    fig.data = data.assign_coords(fixed_of(part)).assign_attrs(title="stroboscopic section")
+    fig.data = data.assign_coords(fixed_of(part)).assign_attrs(title=section_name(model_of(part)))
     return fig
 
 
 def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -> list[labels.Measure]:
     """How the states to the right and upwards are drawn."""
     model = model_of(part)
-    names = states or model.portraits[0]
+    names = states or section_pair(model)
     for name in names:
         style.check_choice("state", name, model.state_names)
     turns = [degrees and model.state(name).unit.startswith("rad") for name in names]
     if degrees and not any(turns):
         raise ValueError(f"neither {names[0]} nor {names[1]} is an angle; draw them without degrees")
     return [labels.state_measure(part, n, turn) for n, turn in zip(names, turns, strict=True)]
+
+
+def section_pair(model: Model, first: str = "") -> tuple[str, str]:
+    """States to the right and upwards: if they can, two of a portrait that differ from section to section."""
+    states = model.section_states
+    pairs = [p for p in model.portraits if set(p) <= set(states) and p[0] == (first or p[0])]
+    if pairs:
+        return pairs[0]
+    first = first or states[0]
+    others = [name for name in states if name != first] or [n for n in model.state_names if n != first]
+    return first, (others or [first])[0]
 
 
 def _view(part: xr.Dataset, measures: list[labels.Measure], attractors: xr.Dataset | None) -> View:
@@ -160,8 +173,7 @@ def draw(run: Run, options: SectionOptions) -> style.DataFigure:
     at, notes = values_of(run, options)
     found = attractors_of(run, options) if options.colour == "attractor" else None
     model = model_of(cube)
-    pair = next((p for p in model.portraits if p[0] == options.state), (options.state, ""))
-    first, second = options.state, options.against or pair[1] or model.portraits[0][1]
+    first, second = options.state, options.against or section_pair(model, options.state)[1]
     figure = plot_section(
         cube, found, states=(first, second), at=at, degrees=options.degrees, frame=frame_of(options)
     )

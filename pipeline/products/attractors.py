@@ -19,7 +19,7 @@ class IdentifyOptions(Options):
     polish: bool = option(True, "Refine orbits by Newton's method, which integrates a point per orbit.")
     residual: float = option(1e-10, "Scaled residual that Newton's method is to reach.", gt=0.0)
     max_orbit_period: int = option(
-        16, "Longest period guessed for cells that are not closed.", unit="drive periods", ge=1
+        16, "Longest period guessed for cells that are not closed.", unit="drive periods or returns", ge=1
     )
     n_points: int = option(64, "Section points stored per attractor.", ge=1)
     mirror_threshold: float = option(0.3, "Largest distance of a mirror partner from the image.", gt=0.0)
@@ -47,7 +47,7 @@ class SettlingOptions(AttractorOptions):
     """How bounded sets are run on."""
 
     n_sample: int = option(32, "Cells of each bounded set that are run on.", ge=1)
-    n_periods: int = option(1024, "Time that they are run on.", unit="drive periods", ge=1)
+    n_periods: int = option(1024, "Time that they are run on.", unit="drive periods or returns", ge=1)
     confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
     rtol: float = option(0.0, "Relative tolerance; 0 takes that of the run.", ge=0.0)
     atol: float = option(0.0, "Absolute tolerance; 0 takes that of the run.", ge=0.0)
@@ -88,7 +88,7 @@ SETTLING = Analysis(
     "settling",
     """Run a sample of every bounded set on: does it stay, or was it a transient, and where does it go?
 
-    This integrates, for minutes if there are many sets. Lifetimes are in drive periods.""",
+    This integrates, for minutes if there are many sets. Lifetimes are in drive periods or returns.""",
     SettlingOptions,
     compute="pipeline.analysis.attractors.settling_product:settling",
     table="pipeline.analysis.attractors.settling_table:settling_table",

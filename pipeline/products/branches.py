@@ -10,14 +10,17 @@ _ROOM = "pipeline.analysis.branches.product"
 class BranchOptions(Options):
     """Which orbits are followed, and how far."""
 
-    parameter: str = option("frequency_hz", "What is varied: the drive's frequency, or a parameter's name.")
+    parameter: str = option(
+        "frequency_hz",
+        "What is varied: the drive's frequency, or a parameter; if the run sweeps one other, that.",
+    )
     low: float | None = option(None, "Least value; by default what the run spans.", unit="SI", flag="--from")
     high: float | None = option(None, "Largest value; by default what the run spans.", unit="SI", flag="--to")
     max_period: int = option(
         0,
         "Longest period of a branch; 0 takes all orbits that attract cells, and doublings up to the longest "
         "of them, at least up to 4.",
-        unit="drive periods",
+        unit="drive periods or returns",
         ge=0,
         flag="--period",
     )
@@ -33,7 +36,7 @@ class CurveOptions(BranchOptions):
     second: str = option(..., "Second parameter: its name, such as q, or the drive's frequency_hz.")
     second_low: float = option(..., "Its least value.", unit="SI", flag="--second-from")
     second_high: float = option(..., "Its largest value.", unit="SI", flag="--second-to")
-    curve_period: int = option(1, "Longest period of the orbits.", unit="drive periods", ge=1)
+    curve_period: int = option(1, "Longest period of the orbits.", unit="drive periods or returns", ge=1)
 
 
 BRANCHES = Analysis(

@@ -66,7 +66,7 @@ class LyapunovFigureOptions(StateOptions):
 
     spectrum: bool = option(False, "All stored exponents, not the largest alone.")
     as_map: bool = option(False, "A map over two parameters instead of a diagram over one.", flag="--map")
-    per: Per = option("s", "Exponents per second or per drive period.")
+    per: Per = option("s", "Exponents per second, or per drive period or return.")
 
     def label(self) -> str:
         """What the file's name says; no state on a map."""
@@ -77,7 +77,7 @@ class ConvergenceOptions(FigureOptions):
     """How exponents converge."""
 
     exponent: int = option(1, "Which exponent, 1 the largest.", ge=1)
-    per: Per = option("s", "Exponents per second or per drive period.")
+    per: Per = option("s", "Exponents per second, or per drive period or return.")
 
 
 class DimensionFigureOptions(DimensionOptions, FigureOptions):
@@ -88,7 +88,7 @@ class BranchFigureOptions(BranchOptions, StateOptions):
     """Branches over a diagram."""
 
     over: str = option("", "Run over the same parameter that is drawn below; by default DIR.")
-    shown: int | None = option(None, "Longest period drawn.", unit="drive periods", ge=1)
+    shown: int | None = option(None, "Longest period drawn.", unit="drive periods or returns", ge=1)
 
 
 class MultiplierOptions(BranchOptions, FigureOptions):
@@ -110,7 +110,7 @@ BIFURCATION = Figure(
 
 SECTION = Figure(
     "section",
-    """Draw the stroboscopic section of one parameter point in the plane of two states.
+    """Draw the section of one parameter point in the plane of two states.
 
     Parts of it with --xlim and --ylim; many points are counted on pixels.""",
     SectionOptions,

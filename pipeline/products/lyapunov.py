@@ -22,11 +22,11 @@ class LyapunovOptions(Options):
         None, "Exponents, from the largest on; by default one for each state.", ge=1
     )
     n_transient: int = option(
-        200, "Time in which the tangent vectors turn into their directions.", unit="drive periods",
+        200, "Time in which the tangent vectors turn into their directions.", unit="drive periods or returns",
         ge=0, le=1_000_000,
     )  # fmt: skip
     n_periods: int = option(
-        400, "Time over which growth is averaged.", unit="drive periods", ge=2, le=100_000_000
+        400, "Time over which growth is averaged.", unit="drive periods or returns", ge=2, le=100_000_000
     )
     n_blocks: int = option(16, "Blocks of that time, for standard errors.", ge=2, le=1000)
 
@@ -59,7 +59,8 @@ class LyapunovFlag(IntEnum):
 _FLAG_SENTENCES = {
     LyapunovFlag.ABSENT: "pending, or the cell has no attractor to go on from",
     LyapunovFlag.GOOD: "no objection",
-    LyapunovFlag.AUDIT_FAILED: "the exponents do not add up to the divergence; use a smaller rtol",
+    LyapunovFlag.AUDIT_FAILED: "the exponents do not add up to the divergence, or none of a flow's is "
+    "near 0; use a smaller rtol",
     LyapunovFlag.UNRESOLVED: "tangent vectors became parallel; only the first exponent is resolved",
     LyapunovFlag.FAILED: "the integration failed",
 }

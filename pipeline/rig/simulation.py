@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from magpend_core.models import ModelError, load_model
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import ParameterError, Parameters
 from magpend_core.models.presets import find_preset
@@ -19,6 +18,7 @@ from pipeline.rig.recordings.mapping import DRIVE, Mapping, TimeMap
 from pipeline.rig.recordings.raw import Raw
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, readings
 from pipeline.spec.files import read_toml
+from pipeline.spec.models import add_model
 from pipeline.spec.problems import SpecError, problems_of, unknown_key, unknown_name
 from pipeline.spec.starts import degrees_key, state_keys, state_of_key
 from pipeline.spec.tables import Table
@@ -74,7 +74,9 @@ class DriveTable(Table):
 class RigTable(Table):
     """What stands at the top of the file."""
 
-    model: str = Field(description="Name of the model.")
+    model: str | dict[str, Any] = Field(
+        description="The model, as in a specification: a name, a file or a table."
+    )
     preset: str | None = Field(default=None, description="Of the model's parameters; by default its first.")
     parameters: dict[str, float] = Field(default={}, description="Values that differ from the preset [SI].")
     initial_state: dict[str, float] = Field(
@@ -211,10 +213,8 @@ def _parameters(data: AnyMapping[str, Any], folder: str | Path, problems: list[s
     if "model" not in data:
         problems.append("model: missing; name the model, as magpend models lists them.")
         return None
-    try:
-        model = load_model(data["model"])
-    except (ModelError, TypeError) as error:
-        problems += [f"model: {p}" for p in getattr(error, "problems", [f"{data['model']!r} is no name."])]
+    model = add_model(data["model"], folder, problems)
+    if model is None:
         return None
     overrides = _table(data, "parameters", problems)
     preset = data.get("preset")

@@ -18,6 +18,7 @@ import numpy as np
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping
 from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.rig.recordings.reading import recording_of
+from pipeline.spec.models import kept_reference
 from pipeline.spec.problems import SpecError, unknown_name
 
 if TYPE_CHECKING:
@@ -198,7 +199,7 @@ def readings(
         channel, mapped = _drive_channel(parameters, drive, instants, sensor, rng, step)
         channels[channel.name] = channel
     raw = Raw(Path("simulated"), "simulated", "", (channels,), simulated=True)
-    return raw, Mapping(model=parameters.model.name, channels=entries, drive=mapped)
+    return raw, Mapping(model=kept_reference(parameters.model), channels=entries, drive=mapped)
 
 
 def _check(parameters: Parameters, drive: Sequence[Step] | None, times: np.ndarray, sensors: Sensors) -> None:

@@ -24,7 +24,7 @@ def named(run: Run, options: Options) -> Options:
 
     ``at`` takes ``frequency`` or ``frequency_hz``, a parameter, and for a grid of initial states its axis
     ``x_0``, the state ``x`` or, of an angle, ``x_deg``. ``parameter`` and ``second`` take either name of the
-    frequency. An empty ``state`` is the model's first.
+    frequency. An empty ``state`` is the model's first that differs from section to section.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def named(run: Run, options: Options) -> Options:
             changes[role] = parameter_name(given[role])
             problems += _unknown("parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY))
         if "state" in fields:
-            changes["state"] = given["state"] or model.state_names[0]
+            changes["state"] = given["state"] or model.section_states[0]
             problems += _unknown("state", given["state"], changes["state"], model.state_names)
     if problems:
         raise SpecError(problems)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from pipeline.layout.domains import check_starts
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate
@@ -84,6 +85,7 @@ def describe_plan(
     """
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
+    check_starts(parsed)
     directory = local_path(out) if out is not None else default_directory(path, smoke)
     plan = make_plan(parsed)
     info = check(directory, identity_here(parsed, plan))

@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from magpend_core.models.imported import origin
+from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.products.reporting import report
@@ -92,6 +94,7 @@ def run(
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     directory = local_path(out) if out is not None else default_directory(path, smoke)
+    check_starts(parsed)
     plan = make_plan(parsed)
     identity = identity_here(parsed, plan)
     check(directory, identity)
@@ -129,7 +132,8 @@ def _complete(
     seconds = task.warm_up(spec)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
-    job = partial(task.run_task, str(info.directory.absolute()), info.digest)
+    place = str(info.directory.absolute())
+    job = partial(task.run_task, place, info.digest, origin=origin(spec.model))
     started = time.perf_counter()
     cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(missing)))
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)

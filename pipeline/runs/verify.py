@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.layout.plan import make_plan
-from pipeline.spec.parsing import parse_spec
+from pipeline.spec.parsing import kept_spec
 from pipeline.store.commits import Verification, verify, withdraw
 from pipeline.store.files import writer_lock
 from pipeline.store.runfile import read_run
@@ -36,7 +36,7 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
         With `repair`, if a run is writing there.
     """
     info = read_run(directory)
-    spec = parse_spec(info.spec)
+    spec = kept_spec(info.spec)
     plan = make_plan(spec)
     if not repair:
         return verify(info, plan)

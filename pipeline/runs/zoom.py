@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import math
-import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.spec.parsing import Spec, load_spec, parse_spec
+from magpend_core.models.imported import KEY
+from pipeline.spec.models import model_toml
+from pipeline.spec.parsing import Spec, kept_spec, load_spec
 from pipeline.spec.problems import SpecError, unknown_name
 from pipeline.spec.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
 from pipeline.spec.tables import FREQUENCY, Range
+from pipeline.spec.toml import toml_key, toml_value
 
 MARK = "(zoom)"
 _ORDER = ("parameters", "axes", "initial_conditions", "continuation", "integration", "products", "execution")
@@ -77,7 +78,7 @@ def read_source(path: str | Path) -> Source:
 
     if local_path(path).is_dir():
         info = read_run(path)
-        return Source(parse_spec(info.spec), f"run {info.directory.resolve().name}, digest {info.digest}")
+        return Source(kept_spec(info.spec), f"run {info.directory.resolve().name}, digest {info.digest}")
     found = find_spec(path)
     return Source(load_spec(found), f"specification {found.name}")
 
@@ -111,7 +112,7 @@ def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
     if changes.samples is not None:
         data["initial_conditions"]["n"] = changes.samples
     data["title"] = spec.title if spec.title.endswith(MARK) else f"{spec.title} {MARK}".strip()
-    return parse_spec(data), notes
+    return kept_spec(data), notes
 
 
 def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
@@ -128,6 +129,8 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
         raise SpecError([f"{out.parent}: no such folder; make it first."])
     spec, notes = zoom(source.spec, changes)
     text = f"# Zoom. Derived from {_one_line(source.origin)}.\n{to_toml(spec)}"
+    if isinstance(spec.reference, Mapping) and (place := spec.reference.get(KEY)):
+        notes = [*notes, f"model: running {out} imports the Python object {place}; look at it before."]
     try:
         with out.open("x", encoding="utf-8") as file:
             file.write(text)
@@ -248,40 +251,24 @@ def _put(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
 def to_toml(spec: Spec) -> str:
     """Return a specification as a TOML text that reads back as the same.
 
-    A writer for what specifications hold: tables of numbers, texts, truth values, lists, and tables within
-    a line.
+    A model as text goes last, with a table for each of its own; of a Python object it is the place.
     """
     data = spec.as_dict()
-    lines = [f"{key} = {_value(data[key])}" for key in ("kind", "title", "model") if data[key]]
+    model = model_toml(data.pop("model"))
+    is_line = not model.startswith("[")
+    lines = [f"{key} = {toml_value(data[key])}" for key in ("kind", "title") if data[key]]
+    lines += [model.rstrip("\n")] if is_line else []
     names = [name for name in data if isinstance(data[name], dict)]
     for name in sorted(names, key=lambda n: _ORDER.index(n) if n in _ORDER else len(_ORDER)):
         # an empty table says nothing
         table = {key: value for key, value in data[name].items() if value != {}}
         if table:
-            lines += ["", f"[{name}]", *(f"{_key(k)} = {_value(v)}" for k, v in table.items())]
-    text = "\n".join(lines) + "\n"
-    assert parse_spec(tomllib.loads(text)) == spec
+            lines += ["", f"[{name}]", *(f"{toml_key(k)} = {toml_value(v)}" for k, v in table.items())]
+    text = "\n".join(lines) + "\n" + ("" if is_line else f"\n{model}")
+    read = tomllib.loads(text)
+    assert is_line or read["model"] == spec.reference
+    assert kept_spec({**read, "model": spec.reference}) == spec
     return text
-
-
-def _key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        # JSON escapes what TOML must have escaped, but for DEL
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list | tuple):
-        items = [_value(v) for v in value]
-        if any(isinstance(v, list | tuple) for v in value):
-            return "[\n" + "".join(f"    {item},\n" for item in items) + "]"
-        return "[" + ", ".join(items) + "]"
-    return repr(value)
 
 
 def _one_line(text: str) -> str:

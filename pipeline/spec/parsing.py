@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from magpend_core.models import DEFAULT, ModelError, load_model, model_names
+from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import ParameterError, Parameters, unknown_name_problem
 from magpend_core.models.presets import Preset, is_file
@@ -25,9 +25,12 @@ from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.drives import RecordedDrive
 from pipeline.spec.files import merged, nested, read_toml
+from pipeline.spec.methods import method_problems
+from pipeline.spec.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
 from pipeline.spec.problems import SpecError, problems_of, unknown_choice, unknown_key
 from pipeline.spec.recorded import DriveTable, recorded, run_problems, with_drive
-from pipeline.spec.starts import STARTS, GridStarts, Starts, starts_model
+from pipeline.spec.section import SectionTable, section_of, seen_through
+from pipeline.spec.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
 from pipeline.spec.tables import (
     FREQUENCY,
     Continuation,
@@ -41,8 +44,6 @@ from pipeline.spec.tables import (
 KINDS = ("sweep", "continuation")
 IDENTIFICATION = "identification"
 """Kind of the specifications that `pipeline.rig.identify` reads."""
-MAX_TILE_BYTES = 256_000_000
-"""Largest sections of the smallest tile that a refined grid can be cut into [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Spec:
 
     kind: str
     title: str
-    model_name: str
+    reference: str | Mapping[str, Any]
     parameters: ParametersTable
     axes: dict[str, Range]
     initial_conditions: Starts
@@ -60,6 +61,7 @@ class Spec:
     products: dict[str, Options]
     execution: Execution
     drive: DriveTable | None = None
+    section: SectionTable | None = None
 
     @cached_property
     def recorded(self) -> RecordedDrive | None:
@@ -68,7 +70,12 @@ class Spec:
 
     @property
     def frequency_hz(self) -> float | None:
-        """Drive frequency [Hz], the mean one of a recording; None if it is an axis."""
+        """Drive frequency [Hz], the mean one of a recording; None if it is an axis.
+
+        With a section by crossing, one over the longest wait for a return: what the engine takes for it.
+        """
+        if self.section is not None:
+            return self.section.crossing.frequency_hz
         return self.parameters.frequency_hz if self.recorded is None else self.recorded.frequency_hz
 
     @property
@@ -77,10 +84,10 @@ class Spec:
         starts = self.initial_conditions
         return starts.refine if isinstance(starts, GridStarts) else None
 
-    @property
+    @cached_property
     def model(self) -> Model:
-        """What is integrated."""
-        return load_model(self.model_name)
+        """What is integrated, through its section if it has one; `reference` is its `Model.reference`."""
+        return seen_through(load_model(self.reference), self.section)
 
     @cached_property
     def values(self) -> Parameters:
@@ -89,7 +96,7 @@ class Spec:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data with all defaults filled in; `parse_spec` reads it back."""
-        tables: dict[str, Any] = {"kind": self.kind, "title": self.title, "model": self.model_name}
+        tables: dict[str, Any] = {"kind": self.kind, "title": self.title, "model": self.reference}
         for name in _TABLES:
             table = getattr(self, name)
             if table is not None:
@@ -108,10 +115,12 @@ _TABLES: dict[str, type[Table]] = {
     "integration": Integration,
     "execution": Execution,
     "drive": DriveTable,
+    "section": SectionTable,
 }
+_OPTIONAL = ("drive", "section")
 _KEYS = (
     "kind", "title", "model", "parameters", "axes", "initial_conditions", "continuation", "integration",
-    "products", "execution", "drive",
+    "products", "execution", "drive", "section",
 )  # fmt: skip
 
 
@@ -134,6 +143,17 @@ def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
     return parse_spec(_with_smoke(read_toml(path), smoke, folder), folder)
 
 
+def kept_spec(data: Mapping[str, Any]) -> Spec:
+    """Read what a run keeps, which `Spec.as_dict` gave: no other file is read, and nothing is imported.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once.
+    """
+    return parse_spec(data, KEPT)
+
+
 def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, Any]:
     """Split off ``[smoke]``, check it in either case, and merge it if asked."""
     plain = {key: value for key, value in data.items() if key != "smoke"}
@@ -144,7 +164,9 @@ def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, An
     table = data["smoke"]
     if not isinstance(table, dict):
         raise SpecError([f"smoke = {table!r}: must be a table of keys to replace."])
-    small = merged(plain, nested(table))
+    changes = nested(table)
+    base = with_model_table(plain, folder) if isinstance(changes.get("model"), dict) else plain
+    small = merged(base, changes)
     try:
         parse_spec(small, folder)
     except SpecError as error:
@@ -162,19 +184,20 @@ def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> N
     raise SpecError(own + [f"with [smoke]: {p}" for p in smoke_error.problems if p not in own])
 
 
-def parse_spec(data: Mapping[str, Any], folder: str | Path = ".") -> Spec:
+def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec:
     """Validate plain data.
 
     Every table is validated by itself, so that one with errors does not hide those of the others;
     then whatever can be checked between the valid ones is. The file of a preset is read here, and its
-    content takes the place of its name, and so is that of a drive: what a run keeps needs the files no more.
+    content takes the place of its name, and so are those of a drive and of a model: what a run keeps needs
+    the files no more. A model that is a Python object is imported, unless `folder` is None.
 
     Parameters
     ----------
     data
         Tables as TOML or `Spec.as_dict` has them.
     folder
-        From where the path of a preset's file counts.
+        From where paths of files count; None for what a run keeps, see `kept_spec`.
 
     Raises
     ------
@@ -183,55 +206,58 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path = ".") -> Spec:
     """
     if data.get("kind") == IDENTIFICATION:
         raise SpecError([f'kind = "{IDENTIFICATION}": is no run; use magpend identify SPEC --out DIR.'])
+    if "kind" not in data and "equations" in data:
+        raise SpecError([A_MODEL])
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
-    data = with_drive(_with_preset(data, folder, problems), folder, problems)
-    kind, title, model = _kind(data, problems), _title(data, problems), _model(data, problems)
+    data = _with_preset(data, folder, problems)
+    data = data if folder is None else with_drive(data, folder, problems)
+    kind, title = _kind(data, problems), _title(data, problems)
+    model = add_model(data.get("model", DEFAULT), folder, problems)
     tables = {name: _table(data, name, table, problems) for name, table in _TABLES.items()}
     axes = _axes(data, problems)
     walk = _walk(kind, data, tables["continuation"], axes, problems)
     if model is None:  # what is left is said in the model's own words
+        model = stand_in(data.get("model"), folder, forced="section" not in data)
+    if model is None:
         raise SpecError(problems)
+    section = section_of(tables["section"], model, data, problems)
+    seen = seen_through(model, section)
     starts = _starts(data, model, problems)
-    problems += _refine_problems(kind, starts, tables["integration"], model)
+    problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
     problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
+    problems += method_problems(tables["integration"], products, "drive" in data)
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
-    complete = "drive" not in data and not any(p.startswith(("axes", "parameters")) for p in problems)
-    problems += _parameter_problems(known, model, _declared(data), axes, complete)
+    has_periods = "drive" in data or "section" in data or model.autonomous
+    complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
+    problems += _parameter_problems(known, seen, _declared(data), axes, complete)
     if problems:
         raise SpecError(problems)
     assert starts is not None
     return Spec(
-        kind, title, model.name, tables["parameters"], axes, starts, walk, tables["integration"], products,
-        tables["execution"], tables["drive"],
+        kind, title, model.reference, tables["parameters"], axes, starts, walk, tables["integration"],
+        products, tables["execution"], tables["drive"], section,
     )  # fmt: skip
 
 
-def _with_preset(data: Mapping[str, Any], folder: str | Path, problems: list[str]) -> Mapping[str, Any]:
+def _with_preset(
+    data: Mapping[str, Any], folder: str | Path | None, problems: list[str]
+) -> Mapping[str, Any]:
     """Put the content of a preset's file in the place of its name; without it, if it cannot be read."""
     table = data.get("parameters")
     name = table.get("preset") if isinstance(table, dict) else None
     if table is None or not isinstance(name, str) or not is_file(name):
         return data
     rest = {key: value for key, value in table.items() if key != "preset"}
+    if folder is None:
+        problems.append(f"parameters.preset = {name!r}: a run keeps the content of a preset's file.")
+        return {**data, "parameters": rest}
     try:
         content = asdict(Preset.read(Path(folder) / name))
     except ParameterError as error:
         problems += [f"parameters.preset: {p}" for p in error.problems]
         return {**data, "parameters": rest}
     return {**data, "parameters": {"preset": content, **rest}}
-
-
-def _model(data: Mapping[str, Any], problems: list[str]) -> Model | None:
-    name = data.get("model", DEFAULT)
-    if not isinstance(name, str):
-        problems.append(f"model = {name!r}: must be a name in quotes, such as {model_names()[0]!r}.")
-        return None
-    try:
-        return load_model(name)
-    except ModelError as error:
-        problems += [f"model: {p}" for p in error.problems]
-        return None
 
 
 def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dict[str, Options]:
@@ -304,7 +330,7 @@ def _validate(model: type[BaseModel], value: Any, path: str, problems: list[str]
 
 
 def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: list[str]) -> Any:
-    if not _is_table(data, name, problems) or (name not in data and name == "drive"):
+    if not _is_table(data, name, problems) or (name not in data and name in _OPTIONAL):
         return None
     return _validate(model, data.get(name, {}), name, problems)
 
@@ -339,35 +365,8 @@ def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Start
             f"instead of {kind!r}."
         )
         table = {key: value for key, value in table.items() if key != "refine"}
-    starts: Starts | None = _validate(starts_model(kind, model.name), table, "initial_conditions", problems)
+    starts: Starts | None = _validate(starts_model(kind, model), table, "initial_conditions", problems)
     return starts
-
-
-def _refine_problems(
-    kind: str, starts: Starts | None, integration: Integration | None, model: Model
-) -> list[str]:
-    """Problems with a grid's `refine`."""
-    if not isinstance(starts, GridStarts) or starts.refine is None:
-        return []
-    stride, key = starts.refine, f"initial_conditions.refine = {starts.refine}"
-    if kind == "continuation":
-        return [f"{key}: branches are not refined; drop the key, or make it a sweep."]
-    lengths = {name: len(axis.array()) for name, axis in starts.ranges.items()}
-    if not lengths:
-        return [f"{key}: there is no range to refine; give a state a range, or drop the key."]
-    shortest = min(lengths, key=lengths.__getitem__)
-    if lengths[shortest] < stride:
-        return [
-            f"{key}: must be at most {lengths[shortest]}, the points of {shortest}; lower it, or add points."
-        ]
-    if integration is not None:
-        n_bytes = stride ** len(lengths) * integration.n_keep * len(model.states) * 8
-        if n_bytes > MAX_TILE_BYTES:
-            return [
-                f"{key}: over {len(lengths)} ranges a task would hold {n_bytes / 1e6:.0f} MB of sections, "
-                f"more than {MAX_TILE_BYTES / 1e6:.0f} MB; lower refine or integration.n_keep."
-            ]
-    return []
 
 
 def _walk(

@@ -6,7 +6,7 @@ name. The models of the tables are made for each model of a system, and checked 
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
@@ -19,13 +19,14 @@ from pydantic import (
     model_validator,
 )
 
-from magpend_core.models import load_model
 from magpend_core.models.model import Model
-from pipeline.spec.tables import MAX_POINTS, Range, Table
+from pipeline.spec.tables import MAX_POINTS, Integration, Range, Table
 
 STRIDES = (2, 4, 8, 16, 32, 64)
 IN_DEGREES = ("rad", "rad/s")
 """Units that degrees stand for."""
+MAX_TILE_BYTES = 256_000_000
+"""Largest sections of the smallest tile that a refined grid can be cut into [bytes]."""
 
 
 def _number_or_range(value: Any) -> str:
@@ -179,8 +180,8 @@ Starts = GridStarts | ListStarts | RandomStarts
 STARTS: dict[str, type[Starts]] = {"grid": GridStarts, "list": ListStarts, "random": RandomStarts}
 
 
-@cache
-def starts_model(kind: str, model: str) -> type[Starts]:
+@lru_cache(maxsize=64)
+def starts_model(kind: str, model: Model) -> type[Starts]:
     """Return the table of initial conditions for a model's states.
 
     Parameters
@@ -188,11 +189,38 @@ def starts_model(kind: str, model: str) -> type[Starts]:
     kind
         ``"grid"``, ``"list"`` or ``"random"``.
     model
-        Name of the model.
+        Whose states they are.
     """
-    base, system = STARTS[kind], load_model(model)
+    base = STARTS[kind]
     annotation: Any = {"grid": Extent | None, "random": Interval | None}.get(kind)
-    fields: Any = {} if annotation is None else dict.fromkeys(state_keys(system), (annotation, None))
+    fields: Any = {} if annotation is None else dict.fromkeys(state_keys(model), (annotation, None))
     made: type[Starts] = create_model(base.__name__, __base__=base, __module__=__name__, **fields)
-    made.system = system
+    made.system = model
     return made
+
+
+def refine_problems(
+    kind: str, starts: Starts | None, integration: Integration | None, model: Model
+) -> list[str]:
+    """Sentences on a grid's `refine` that does not fit its ranges, the kind or what is kept."""
+    if not isinstance(starts, GridStarts) or starts.refine is None:
+        return []
+    stride, key = starts.refine, f"initial_conditions.refine = {starts.refine}"
+    if kind == "continuation":
+        return [f"{key}: branches are not refined; drop the key, or make it a sweep."]
+    lengths = {name: len(axis.array()) for name, axis in starts.ranges.items()}
+    if not lengths:
+        return [f"{key}: there is no range to refine; give a state a range, or drop the key."]
+    shortest = min(lengths, key=lengths.__getitem__)
+    if lengths[shortest] < stride:
+        return [
+            f"{key}: must be at most {lengths[shortest]}, the points of {shortest}; lower it, or add points."
+        ]
+    if integration is not None:
+        n_bytes = stride ** len(lengths) * integration.n_keep * len(model.states) * 8
+        if n_bytes > MAX_TILE_BYTES:
+            return [
+                f"{key}: over {len(lengths)} ranges a task would hold {n_bytes / 1e6:.0f} MB of sections, "
+                f"more than {MAX_TILE_BYTES / 1e6:.0f} MB; lower refine or integration.n_keep."
+            ]
+    return []

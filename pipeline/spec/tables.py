@@ -134,8 +134,13 @@ class Integration(Table):
 
     rtol: float = Field(1e-8, ge=1e-13, lt=1, description="Relative tolerance of a step.")
     atol: float = Field(1e-8, gt=0, lt=1, description="Absolute tolerance of a step, in the states' units.")
-    n_transient: int = Field(300, ge=0, le=100_000_000, description="Drive periods before sections are kept.")
-    n_keep: int = Field(60, ge=1, le=1_000_000, description="Sections kept, one per drive period.")
+    method: Literal["dopri5", "dop853"] = Field(
+        "dopri5", description="Runge-Kutta method: of order 5, or of order 8 for smooth equations."
+    )
+    n_transient: int = Field(
+        300, ge=0, le=100_000_000, description="Drive periods, or returns, before sections are kept."
+    )
+    n_keep: int = Field(60, ge=1, le=1_000_000, description="Sections kept, one per drive period or return.")
     max_steps_per_period: int = Field(
         20_000, ge=1, le=1_000_000_000, description="Attempted steps after which a cell is given up."
     )
@@ -146,7 +151,7 @@ class Integration(Table):
         1e-6, gt=0, lt=1, description="Scaled distance to a closed orbit below which a cell counts as closed."
     )
     max_orbit_period: int = Field(
-        16, ge=1, le=32_000, description="Longest period that is looked for [drive periods]."
+        16, ge=1, le=32_000, description="Longest period that is looked for [drive periods or returns]."
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
+from pipeline.layout.vocabulary import model_attribute, section_attributes
 from pipeline.store.run import Run
 from pipeline.store.view import committed_view
 
@@ -75,10 +76,11 @@ def _attributes(run: Run) -> dict[str, Any]:
         f"kernel {info.identity['kernel_version']}",
         **info.provenance,
         "kind": run.plan.kind,
-        "model": run.spec.model_name,
+        "model": model_attribute(run.spec.model),
         "spec": info.spec_text,
         "digest": info.digest,
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
+        **section_attributes(run.model.crossing),
         **run.spec.integration.model_dump(),
         **{f"{name}_{k}": v for name, o in run.spec.products.items() for k, v in o.plain().items()},
     }

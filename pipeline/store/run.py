@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.spec.parsing import Spec, parse_spec
+from pipeline.spec.parsing import Spec, kept_spec
 from pipeline.store.commits import Commit, cube_digest, read_commits
 from pipeline.store.runfile import RunInfo, read_run
 from pipeline.store.skeleton import check_skeleton
@@ -64,7 +64,7 @@ class Run:
             return source
         info = read_run(source)
         check_skeleton(info)
-        spec = parse_spec(info.spec)
+        spec = kept_spec(info.spec)
         plan = make_plan(spec)
         return cls(info, spec, plan, read_commits(info, plan))
 

@@ -84,7 +84,7 @@ def read_run(directory: str | Path) -> RunInfo:
             )
         info = RunInfo(directory=directory, **data)
         fits = digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DamagedError(f"{path}: damaged ({error}); {_remedy(directory)}") from None
     if not fits:
         raise DamagedError(f"{path}: damaged (its digest does not fit); {_remedy(directory)}")

@@ -18,6 +18,7 @@ from zarr.storage import MemoryStore
 from pipeline.layout.cells import Coordinate, coordinates
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import Plan
+from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec
 from pipeline.store.arrays import create_array, write_whole
@@ -34,7 +35,7 @@ def skeleton_files(
     """Content by key of all files of an empty cube; the group's own metadata come first."""
     attrs = {
         "kind": plan.kind,
-        "model": spec.model_name,
+        "model": model_attribute(spec.model),
         "Conventions": "CF-1.11",
         "title": title,
         "spec": spec_text,

@@ -51,6 +51,13 @@ def test_cheap__prints_all_variants(bench, capsys):
         assert name in printed
 
 
+def test_events__prints_both_tables(bench, capsys):
+    bench("events").main(TINY[:2] + ["--periods", "2", "--rounds", "1"])
+    printed = capsys.readouterr().out
+    for name in ("van-der-pol", "rossler", "lorenz", "without the stop"):
+        assert name in printed
+
+
 def test_peers__models_are_the_same(bench):
     line = bench("peers").check_models(bench("magpend_core").load_preset(), seed=1)
     assert "scalar model" in line
@@ -129,3 +136,32 @@ def test_virtual_rig__finds_all_parameters_again(bench):
     assert off.max() < 4.0
     assert found.hits.sum() >= 12
     assert (found.errors / rig.truth() < 0.5).all()
+
+
+def test_text_models__prints_all_tables(bench, monkeypatch, capsys):
+    # heyoka and numbalsoda compile for long; that their equations are the same is tested below
+    monkeypatch.setitem(sys.modules, "numbalsoda", None)
+    few = ["--trajectories", "16", "--periods", "1", "--rounds", "1", "--pairs", "duffing"]
+    few += ["--models", "van-der-pol", "--oscillators", "driven-1e4"]
+    bench("text_models").main([*few, "--peers", "scalar", "numbalsoda"])
+    printed = capsys.readouterr().out
+    for name in ("duffing", "layers found: True", "scalar numba", "later process"):
+        assert name in printed
+    assert "numbalsoda is left out" in printed
+
+
+@pytest.mark.parametrize("name", ["belt", "three-magnets", "pendulum-text"])
+def test_text_peers__equations_are_those_of_the_engine(bench, name):
+    peers, cases = bench("text_peers"), bench("text_models").CASES
+    model = bench("magpend_core").load_model(name)
+    pointwise, frequency = bench("magpend_core.pointwise"), 1.0 / cases[name].period
+    states = np.random.default_rng(3).uniform(cases[name].low, cases[name].high, (20, len(cases[name].low)))
+    ours = pointwise.rates(0.1, states, model.load(), frequency)
+    rhs = peers.scalar_rhs(model, model.load().as_dict(), frequency)
+    theirs = np.array([rhs(0.1, *y) for y in states.tolist()])
+    assert np.allclose(theirs, ours, rtol=1e-10, atol=1e-10)
+    heyoka = pytest.importorskip("heyoka")
+    variables, right = peers.heyoka_equations(model, model.load().as_dict(), frequency)
+    function = heyoka.cfunc(right, variables)
+    theirs = function(inputs=np.ascontiguousarray(states.T), time=np.full(len(states), 0.1)).T
+    assert np.allclose(theirs, ours, rtol=1e-10, atol=1e-10)

@@ -251,3 +251,108 @@ def duffing():
         escape=(1e3, 1e3),
         has_layers=False,
     )
+
+
+# ---- systems of one's own ----------------------------------------------------------------------
+
+OWN_TEXT = """
+[model]
+name = "duffing5"
+states = { x = { unit = "m" }, v = { unit = "m/s" } }
+parameters = { d = 0.08, A = { value = 0.2, unit = "N", meaning = "amplitude" } }
+define = { drive = "A*cos(2*pi*f*t)" }
+equations = { x = "v", v = "drive - d*v - x**3" }
+"""
+
+OWN_GRID = """
+kind = "sweep"
+title = "five attractors"
+{model}
+[parameters]
+frequency_hz = 0.15915494309189535
+[initial_conditions]
+kind = "grid"
+x = {{ start = -1.0, stop = 1.0, num = 6 }}
+v = {{ start = -0.5, stop = 1.0, num = 4 }}
+[integration]
+rtol = 1e-7
+atol = 1e-7
+n_transient = 20
+n_keep = 4
+[execution]
+trajectories_per_task = 8
+{more}
+"""
+
+OWN_MODULE = '''
+"""A damped oscillator under a cosine, x'' + d x' + x = cos(2 pi f t)."""
+
+from pathlib import Path
+
+from magpend_core.engine.jit import inline
+from magpend_core.engine.system import System
+from magpend_core.engine.vecmath import TWO_PI, sincos
+from magpend_core.models.model import Mirror, Model, Preset, Quantity, State
+from magpend_core.models.parameters import NON_NEGATIVE, Parameter
+
+with Path(__file__).with_name("imported").open("a") as trace:
+    trace.write("x")
+
+
+@inline
+def constants(frequency, p, out):
+    out[0] = p[0]
+    out[1] = TWO_PI * frequency
+
+
+@inline
+def forcing(t, c):
+    return sincos(c[1] * t)[1]
+
+
+@inline
+def rhs(y, u, c):
+    return y[1], u - c[0] * y[1] - y[0]
+
+
+@inline
+def jacobian(y, u, c):
+    zero = 0.0 * y[0]
+    return zero, zero + 1.0, zero - 1.0, zero - c[0]
+
+
+SYSTEM = System(
+    name="mine", state_names=("x", "v"), parameter_names=("d",), n_constants=2,
+    constants=constants, forcing=forcing, rhs=rhs, jacobian=jacobian,
+)
+MINE = Model(
+    name="mine",
+    title="an oscillator of one's own",
+    states=(State("x", "m", "place", rate="v"), State("v", "m/s", "velocity", escape=1e6)),
+    parameters=(Parameter("d", "1/s", "damping", NON_NEGATIVE),),
+    presets=(Preset("light", {"d": 0.1}, {"d": "chosen"}), Preset("heavy", {"d": 0.5}, {"d": "chosen"})),
+    system_path=f"{__name__}:SYSTEM",
+    sources=(),
+    section="the drive's maximum",
+    mirror=Mirror((-1, -1), half_period=True),
+)
+'''
+
+
+@pytest.fixture
+def own():
+    """A system of one's own, as text and as a Python module that leaves a trace when it is imported."""
+
+    def spec(model: str, more: str = "") -> str:
+        """A small sweep; `model` is a line, or a table, which goes last."""
+        is_table = model.lstrip().startswith("[")
+        line, end = ("", f"{more}\n{model}") if is_table else (model, more)
+        return OWN_GRID.format(model=line, more=end)
+
+    def write_module(folder: Path, name: str) -> Path:
+        """Write the module, and return the file that it leaves when it is imported."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.py").write_text(OWN_MODULE, "utf-8")
+        return folder / "imported"
+
+    return SimpleNamespace(text=OWN_TEXT, spec=spec, write_module=write_module)

@@ -21,7 +21,7 @@ variable                 dims                                  dtype, fill  mean
 ``decision``             parameter dims, start dims            int8, 0      how it was decided, see below
 ``status``               parameter dims, start dims            int8         as in the cube
 ``kind``                 parameter dims, attractor             int8, 0      0 absent, 1 closed orbit,
-                                                                            2 bounded set
+                                                                            2 bounded set, 3 equilibrium
 ``orbit_period``         parameter dims, attractor             int32, 0     drive periods; 0 absent or bounded
 ``n_cells``              parameter dims, attractor             int64, 0     cells
 ``share``                parameter dims, attractor             float64, 0   of all cells of the point
@@ -43,6 +43,9 @@ variable                 dims                                  dtype, fill  mean
 ``lyapunov_max``         parameter dims, attractor             float64, NaN largest exponent [1/s]; of bounded
                                                                             sets if the cube has the product
                                                                             ``lyapunov``
+``period_s``             parameter dims, attractor             float64, NaN period of a polished orbit [s]
+``eigenvalue_real``,     parameter dims, attractor, multiplier float64, NaN of an equilibrium [1/s], by
+``eigenvalue_imag``                                                         falling real part
 ======================== ===================================== ============ ==================================
 
 `attractor_points` are NaN beyond the attractor's own: a closed orbit's points in the order of time, or a
@@ -59,9 +62,10 @@ where that attractor is absent its row holds the fill values. `match` adds ``mat
 dims, attractor): what the id rests on there; `matching` says what an id is.
 
 `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the orbit, 3 approaching the
-orbit, 4 one of the set, 5 ended on the orbit when it was run on; `deciding.decide` has the criteria. A cell
-that is not bounded (diverged, step limit, pending, unreached) has the id -1, and its own `status`; a
-bounded one that belongs to nothing found (see `bounded.Rule`) has the id -1 and `decision` 0. Before a
+orbit, 4 one of the set, 5 ended on the orbit when it was run on, 6 at rest (see `equilibria`);
+`deciding.decide` has the criteria. A cell that is not bounded (diverged, step limit, pending,
+unreached, or without a return and yet not at rest) has the id -1, and its own `status`; a bounded one that
+belongs to nothing found (see `bounded.Rule`) has the id -1 and `decision` 0. Before a
 bounded set is named, the cells that come back near (`spirals`) and that no orbit accounts for are run on,
 2048 drive periods at most: a slow spiral is its orbit's, no set. A chaotic transient looks like a bounded
 set here: what it becomes takes a longer run, or `lifetimes`. An unstable orbit (`is_stable` 0) is listed
@@ -84,7 +88,9 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
+from pipeline.analysis.attractors.cycles import tell_cycles
 from pipeline.analysis.attractors.deciding import DECISIONS
+from pipeline.analysis.attractors.equilibria import tell_rest
 from pipeline.analysis.attractors.features import ENERGY, Features
 from pipeline.analysis.attractors.labelling import Found, conclude
 from pipeline.analysis.attractors.matching import match
@@ -92,7 +98,7 @@ from pipeline.analysis.attractors.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.attractors.searching import Search, search_all
 from pipeline.analysis.chaos.lyapunov import on_attractor
 from pipeline.analysis.sides import flags_of
-from pipeline.layout.vocabulary import BOUNDED_SET, split_dims
+from pipeline.layout.vocabulary import BOUNDED_SET, KINDS, split_dims
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.chaos import ChaosOptions
 
@@ -150,6 +156,12 @@ def identify(
     search = Search(options, tolerance, dynamics)
     found: dict[tuple[int, ...], Found] = {}
     for points in slabs(ds, dynamics, block_bytes):
+        if dynamics.can_rest:
+            tell_rest(points.values(), tolerance, dynamics.geometry)
+        if dynamics.can_rest and not dynamics.is_flow and options.polish:
+            tell_cycles(
+                points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry
+            )
         states = search_all(points, search)
         found |= {index: conclude(points[index], states[index], search) for index in points}
     return _with_exponents(_dataset(ds, found, search), ds)
@@ -244,11 +256,17 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "is_stable": ((), "int8", -1, "1", "whether all multipliers lie inside the unit circle, -1 not known"),
     "is_polished": ((), "int8", 0, "1", "whether Newton's method converged"),
     "lyapunov_max": ((), "float64", np.nan, "1/s", "largest Lyapunov exponent"),
+    "period_s": ((), "float64", np.nan, "s", "period of a polished orbit"),
+    "eigenvalue_real": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, real part"),
+    "eigenvalue_imag": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, imaginary part"),
 }  # fmt: skip
 """Own dims, dtype, fill, units and long name of the variables per attractor."""
 
 
-_ELSEWHERE = ("n_cells", "share", "attractor_points", "multiplier_real", "multiplier_imag")
+_ELSEWHERE = (
+    "n_cells", "share", "attractor_points", "multiplier_real", "multiplier_imag", "eigenvalue_real",
+    "eigenvalue_imag",
+)  # fmt: skip
 """Variables that are no attribute of `Features`."""
 
 
@@ -261,6 +279,7 @@ def _names(dynamics: Dynamics) -> list[str]:
         "mirror_": model is None or model.mirror is None,
         "side": model is None or model.classifier is None,
         "rotation": not dynamics.n_angles,
+        "eigenvalue_": model is None or not model.autonomous,
     }
     return [name for name in _TABLE if not any(name.startswith(k) and out for k, out in left_out.items())]
 
@@ -287,12 +306,15 @@ class _Table:
         if x.multipliers is not None:
             arrays["multiplier_real"][at] = x.multipliers.real
             arrays["multiplier_imag"][at] = x.multipliers.imag
+        if x.eigenvalues is not None and "eigenvalue_real" in arrays:
+            arrays["eigenvalue_real"][at] = x.eigenvalues.real
+            arrays["eigenvalue_imag"][at] = x.eigenvalues.imag
         for name in arrays.keys() - set(_ELSEWHERE):
             arrays[name][at] = getattr(x, name)
 
     def variables(self) -> dict[str, Any]:
         """As xarray takes them."""
-        more: dict[str, dict[str, Any]] = {"kind": _flags("absent closed_orbit bounded_set")}
+        more: dict[str, dict[str, Any]] = {"kind": _flags(" ".join(KINDS))}
         model = self._dynamics.model
         if "side" in self.arrays and model is not None and model.classifier is not None:
             more["side"] = flags_of(model.classifier)

@@ -21,6 +21,8 @@ class Block:
     section : ndarray, (cell, period_index, state)
     status, orbit_period : ndarray, (cell,)
     turns : ndarray, (cell, angle)
+    rest : ndarray, (cell, state), or None
+        States in which cells waited in vain for a return, if sections are crossings of a flow.
     """
 
     cells: slice
@@ -28,6 +30,7 @@ class Block:
     status: np.ndarray
     orbit_period: np.ndarray
     turns: np.ndarray
+    rest: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Block:
         """Cells by row; their places are no longer those of `cells`."""

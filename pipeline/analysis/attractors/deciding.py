@@ -21,8 +21,8 @@ STRICT = 1e-3
 LOOSE_SHARE = 0.1
 """Share of a tolerance above `STRICT` within which a closed cell counts as on an orbit at once."""
 
-DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "run_on")
-UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, RUN_ON = range(len(DECISIONS))
+DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "run_on", "at_rest")
+UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, RUN_ON, AT_REST = range(len(DECISIONS))
 """How a cell was decided: values of `decision`."""
 
 

@@ -19,18 +19,22 @@ import numpy as np
 
 from magpend_core.models.model import Mirror
 from magpend_core.models.parameters import Parameters
+from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import evaluate
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.bounded import mean_rotation
 from pipeline.analysis.attractors.cells import Block
+from pipeline.analysis.attractors.cycles import Cycle
+from pipeline.analysis.attractors.equilibria import Equilibrium
 from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points
 from pipeline.analysis.sides import UNKNOWN
+from pipeline.layout.vocabulary import CLOSED_ORBIT, EQUILIBRIUM
 
 ENERGY = "energy"
 """Quantity of a model of which attractors have ranges."""
 
 SAMPLES = 256
-"""Times per drive period at which a polished orbit is sampled for its ranges; even."""
+"""Times per drive period or return at which a polished orbit is sampled for its ranges; even."""
 
 RTOL = 1e-9
 """Tolerance of these trajectories: their errors stay far below what their sampling leaves open."""
@@ -119,6 +123,8 @@ class Features:
     is_polished: bool = False
     is_stable: int = -1
     lyapunov_max: float = np.nan
+    period_s: float = np.nan
+    eigenvalues: np.ndarray | None = None
     image: np.ndarray | None = None
     mirror_partner: int = -1
     mirror_distance: float = np.nan
@@ -136,25 +142,48 @@ def sides_of(
 
 
 def follow_orbit(found: Features, parameters: Parameters, frequency: float, geometry: Geometry) -> None:
-    """Fill in what the whole of a polished orbit shows: ranges, exact rotation, energy, image."""
-    p = found.orbit_period
+    """Fill in what the whole of a polished orbit shows: ranges, exact rotation, energy, image.
+
+    `frequency` is that of the drive, or the mean one of the returns [Hz].
+    """
+    p, flow = found.orbit_period, of_flow(parameters)
     times = np.arange(p * SAMPLES + 1) / (SAMPLES * frequency)
-    states = trajectory(parameters, frequency, found.points[0], times, rtol=RTOL, atol=RTOL)
+    states = trajectory(flow, frequency, found.points[0], times, rtol=RTOL, atol=RTOL)
     angles = np.flatnonzero(geometry.is_angle)
     turns = np.round((states[-1] - states[0])[angles] / TWO_PI)
     found.rotation = turns / p + 0.0  # no -0.0
     found.state_min, found.state_max = states.min(axis=0), states.max(axis=0)
     found.state_min[angles[turns != 0]], found.state_max[angles[turns != 0]] = -np.pi, np.pi
-    _fill_energy(found, times, states, parameters, frequency)
+    _fill_energy(found, times, states, flow, frequency)
     mirror = parameters.model.mirror
     if mirror is not None:
         first = SAMPLES // 2 if mirror.half_period else 0
         found.image = states[first : p * SAMPLES : SAMPLES] * np.array(mirror.signs)
 
 
+def fill_cycle(found: Features, cycle: Cycle) -> None:
+    """Fill in what is known of a limit cycle seen at even times: it has no section points of its own."""
+    found.kind, found.period_s, found.residual = CLOSED_ORBIT, cycle.seconds, cycle.residual
+    found.multipliers, found.is_stable, found.lyapunov_max = cycle.multipliers, 1, 0.0
+
+
+def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: int) -> Features:
+    """Describe an equilibrium: its exponents are the real parts of its eigenvalues."""
+    x = Features(
+        found.state[None], EQUILIBRIUM, 0, np.zeros(n_angles), UNKNOWN, found.state, found.state,
+        residual=found.residual, is_polished=True, is_stable=int(found.is_stable),
+        lyapunov_max=float(found.eigenvalues.real[0]), eigenvalues=found.eigenvalues,
+    )  # fmt: skip
+    if parameters is None:
+        return x
+    x.side = int(sides_of(x.points[None], np.zeros((1, n_angles), np.int64), np.inf, parameters)[0])
+    follow_points(x, parameters, 1.0)
+    return x
+
+
 def follow_points(found: Features, parameters: Parameters, frequency: float) -> None:
     """Fill in energy and image of a set from its stored points."""
-    _fill_energy(found, np.zeros(len(found.points)), found.points, parameters, frequency)
+    _fill_energy(found, np.zeros(len(found.points)), found.points, of_flow(parameters), frequency)
     mirror = parameters.model.mirror
     if mirror is None:
         return

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from magpend_core.multipliers import orbit_exponents
 from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors.bounded import Clouds, assign, find_sets
 from pipeline.analysis.attractors.cells import Block, marks_of
-from pipeline.analysis.attractors.deciding import CLOSED, RUN_ON, SAME_SET, UNDECIDED, decide
+from pipeline.analysis.attractors.deciding import AT_REST, CLOSED, RUN_ON, SAME_SET, UNDECIDED, decide
 from pipeline.analysis.attractors.features import Cells, Features
 from pipeline.analysis.attractors.orbits import Orbit, raw_orbit
 from pipeline.analysis.attractors.points import Point
@@ -60,7 +60,15 @@ def conclude(point: Point, state: State, search: Search) -> Found:
     orbits = [*state.orbits, *(raw_orbit(raw[g][2], search.geometry) for g in sorted(raw))]
     _label_sets(point, len(orbits), label, decision, search)
     label[label == UNSETTLED] = -1
-    return _describe(point, orbits, label, decision, search)
+    resting = first = int(label.max(initial=-1)) + 1
+    for told, known, code in (
+        (point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED),
+    ):  # fmt: skip
+        if told is not None:
+            own = told >= 0
+            label[own], decision[own] = first + told[own], code
+            first += len(known)
+    return _describe(point, orbits, resting, label, decision, search)
 
 
 def _label_spirals(
@@ -139,11 +147,15 @@ def _label_sets(point: Point, first: int, label: np.ndarray, decision: np.ndarra
 def _describe(
     point: Point,
     orbits: list[Orbit],
+    resting: int,
     label: np.ndarray,
     decision: np.ndarray,
     search: Search,
 ) -> Found:
-    """Features of all labels that have cells, and labels in canonical order."""
+    """Features of all labels that have cells, and labels in canonical order.
+
+    From `resting` on they are equilibria, and then limit cycles seen at even times.
+    """
     cells: dict[int, Cells] = {}
     for block in point.blocks():
         own = label[block.cells]
@@ -153,8 +165,15 @@ def _describe(
             found.add(block, np.flatnonzero(own == number), sides, search.geometry)
     features = {}
     for number, found in cells.items():
+        told = number - resting
+        if 0 <= told < len(point.equilibria):
+            rest = point.equilibria[told]
+            features[number] = feature.of_equilibrium(rest, point.parameters, point.n_angles)
+            continue
         orbit = orbits[number] if number < len(orbits) else None
         features[number] = _features(found, orbit, point, search)
+        if told >= 0:
+            feature.fill_cycle(features[number], point.cycles[told - len(point.equilibria)])
     numbers = list(features)
     order = [numbers[i] for i in order_by_points([features[n].points for n in numbers], search.geometry)]
     ranked = [features[n] for n in order]
@@ -183,12 +202,15 @@ def _features(cells: Cells, orbit: Orbit | None, point: Point, search: Search) -
     )  # fmt: skip
     if point.parameters is not None:
         found.side = cells.side(point.parameters, point.frequency)
+    frequency = point.frequency
     if orbit is not None and orbit.is_polished:
-        _fill_orbit(found, orbit, point.frequency)
+        is_flow = search.dynamics.is_flow
+        frequency = orbit.period / orbit.seconds if is_flow else frequency
+        _fill_orbit(found, orbit, is_flow)
     if point.parameters is None or not search.options.polish:
         return found
     if found.is_polished:
-        feature.follow_orbit(found, point.parameters, point.frequency, search.geometry)
+        feature.follow_orbit(found, point.parameters, frequency, search.geometry)
         turns = np.round(found.rotation * found.orbit_period).astype(np.int64)
         found.side = int(feature.sides_of(points[None], turns[None], point.frequency, point.parameters)[0])
     else:
@@ -196,10 +218,10 @@ def _features(cells: Cells, orbit: Orbit | None, point: Point, search: Search) -
     return found
 
 
-def _fill_orbit(found: Features, orbit: Orbit, frequency: float) -> None:
+def _fill_orbit(found: Features, orbit: Orbit, is_flow: bool) -> None:
     found.multipliers, found.residual, found.is_polished = orbit.multipliers, orbit.residual, True
     found.is_stable = int(orbit.is_stable)
-    largest = max(float(np.abs(orbit.multipliers[0])), 1e-300)
-    found.lyapunov_max = math.log(largest) * frequency / orbit.period
+    found.lyapunov_max = float(orbit_exponents(orbit.multipliers, orbit.seconds, is_flow)[0])
+    found.period_s = orbit.seconds
     # whole turns over its period: the cells' mean has not closed to the last digit
     found.rotation = np.round(found.rotation * orbit.period) / orbit.period + 0.0  # no -0.0

@@ -32,7 +32,7 @@ from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.connections import Connections, Place, connections, followable
 from pipeline.analysis.sets import Geometry, mean_distance, order_by_points
-from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of, parameters_of
+from pipeline.layout.vocabulary import frequency_of, model_of, parameters_of
 
 _PER_ATTRACTOR = "attractor"
 
@@ -168,8 +168,8 @@ def _connections(
     else:
         packed = np.array(base, np.float64)
     assert system is not None
-    frequency = attractors.coords.get(FREQUENCY_DIM)
-    fixed = float(frequency) if frequency is not None and not frequency.ndim else np.nan
+    model = base.model if isinstance(base, Parameters) else None
+    fixed = frequency_of(model, {str(k): v for k, v in attractors.coords.items() if not v.ndim})
     return connections(attractors, places, dims, packed, fixed, system)
 
 

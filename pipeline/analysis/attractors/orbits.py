@@ -37,16 +37,19 @@ class Orbit:
         Certificate of `polish_orbits`; NaN if not polished.
     derivative : ndarray, (state, state)
         Monodromy matrix at the first point; NaN if not polished.
+    seconds : float
+        Period [s]; NaN if not polished.
     """
 
     points: np.ndarray
     multipliers: np.ndarray
     residual: float
     derivative: np.ndarray
+    seconds: float = np.nan
 
     @property
     def period(self) -> int:
-        """Drive periods until the orbit closes."""
+        """Drive periods, or returns, until the orbit closes."""
         return len(self.points)
 
     @property
@@ -127,7 +130,8 @@ def polish(
         if again.converged[i]:
             in_time = np.concatenate([again.section[i][None], images[i][:-1]])
             residual = float(again.residual[i])
-            orbits[row] = Orbit(in_time, again.multipliers[i], residual, derivatives[i])
+            seconds = float(again.seconds[i])
+            orbits[row] = Orbit(in_time, again.multipliers[i], residual, derivatives[i], seconds)
     return orbits
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -13,9 +13,14 @@ import xarray as xr
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
+from magpend_core.status import Status
 from pipeline.analysis.attractors.cells import Block
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of, parameters_of, split_dims
+from pipeline.layout.vocabulary import FREQUENCY_DIM, frequency_of, model_of, parameters_of, split_dims
+
+if TYPE_CHECKING:
+    from pipeline.analysis.attractors.cycles import Cycle
+    from pipeline.analysis.attractors.equilibria import Equilibrium
 
 BUDGET = 256 * 2**20
 """Bytes of sections held at once."""
@@ -68,6 +73,16 @@ class Dynamics:
         return self.system
 
     @property
+    def can_rest(self) -> bool:
+        """Whether equilibria are told apart: of flows without a drive whose equations are integrated."""
+        return self.model is not None and self.model.autonomous and self.system is not None
+
+    @property
+    def is_flow(self) -> bool:
+        """Whether sections are crossings of a flow."""
+        return self.model is not None and self.model.crossing is not None
+
+    @property
     def n_angles(self) -> int:
         """Number of states on circles."""
         return sum(self.geometry.is_angle)
@@ -84,7 +99,17 @@ class Point:
     packed : ndarray
         The same as the engine takes them.
     frequency : float
-        Of the drive [Hz].
+        Of the drive [Hz]; of a flow seen at crossings one over the longest wait.
+    system : System or None
+        What is integrated.
+    equilibria : list of Equilibrium
+        Those that cells are at, see `equilibria.tell_rest`.
+    at_rest : ndarray, (cell,), or None
+        Which of them each cell is at, -1 for none: it is neither closed nor bounded then.
+    cycles : list of Cycle
+        Of a flow at even times: limit cycles that cells are on, see `cycles.tell_cycles`.
+    on_cycle : ndarray, (cell,), or None
+        Which of them each cell is on, likewise.
     """
 
     cube: xr.Dataset
@@ -94,6 +119,17 @@ class Point:
     parameters: Parameters | None
     n_angles: int
     block_cells: int
+    system: System | None = None
+    equilibria: list[Equilibrium] = field(default_factory=list)
+    at_rest: np.ndarray | None = None
+    cycles: list[Cycle] = field(default_factory=list)
+    on_cycle: np.ndarray | None = None
+
+    @property
+    def integrates(self) -> System:
+        """What is integrated; it must be there."""
+        assert self.system is not None
+        return self.system
 
     @property
     def n_cells(self) -> int:
@@ -123,12 +159,17 @@ class Point:
 
         section = values("section", "period_index", "state").astype(np.float64)
         turns = values("turns", ...) if "turns" in part else np.zeros((n, self.n_angles), np.int64)
-        return Block(cells, section, values("status"), values("orbit_period"), turns)
+        status = values("status")
+        for told in (self.at_rest, self.on_cycle):
+            if told is not None:
+                status = np.where(told[cells] >= 0, np.int8(Status.NO_RETURN), status)
+        rest = values("rest_state", "state") if "rest_state" in part else None
+        return Block(cells, section, status, values("orbit_period"), turns, rest)
 
 
 def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
     """Parameter points, some at a time: what fits is loaded at once, since chunks span many points."""
-    names = [n for n in ("section", "status", "orbit_period", "turns") if n in ds]
+    names = [n for n in ("section", "status", "orbit_period", "turns", "rest_state") if n in ds]
     cube = ds[names].reset_coords(drop=True) if FREQUENCY_DIM in ds.dims else ds[names]
     dims, start_dims = split_dims(ds["status"])
     shape = [ds.sizes[d] for d in dims]
@@ -158,15 +199,16 @@ def _point(
     one: xr.Dataset, start_dims: tuple[str, ...], values: Mapping[str, float], dynamics: Dynamics,
     block_cells: int,
 ) -> Point:  # fmt: skip
-    frequency, base = values.get(FREQUENCY_DIM, math.nan), dynamics.parameters
+    frequency, base = frequency_of(dynamics.model, values), dynamics.parameters
     if isinstance(base, Parameters):
         parameters = base.replace(**{name: value for name, value in values.items() if name in base})
         return Point(
-            one, start_dims, frequency, parameters.pack(), parameters, dynamics.n_angles, block_cells
-        )
+            one, start_dims, frequency, parameters.pack(), parameters, dynamics.n_angles, block_cells,
+            dynamics.system,
+        )  # fmt: skip
     names = dynamics.system.parameter_names if dynamics.system is not None else ()
     packed = np.zeros(len(names)) if base is None else np.array(base, np.float64)
     for name, value in values.items():
         if name in names:
             packed[names.index(name)] = value
-    return Point(one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells)
+    return Point(one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells, dynamics.system)

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
 
 from magpend_core.models.parameters import Parameters
+from magpend_core.models.sectioned import of_flow
+from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.vocabulary import CLOSED_ORBIT, FREQUENCY_DIM, parameters_of
+from pipeline.layout.vocabulary import (
+    BOUNDED_SET,
+    CLOSED_ORBIT,
+    EQUILIBRIUM,
+    frequency_of,
+    parameters_of,
+    told_by,
+)
 
 RTOL = 1e-9
 
@@ -35,15 +45,16 @@ def portraits(
         What was integrated; by default as the attributes say. Swept parameters replace those of the same
         name.
     n_samples
-        Samples per drive period.
+        Samples per drive period, or per return.
     n_periods
-        Drive periods of a bounded set, from its first stored point on.
+        Drive periods or returns of a bounded set, from its first stored point on.
 
     Returns
     -------
     Dataset
         Dim ``attractor`` runs over those present at the point. ``orbit`` (attractor, sample, state): states,
-        angles not wrapped, every 1 / (`n_samples` f) from a section on, NaN beyond the end; ``points``
+        angles not wrapped, every 1 / (`n_samples` f) from a section on, NaN beyond the end (of an equilibrium
+        after the first); ``points``
         (attractor, sample, place, axis): the moving points of the model's drawing, ``x`` to the right, ``y``
         upwards, in its unit, and ``fixed`` (fixed_place, axis), those that do not move, both absent if the
         model has no drawing; ``attractor_points``, ``share``, ``n_cells``, ``orbit_period``, ``kind`` and, if
@@ -61,31 +72,62 @@ def portraits(
     part = choose(attractors, at, tuple(start_dims(attractors)), "portraits are those of one parameter point")
     here = part.isel(attractor=np.flatnonzero(part["kind"].values > 0))
     values = {str(k): float(v) for k, v in here.coords.items() if not v.ndim and v.dtype.kind == "f"}
-    frequency = values.get(FREQUENCY_DIM)
-    if frequency is None:
-        raise ValueError("the dataset has no coordinate 'frequency' [Hz]; assign the drive frequency")
     base = parameters_of(attractors) if parameters is None else parameters
     base = base.replace(**{k: v for k, v in values.items() if k in base})
+    step = _step(here, base, frequency_of(base.model, values), n_samples)
     orbits = [
-        _orbit(here.isel(attractor=i), base, frequency, n_samples, n_periods)
+        _orbit(here.isel(attractor=i), base, step, n_samples, n_periods)
         for i in range(here.sizes["attractor"])
     ]
-    return _dataset(here, orbits, base, frequency, n_samples)
+    return _dataset(here, orbits, base, step)
+
+
+def _step(here: xr.Dataset, parameters: Parameters, frequency: float, n_samples: int) -> float:
+    """Time between two samples [s]: a part of the drive's period, or of a typical return.
+
+    Returns of a flow are not of one length: all attractors are sampled alike, by the shortest return of a
+    closed orbit, else by that of the first set.
+    """
+    if np.isnan(frequency):
+        raise ValueError("the dataset has no coordinate 'frequency' [Hz]; assign the drive frequency")
+    if parameters.model.crossing is None:
+        return 1.0 / (n_samples * frequency)
+    per_return = (here["period_s"] / here["orbit_period"].where(here["orbit_period"] > 0)).values
+    if np.isfinite(per_return).any():
+        return float(np.nanmin(per_return)) / n_samples
+    moving = here["kind"].values == BOUNDED_SET
+    starts = here["attractor_points"].transpose("attractor", "point", "state").values[moving, 0]
+    if not len(starts):
+        return 0.1 / (n_samples * frequency)
+    return _mean_return(starts[:1], parameters, frequency) / n_samples
+
+
+def _mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) -> float:
+    """Mean time between some crossings [s]."""
+    result = run_branches(
+        parameters.pack()[None, None], np.full((1, 1), frequency), starts, n_transient=0, n_keep=16,
+        rtol=RTOL, atol=RTOL, system=parameters.model.system,
+    )  # fmt: skip
+    assert result.return_time is not None
+    found = float(result.return_time.mean())
+    return found if np.isfinite(found) else 0.1 / frequency
 
 
 def _orbit(
-    one: xr.Dataset, parameters: Parameters, frequency: float, n_samples: int, n_periods: int
+    one: xr.Dataset, parameters: Parameters, step: float, n_samples: int, n_periods: int
 ) -> np.ndarray:
-    closed = int(one["kind"]) == CLOSED_ORBIT
-    periods = int(one["orbit_period"]) if closed else n_periods
-    times = np.arange(periods * n_samples + 1) / (n_samples * frequency)
     start = one["attractor_points"].transpose("point", "state").values[0]
-    return trajectory(parameters, frequency, start, times, rtol=RTOL, atol=RTOL)
+    kind, periods = int(one["kind"]), int(one["orbit_period"])
+    n = n_samples * (periods if kind == CLOSED_ORBIT else n_periods)
+    if kind == EQUILIBRIUM:
+        return np.asarray(start[None])
+    if kind == CLOSED_ORBIT and (parameters.model.crossing is not None or not periods):
+        n = math.ceil(float(one["period_s"]) / step)
+    times = np.arange(n + 1) * step
+    return trajectory(of_flow(parameters), 1.0 / (step * n_samples), start, times, rtol=RTOL, atol=RTOL)
 
 
-def _dataset(
-    here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters, frequency: float, n_samples: int
-) -> xr.Dataset:
+def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters, step: float) -> xr.Dataset:
     length = max((len(o) for o in orbits), default=0)
     table = np.full((len(orbits), length, len(parameters.model.states)), np.nan)
     for row, orbit in zip(table, orbits, strict=True):
@@ -95,10 +137,10 @@ def _dataset(
         orbit=(("attractor", "sample", "state"), table,
                {"units": "see state_units", "long_name": "motion on the attractor"}),
     )  # fmt: skip
-    time = np.arange(length) / (n_samples * frequency)
+    time = np.arange(length) * step
     result = result.assign_coords(time=("sample", time, {"units": "s", "long_name": "time"}))
     result.attrs = {
-        **{name: here.attrs[name] for name in ("model", "parameters") if name in here.attrs},
+        **told_by(here.attrs),
         "title": "portraits of attractors",
     }
     return _drawn(result, table, parameters)

@@ -15,6 +15,8 @@ from pipeline.analysis.tabular import (
     where_of,
     words_of,
 )
+from pipeline.layout.vocabulary import model_of
+from pipeline.layout.words import periods_of
 from pipeline.products.product import Table
 
 
@@ -46,7 +48,7 @@ def settling_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     n = ds.attrs["lifetimes_n_periods"]
     if not rows:
         return ["bounded sets: none, so there is nothing to run on"]
-    lines = [f"bounded sets: {len(rows)}; run on for {n} drive periods, which lifetimes are in"]
+    lines = [f"bounded sets: {len(rows)}; run on for {n} {periods_of(model_of(ds))}, which lifetimes are in"]
     dims = [str(d) for d in ds["verdict"].dims if d != "attractor"]
     table = []
     for row in rows:

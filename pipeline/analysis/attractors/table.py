@@ -72,6 +72,7 @@ def _attractor(one: xr.Dataset) -> Row:
         "attractor_id": int(one["attractor"]),
         "kind": words_of(one["kind"])[int(one["kind"])],
         "orbit_period": int(one["orbit_period"]),
+        "period_s": float(one["period_s"]),
     }
     if "side" in one:
         row["side"] = words_of(one["side"])[int(one["side"])]
@@ -81,6 +82,9 @@ def _attractor(one: xr.Dataset) -> Row:
         row |= {f"rotation_{n}": float(v) for n, v in zip(names, one["rotation"].values, strict=True)}
     row["multiplier_modulus"] = float(largest[0]) if np.isfinite(largest).any() else np.nan
     row["is_stable"] = int(one["is_stable"])
+    if "eigenvalue_real" in one:
+        row["eigenvalue_real"] = float(one["eigenvalue_real"][0])
+        row["eigenvalue_imag"] = float(np.abs(one["eigenvalue_imag"][0]))
     if "mirror_partner" in one:
         row["mirror_partner"] = int(one["mirror_partner"])
         row["mirror_distance"] = float(one["mirror_distance"])
@@ -115,11 +119,16 @@ def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
         "kind": row["kind"].replace("_", " "),
         "period": str(row["orbit_period"] or "-"),
     }
+    if "eigenvalue_real" in row:  # a flow: returns are not of one length
+        words["seconds"] = number(row["period_s"], ".6g")
     if "side" in row:
         words["side"] = row["side"]
     if turns:
         words["rotation"] = " ".join(f"{round(v, 3) + 0.0:.3f}" for v in turns)
-    words |= {"|multiplier|": number(row["multiplier_modulus"], ".4f"), "cells": str(row["n_cells"])}
+    words["|multiplier|"] = number(row["multiplier_modulus"], ".4g" if "eigenvalue_real" in row else ".4f")
+    if "eigenvalue_real" in row:
+        words["eigenvalue"] = _eigenvalue(row)
+    words["cells"] = str(row["n_cells"])
     if "fraction" in row:
         words["share"] = with_interval(row)
     if "mirror_partner" in row:
@@ -130,12 +139,23 @@ def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
     return words | {"decided": decided}
 
 
+def _eigenvalue(row: Row) -> str:
+    """The leading eigenvalue of an equilibrium [1/s]."""
+    if not np.isfinite(row["eigenvalue_real"]):
+        return "-"
+    imaginary = f" \u00b1 {row['eigenvalue_imag']:.4g}i" if row["eigenvalue_imag"] else ""
+    return f"{row['eigenvalue_real']:.4g}{imaginary}"
+
+
 def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
     words = {
         "id": str(rows[0]["attractor_id"]),
         "kind": distinct(r["kind"].replace("_", " ") for r in rows),
         "periods": distinct(r["orbit_period"] for r in rows if r["orbit_period"]) or "-",
     }
+    if "eigenvalue_real" in rows[0]:
+        seconds = [r["period_s"] for r in rows if np.isfinite(r["period_s"])]
+        words["seconds"] = f"{min(seconds):.4g} to {max(seconds):.4g}" if seconds else "-"
     if "side" in rows[0]:
         words["side"] = distinct(r["side"] for r in rows)
     words |= {**ranges(ds, rows, dims), "cells": str(sum(r["n_cells"] for r in rows))}

@@ -4,7 +4,8 @@
     branches = explore(starts, Scope(2.0, 3.0))
     ds = dataset_of(branches, "frequency", parameters, left_out)
 
-An orbit of period p is a fixed point of the p-fold stroboscopic map; its branch is followed by
+An orbit of period p is a fixed point of the p-fold stroboscopic map, or of the p-fold return map of a flow
+seen at crossings (`magpend_core.orbits` has its derivative); its branch is followed by
 pseudo-arclength continuation, whether it is stable or not. `problems` has the equations, `lockstep`
 evaluates many of them in one call of the engine, `arclength` traces, `bifurcations` notices and locates,
 `following` makes one branch, `exploring` all that hang together, `curves` continues located points in two
@@ -65,14 +66,18 @@ variable                          dims                     meaning
 ``n_unstable``                    branch, point            multipliers outside the unit circle
 ``side``                          branch, point            class of the motion, from the whole orbit
 ``residual``                      branch, point            scaled distance of the point from its image
-``orbit_period``, ``n_points``    branch                   drive periods; points
+``period_s``                      branch, point            period of the orbit [s]
+``orbit_period``, ``n_points``    branch                   drive periods or returns; points
 ``origin``                        branch                   bifurcation that it sprang from, -1 none
 ``first_end``, ``last_end``       branch                   why it ends: at a bound of the parameter, closed on
                                                            itself, on the orbit of half the period, after too
                                                            many points, stuck (Newton's method fails for the
-                                                           shortest step), start (it sprang off there)
-``frequency``                     branch                   drive frequency, NaN if that is the parameter
-``rotation``                      branch, angle            mean turns per drive period
+                                                           shortest step), start (it sprang off there),
+                                                           equilibrium (a cycle of a flow that shrinks to a
+                                                           point there, as at a Hopf bifurcation)
+``frequency``                     branch                   drive frequency, NaN if that is the parameter; a
+                                                           flow has none
+``rotation``                      branch, angle            mean turns per drive period or return
 ``kind``, ``value``, ``bracket``  bifurcation              what, where, between parameter values how far apart
 ``of_branch``, ``after``          bifurcation              its branch, and the point after which it comes
 ``to_branch``                     bifurcation              the other branch through it, -1 none or unknown
@@ -85,6 +90,7 @@ variable                          dims                     meaning
 ``bifurcation_section``           bifurcation, phase,      the orbit
                                   state
 ``bifurcation_side``              bifurcation              its side
+``bifurcation_period_s``          bifurcation              its period [s]
 ================================= ======================== ===================================================
 """
 

@@ -17,6 +17,7 @@ from pipeline.analysis.branches.following import opposite
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, BifurcationProblem, Family
 from pipeline.analysis.branches.units import parameter_units, state_units
+from pipeline.layout.vocabulary import frequency_of
 
 CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-8, max_iterations=8)
 """Steps are longer than on a branch, since nothing is looked for between; the residual, with that of the
@@ -119,7 +120,7 @@ def _starts(
         if period > max_period or kind not in TESTS:
             continue
         own = parameters.replace(**{n: float(ds[n][branch]) for n in parameters.names if n in ds})
-        frequency = float(ds[FREQUENCY][branch])
+        frequency = float(ds[FREQUENCY][branch]) if FREQUENCY in ds else frequency_of(parameters.model, {})
         family = Family(
             parameters.model.system,
             period,

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.branches.bifurcations import KINDS, Bifurcation, multipliers_of, n_unstable
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.motion import rotation_of, sides_of
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.branches.units import parameter_units, state_units
+from pipeline.layout.vocabulary import model_attribute, section_attributes
+from pipeline.layout.words import period_of, periods_of
 
 CRITICALITIES = ("", "supercritical", "subcritical")
 
@@ -55,7 +58,7 @@ def dataset_of(
     events = [(i, b) for i, branch in enumerate(branches) for b in branch.bifurcations]
     states = state_units(model)
     variables = arrays.variables(parameter_units(parameter, model), states)
-    variables |= _per_branch(branches, events, n_angles) | _per_event(
+    variables |= _per_branch(branches, events, n_angles, model) | _per_event(
         branches, events, longest, names, states
     )
     variables |= _fixed(branches, parameter, parameters)
@@ -65,7 +68,9 @@ def dataset_of(
     result = xr.Dataset(variables).rename({"angle": angle_dim} if angle_dim != "angle" else {})
     result = result.assign_coords(state=("state", list(names), {"long_name": "component of the state"}))
     if model is not None:
-        result = result.assign_coords({angle_dim: list(model.angles)}).assign_attrs(model=model.name)
+        result = result.assign_coords({angle_dim: list(model.angles)}).assign_attrs(
+            model=model_attribute(model), **section_attributes(model.crossing)
+        )
     return result.assign_attrs(
         parameter=parameter, parameter_units=parameter_units(parameter, model), left_out="\n".join(left_out)
     )
@@ -114,6 +119,7 @@ class _Arrays:
         self.n_unstable = np.full(shape, -1, np.int8)
         self.side = np.zeros(shape, np.int8)
         self.residual = np.full(shape, np.nan)
+        self.period_s = np.full(shape, np.nan)
 
     def put(self, i: int, j: int, branch: Branch, point: Any) -> None:
         """Write point number `j` of branch number `i`."""
@@ -122,6 +128,7 @@ class _Arrays:
         self.multiplier[i, j] = multipliers_of(point)
         self.n_unstable[i, j] = n_unstable(point)
         self.residual[i, j] = point.residual
+        self.period_s[i, j] = point.value.seconds
 
     def variables(self, units: str, state_units: str) -> dict[str, Any]:
         """As xarray takes them; `units` are those of the parameter."""
@@ -153,6 +160,7 @@ class _Arrays:
                 self.residual,
                 {"units": "1", "long_name": "scaled distance of the point from its image"},
             ),
+            "period_s": (dims, self.period_s, {"units": "s", "long_name": "period of the orbit"}),
         }
 
 
@@ -171,25 +179,27 @@ def _column(values: Any, dtype: str, long_name: str, **attrs: Any) -> tuple[np.n
 
 
 def _per_branch(
-    branches: Sequence[Branch], events: Sequence[tuple[int, Bifurcation]], n_angles: int
+    branches: Sequence[Branch], events: Sequence[tuple[int, Bifurcation]], n_angles: int, model: Model | None
 ) -> dict[str, Any]:
     numbers = {id(b): k for k, (_, b) in enumerate(events)}
     periods = [b.family.period for b in branches]
     frequencies = [np.nan if FREQUENCY in b.family.free else b.family.frequency_hz for b in branches]
     first, last = ([ENDS.index(b.ends[i]) for b in branches] for i in (0, 1))
     columns = {
-        "orbit_period": _column(periods, "int32", "period in drive periods"),
+        "orbit_period": _column(periods, "int32", f"period in {periods_of(model)}"),
         "n_points": _column([len(b.points) for b in branches], "int32", "points of the branch"),
         "origin": _column(
             [numbers.get(id(b.origin), -1) for b in branches], "int32", "bifurcation it sprang from, -1 none"
         ),
         "first_end": _column(first, "int8", "why it begins", **_flags(ENDS)),
         "last_end": _column(last, "int8", "why it ends", **_flags(ENDS)),
-        FREQUENCY: _column(frequencies, "float64", "drive frequency, NaN if it varies", units="Hz"),
     }
+    if model is None or model.crossing is None:
+        about = "drive frequency, NaN if it varies"
+        columns[FREQUENCY] = _column(frequencies, "float64", about, units="Hz")
     found: dict[str, Any] = {name: ("branch", *column) for name, column in columns.items()}
     turns = np.array([rotation_of(b) for b in branches]).reshape(len(branches), n_angles)
-    found["rotation"] = (("branch", "angle"), *_column(turns, "float64", "turns per drive period"))
+    found["rotation"] = (("branch", "angle"), *_column(turns, "float64", f"turns per {period_of(model)}"))
     return found
 
 
@@ -214,6 +224,9 @@ def _per_event(
     columns = {
         "kind": _column(kinds, "int8", "kind of bifurcation", **_flags(KINDS)),
         "value": _column(values, "float64", "parameter value of the bifurcation"),
+        "bifurcation_period_s": _column(
+            [b.point.value.seconds for b in ones], "float64", "period of the orbit there", units="s"
+        ),
         "bracket": _column([b.bracket for b in ones], "float64", "width of the bracket in the parameter"),
         "of_branch": _column([i for i, _ in events], "int32", "branch on which it lies"),
         "after": _column([b.after for b in ones], "int32", "point of the branch that it comes after"),

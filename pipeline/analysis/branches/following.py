@@ -7,12 +7,18 @@ from itertools import product
 
 import numpy as np
 
+from magpend_core.orbits import crossed_state
+from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import FOLD, Bifurcation, Watch
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import Family, OrbitProblem
 
-ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start")
+ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium")
+
+REST = 0.01
+"""A cycle has shrunk to an equilibrium where its period, at the speed with which it crosses the section,
+would carry it no farther than this [scales of the state that crosses]."""
 
 
 @dataclass(eq=False)
@@ -65,6 +71,8 @@ class _Stop:
             return "bound"
         if self._is_closed(points):
             return "closed"
+        if reach(self.family, here) < REST:
+            return "equilibrium"
         return "period_halving" if len(points) > 2 and has_halved(self.family, points) else ""
 
     def _is_closed(self, points: list[Point]) -> bool:
@@ -86,6 +94,16 @@ class _Stop:
     def _difference(self, state: np.ndarray, parameter: float, u: np.ndarray) -> np.ndarray:
         """Scaled unknowns of a state and parameter minus `u`."""
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
+
+
+def reach(family: Family, point: Point) -> float:
+    """Scaled distance that the crossing state would go in a period at its speed; infinite with a drive."""
+    crossed = crossed_state(family.system)
+    if crossed is None:
+        return np.inf
+    rows = family.rows(point.u[None])
+    rates = rates_packed(family.system, rows.states, rows.parameters, rows.frequency_hz)
+    return float(abs(rates[0, crossed]) * point.value.seconds / family.system.scales[crossed])
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:
@@ -130,6 +148,9 @@ def half_branch(
         yield from _cut(problem, found, low, high, settings)
         inside = [low <= family.values(b.point.u)[0] <= high for b in watch.found]
         watch.found = [b for b, good in zip(watch.found, inside, strict=True) if good]
+    elif found.end == "equilibrium":
+        # the map is not smooth where the orbit shrinks to a point of the section
+        watch.found = [b for b in watch.found if b.after < n_last]
     elif found.end == "period_halving":
         # the half-period orbit is a singular point of these equations: what was located there is it
         found.points.pop()

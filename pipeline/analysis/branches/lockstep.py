@@ -7,7 +7,6 @@ for little more than the price of one. The numbers of each are those that it wou
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -16,8 +15,7 @@ import numpy as np
 
 from magpend_core.engine.simd import WIDTH
 from magpend_core.engine.system import System
-from magpend_core.engine.variational import with_tangents
-from magpend_core.sections import run_branches
+from magpend_core.orbits import section_map
 from pipeline.analysis.branches.problems import RTOL, Ends, Problem, Rows, Value
 from pipeline.products.reporting import report
 
@@ -112,29 +110,17 @@ def _calls(rows: Sequence[Rows], systems: Sequence[System]) -> list[list[int]]:
 
 
 def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
-    n = system.n_states
-    states = np.concatenate([r.states for r in rows])
-    finite = np.isfinite(states).all(axis=1)
-    identity = np.broadcast_to(np.eye(n).ravel(), (len(states), n * n))
-    # tangents in the error control: else a corner in the Jacobian leaves an error in the multipliers that
-    # the tolerance does not bound
-    extended = dataclasses.replace(with_tangents(system, n), n_controlled=None)
-    result = run_branches(
-        np.concatenate([r.parameters for r in rows])[:, None],
-        np.concatenate([r.frequency_hz for r in rows])[:, None],
-        np.concatenate([np.where(finite[:, None], states, 0.0), identity], axis=1),
-        n_transient=0,
-        n_keep=max(r.period for r in rows),
+    ends = section_map(
+        np.concatenate([r.parameters for r in rows]),
+        np.concatenate([r.frequency_hz for r in rows]),
+        np.concatenate([r.states for r in rows]),
+        np.concatenate([np.full(len(r.states), r.period) for r in rows]),
         rtol=RTOL,
-        atol=RTOL,
-        system=extended,
+        system=system,
     )
-    section = result.section[:, 0]
     found, first = [], 0
     for r in rows:
-        own = section[first : first + len(r.states), : r.period]
+        own = slice(first, first + len(r.states))
+        found.append(Ends(ends.images[own, : r.period], ends.derivatives[own], ends.times[own, : r.period]))
         first += len(r.states)
-        # tangent vector k, the derivative by state k, is a column
-        monodromy = own[:, -1, n:].reshape(-1, n, n).transpose(0, 2, 1)
-        found.append(Ends(own[:, :, :n], monodromy))
     return found

@@ -11,6 +11,8 @@ import numpy as np
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.model import Classifier
 from magpend_core.models.parameters import Parameters
+from magpend_core.models.sectioned import of_flow
+from magpend_core.orbits import on_section
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.branches.following import Branch
@@ -18,7 +20,7 @@ from pipeline.analysis.branches.problems import FREQUENCY, RTOL
 from pipeline.products.reporting import track
 
 SAMPLES = 64
-"""Instants per drive period at which the side of an orbit is judged."""
+"""Instants per drive period or return at which the side of an orbit is judged."""
 
 
 def sides_of(branches: Sequence[Branch], base: Parameters) -> list[np.ndarray]:
@@ -46,8 +48,10 @@ def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarr
         value = float(family.values(point.u)[0])
         frequency = value if name == FREQUENCY else family.frequency_hz
         parameters = own if name == FREQUENCY else own.replace(**{name: value})
+        if base.model.crossing is not None:
+            frequency = family.period / point.value.seconds
         times = np.arange(family.period * SAMPLES + 1) / (SAMPLES * frequency)
-        states = trajectory(parameters, frequency, family.state(point.u), times)
+        states = trajectory(of_flow(parameters), frequency, family.state(point.u), times)
         turns = np.round((states[-1, angles] - states[0, angles]) / (2.0 * np.pi)).astype(np.int64)
         found[j] = classifier.classify(states, turns, _SEEN_WHOLE, _values(parameters))
     return found
@@ -62,7 +66,7 @@ def _values(parameters: Parameters) -> Mapping[str, Any]:
 
 
 def rotation_of(branch: Branch) -> np.ndarray:
-    """Mean turns per drive period of each angle, from the branch's first orbit."""
+    """Mean turns per drive period or return of each angle, from the branch's first orbit."""
     family = branch.family
     if not any(family.system.is_angle):
         return np.zeros(0)
@@ -71,7 +75,8 @@ def rotation_of(branch: Branch) -> np.ndarray:
     # the extended system, since that code is compiled already
     extended = dataclasses.replace(with_tangents(family.system, n), n_controlled=None)
     result = run_branches(
-        rows.parameters[:, None], rows.frequency_hz[:, None], np.append(rows.states[0], np.eye(n))[None],
+        rows.parameters[:, None], rows.frequency_hz[:, None],
+        np.append(on_section(rows.states[0], rows.parameters[0], family.system), np.eye(n))[None],
         n_transient=0, n_keep=family.period + 1, rtol=RTOL, atol=RTOL, system=extended,
     )  # fmt: skip
     return np.asarray(result.turns[0, 0] / family.period, np.float64)

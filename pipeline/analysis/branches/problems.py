@@ -42,13 +42,16 @@ class Ends:
     Attributes
     ----------
     images : ndarray, (m, period, n_states)
-        Sections after 1, 2, ... drive periods.
+        Sections after 1, 2, ... drive periods or returns.
     monodromy : ndarray, (m, n_states, n_states)
         Derivative of the last image by the start.
+    times : ndarray, (m, period)
+        How long each took [s].
     """
 
     images: np.ndarray
     monodromy: np.ndarray
+    times: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +66,16 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """A problem at some `u`: F (m,), its derivative (m, m + 1), and what the orbit looks like there."""
+    """A problem at some `u`: F (m,), its derivative (m, m + 1), and what the orbit looks like there.
+
+    `seconds` is the orbit's period.
+    """
 
     residual: np.ndarray
     derivative: np.ndarray
     images: np.ndarray
     monodromy: np.ndarray
+    seconds: float = np.nan
 
     @property
     def is_finite(self) -> bool:
@@ -102,7 +109,7 @@ class Family:
     ----------
     system : System
     period : int
-        In drive periods.
+        In drive periods or returns.
     frequency_hz : float
         Used unless it is free.
     parameters : ndarray
@@ -165,7 +172,7 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class OrbitProblem:
-    """Fixed points of the p-fold stroboscopic map, with one free parameter."""
+    """Fixed points of the p-fold stroboscopic or return map, with one free parameter."""
 
     family: Family
 
@@ -191,7 +198,8 @@ class OrbitProblem:
         last = [self.family.mismatch(u, image) for image in ends.images[:, -1]]
         slope = _wrapped(last[1] - last[2], self.family) / (2.0 * PARAMETER_STEP)
         matrix = self.family.scaled(ends.monodromy[0]) - np.eye(n)
-        return Value(last[0], np.column_stack([matrix, slope]), ends.images[0], ends.monodromy[0])
+        derivative = np.column_stack([matrix, slope])
+        return Value(last[0], derivative, ends.images[0], ends.monodromy[0], float(ends.times[0].sum()))
 
 
 def _wrapped(difference: np.ndarray, family: Family) -> np.ndarray:
@@ -270,5 +278,6 @@ class BifurcationProblem:
         )
         gradient = (tests[1 : 1 + size] - tests[1 + size :]) / (2.0 * self._steps)
         return Value(
-            np.append(mismatch[0], tests[0]), np.vstack([matrix, gradient]), ends.images[0], ends.monodromy[0]
-        )
+            np.append(mismatch[0], tests[0]), np.vstack([matrix, gradient]), ends.images[0],
+            ends.monodromy[0], float(ends.times[0].sum()),
+        )  # fmt: skip

@@ -18,8 +18,25 @@ LEAST_PERIOD = 4
 
 def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
     """Complete the interval from the run's axis; refuse an empty one."""
-    low, high = _interval(run, options.parameter, options.low, options.high)
-    return options.model_copy(update={"low": low, "high": high})
+    parameter = _followed(run, options)
+    low, high = _interval(run, parameter, options.low, options.high)
+    return options.model_copy(update={"parameter": parameter, "low": low, "high": high})
+
+
+def _followed(run: Run, options: BranchOptions) -> str:
+    """The parameter to follow: what the run sweeps, if that is no frequency and no interval is given."""
+    from pipeline.spec.problems import SpecError
+
+    parameter, is_flow = options.parameter, run.model.crossing is not None
+    if axis_name(parameter) != FREQUENCY_DIM or _axis(run, parameter) is not None:
+        return parameter
+    swept = [name for name in run.spec.axes if _axis(run, name) is not None]
+    if not is_flow and (len(swept) != 1 or not (options.low is None or options.high is None)):
+        return parameter
+    if len(swept) != 1:
+        known = ", ".join(swept or run.model.parameter_names)
+        raise SpecError([f"{run.model.name} has no drive's frequency to follow; give --parameter: {known}."])
+    return swept[0]
 
 
 def branches(run: Any, options: BranchOptions) -> xr.Dataset:
@@ -51,7 +68,7 @@ def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
 
     settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
     second = options.second
-    if axis_name(second) == axis_name(options.parameter):
+    if axis_name(second) == axis_name(settled.parameter):
         raise SpecError([f"{second} is the branches' own parameter; give another one."])
     if _axis(run, second) is not None:
         raise SpecError(

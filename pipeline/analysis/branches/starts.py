@@ -13,7 +13,7 @@ from magpend_core.models.parameters import Parameters
 from magpend_core.orbits import polish_orbits, scaled_distance, stroboscopic_map
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.layout.vocabulary import BOUNDED, is_start_dim
+from pipeline.layout.vocabulary import BOUNDED, CLOSED_ORBIT, EQUILIBRIUM, frequency_of, is_start_dim
 
 CLOSE = 0.1
 """Largest scaled distance of a recurrence that is worth a try."""
@@ -30,6 +30,8 @@ class Listed:
     where: Mapping[str, float]
     period: int
     start: Start | None
+    is_rest: bool = False
+    is_cycle: bool = False
 
 
 def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float) -> Iterator[Listed]:
@@ -51,12 +53,14 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
         where = {d: float(point[d]) for d in _dims(attractors)}
         for i in np.flatnonzero(point["kind"].values > 0):
             one = point.isel(attractor=int(i))
-            period, start = int(one["orbit_period"]), None
+            kind, period, start = int(one["kind"]), int(one["orbit_period"]), None
             if int(one["is_polished"]) and period >= 1:
                 family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
                 state = np.asarray(one["attractor_points"].values[0])
                 start = Start(family, state, value_of(family, frequency, packed))
-            yield Listed(int(i), where, period, start)
+            yield Listed(
+                int(i), where, period, start, kind == EQUILIBRIUM, kind == CLOSED_ORBIT and not period
+            )
 
 
 def attracting(
@@ -103,6 +107,10 @@ def attracting(
 
 def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str:
     """Why an attractor is no start, empty if it is one."""
+    if one.is_rest:
+        return "an equilibrium, no closed orbit"
+    if one.is_cycle:
+        return "a limit cycle seen at even times; see it at crossings: [section] of a new run"
     if not one.period:
         return "a bounded set, no closed orbit; --recurrences P starts from orbits that it comes near"
     if one.start is None:
@@ -157,7 +165,7 @@ def _points(ds: xr.Dataset) -> list[xr.Dataset]:
 def _parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarray]:
     """Frequency and packed parameters of a point of the cube."""
     axes = {n: float(point.coords[n]) for n in base.names if n in point.coords and not point.coords[n].dims}
-    return float(point.coords["frequency"]), base.replace(**axes).pack()
+    return frequency_of(base.model, {str(k): v for k, v in point.coords.items()}), base.replace(**axes).pack()
 
 
 def recurrent(

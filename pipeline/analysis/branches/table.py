@@ -10,7 +10,7 @@ import xarray as xr
 
 from pipeline.analysis.branches.bifurcations import FOLD
 from pipeline.analysis.branches.problems import FREQUENCY
-from pipeline.layout.vocabulary import parameter_name
+from pipeline.layout.vocabulary import model_of, parameter_name
 from pipeline.products.product import Table
 
 Row = dict[str, Any]
@@ -60,6 +60,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
                 "multiplier_imag": float(one["critical_imag"]),
                 "unstable_below": below,
                 "unstable_above": above,
+                "period_s": float(one["bifurcation_period_s"]),
                 **fixed_of(ds, branch),
                 "branch": branch,
                 "to_branch": int(one["to_branch"]),
@@ -71,7 +72,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
 def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
     """Where a branch lies in the parameters that it does not follow: the frequency, and what differs."""
     parameter = str(ds.attrs["parameter"])
-    names = [FREQUENCY] if parameter != FREQUENCY else []
+    names = [FREQUENCY] if parameter != FREQUENCY and FREQUENCY in ds else []
     names += [str(n) for n in ds.data_vars if str(ds[n].attrs.get("long_name", "")) == f"value of {n}"]
     return {parameter_name(n): float(ds[n].values[branch]) for n in names}
 
@@ -94,10 +95,13 @@ def _lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
         z = complex(row["multiplier_real"], row["multiplier_imag"])
         known = {
             _with_unit(ds): f"{row[parameter]:.7f}", "type": row["type"], "criticality": row["criticality"],
-            "period": str(row["period"]), "side": row.get("side", ""), "multiplier": _number(z),
+            "period": str(row["period"]), "seconds": f"{row['period_s']:.6g}", "side": row.get("side", ""),
+            "multiplier": _number(z),
             "unstable below, above": f"{row['unstable_below']}, {row['unstable_above']}",
             "branch": f"{row['branch']}{to}{_at(ds, row['branch'])}",
         }  # fmt: skip
+        if model_of(ds).crossing is None:  # as many periods of the drive
+            known.pop("seconds")
         table.append(known if "side" in row else {n: v for n, v in known.items() if n != "side"})
     return _aligned(table)
 

@@ -137,7 +137,8 @@ def reasons(ds: xr.Dataset, stride: int = 1) -> list[str]:
 def _of_exponents(ds: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
     summary = summarise(ds, n_sigma=options.n_sigma, least=options.least).drop_vars("lyapunov_running")
     own = ds[["lyapunov", "lyapunov_stderr", "lyapunov_flag"]]
-    return own.assign(summary.data_vars).assign(kaplan_yorke_dimension(ds).data_vars)
+    dimension = kaplan_yorke_dimension(ds, flow="return_time" in ds)
+    return own.assign(summary.data_vars).assign(dimension.data_vars)
 
 
 def _without_exponents(ds: xr.Dataset) -> xr.Dataset:

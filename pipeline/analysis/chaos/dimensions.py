@@ -21,7 +21,7 @@ from pipeline.products.reporting import track
 
 
 def kaplan_yorke_dimension(
-    ds: xr.Dataset, *, name: str = "lyapunov", dim: str = "exponent", zero: float = 0.0
+    ds: xr.Dataset, *, name: str = "lyapunov", dim: str = "exponent", zero: float = 0.0, flow: bool = False
 ) -> xr.Dataset:
     """Kaplan-Yorke dimension from Lyapunov spectra.
 
@@ -41,6 +41,9 @@ def kaplan_yorke_dimension(
     zero
         Exponents of at most this modulus count as 0. The dimension jumps from 0 to 1 where the largest
         exponent changes its sign: on a quasi-periodic motion it is 0 but for an error.
+    flow
+        Whether they are those of a flow: the one nearest to 0 is left out, and the dimension is that of a
+        section across the flow, one less than that of the attractor.
 
     Returns
     -------
@@ -65,6 +68,8 @@ def kaplan_yorke_dimension(
     rates = np.take_along_axis(exponents.values.astype(np.float64), order, axis=-1)
     rates = np.where(np.abs(rates) <= zero, 0.0, rates)
     errors = np.take_along_axis(stderr.values, order, axis=-1)
+    if flow:
+        rates, errors = (_without_zero(values, rates) for values in (rates, errors))
     n = rates.shape[-1]
     sums = np.cumsum(rates, axis=-1)
     # sums rise and then fall, and start at 0: those before the first negative one are not
@@ -80,7 +85,7 @@ def kaplan_yorke_dimension(
     used = np.where(weight != 0.0, weight * errors, 0.0)
     error = np.where(inside, np.sqrt((used**2).sum(axis=-1)) / safe, 0.0)
     error = np.where(np.isnan(errors).any(axis=-1), np.nan, error)
-    unknown = np.isnan(rates).any(axis=-1) | ((j == n) & (n < ds.sizes.get("state", n)))
+    unknown = np.isnan(rates).any(axis=-1) | ((j == n) & (n + flow < ds.sizes.get("state", n)))
     dims = exponents.dims[:-1]
     if f"{name}_flag" in ds:
         unknown |= ds[f"{name}_flag"].transpose(*dims).values != LyapunovFlag.GOOD
@@ -92,6 +97,13 @@ def kaplan_yorke_dimension(
         variables[key] = (dims, np.where(unknown, np.nan, values), {"units": "1", "long_name": text})
     references = "Kaplan and Yorke, Lect. Notes Math. 730, 204 (1979)"
     return with_coords(ds, dims, variables).assign_attrs(zero=zero, references=references)
+
+
+def _without_zero(values: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Values on the last axis but for that of the rate nearest to 0."""
+    nearest = np.argmin(np.abs(np.nan_to_num(rates, nan=np.inf)), axis=-1)
+    kept = np.arange(rates.shape[-1]) != nearest[..., None]
+    return np.asarray(values[kept].reshape(*rates.shape[:-1], rates.shape[-1] - 1))
 
 
 PER_OCTAVE = 4

@@ -42,7 +42,7 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
     ----------
     ds
         Cube with `lyapunov`, `lyapunov_stderr`, `lyapunov_blocks`, `divergence`, `lyapunov_flag`, and
-        the coordinate `frequency` [Hz].
+        the coordinate `frequency` [Hz] or `return_time` [s].
     n_sigma
         Standard errors by which an exponent must differ from 0 to count as positive or negative.
     least
@@ -54,7 +54,7 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
         With the cell dims of the cube:
 
         ``lyapunov_per_period`` (exponent), ``lyapunov_per_period_stderr`` (exponent)
-            Exponents per drive period, lambda/f [1].
+            Exponents per drive period, or per return in the mean [1].
         ``lyapunov_running`` (block, exponent)
             Mean over the blocks up to this one [1/s]: the convergence history.
         ``motion``
@@ -84,11 +84,11 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
             "the cube has no Lyapunov exponents; run it with [products] lyapunov = {} in its specification"
         )
     rate, error = ds["lyapunov"], ds["lyapunov_stderr"]
-    frequency = ds["frequency"] if "frequency" in ds.coords else xr.DataArray(float(ds.attrs["frequency_hz"]))
+    seconds = period_seconds(ds)
     result = xr.Dataset(
         {
-            "lyapunov_per_period": (rate / frequency).transpose(*rate.dims),
-            "lyapunov_per_period_stderr": (error / frequency).transpose(*rate.dims),
+            "lyapunov_per_period": (rate * seconds).transpose(*rate.dims),
+            "lyapunov_per_period_stderr": (error * seconds).transpose(*rate.dims),
             "lyapunov_running": _running(ds["lyapunov_blocks"]),
             **_motion(ds, n_sigma, least),
             "is_transient": transients(ds, n_sigma=n_sigma, least=least),
@@ -97,6 +97,14 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
         }
     )
     return result.assign_attrs(ds.attrs)
+
+
+def period_seconds(ds: xr.Dataset) -> xr.DataArray:
+    """Time between two sections [s]: a drive period, or the mean return of each cell."""
+    if "return_time" in ds:
+        return ds["return_time"].mean("period_index")
+    frequency = ds["frequency"] if "frequency" in ds.coords else xr.DataArray(float(ds.attrs["frequency_hz"]))
+    return 1.0 / frequency
 
 
 def _running(blocks: xr.DataArray) -> xr.DataArray:
@@ -166,8 +174,10 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
     early, late = first.isel(block=slice(quarter)), first.isel(block=slice(-quarter, None))
     before, after = early.mean("block"), late.mean("block")
     error = np.sqrt((early.var("block", ddof=1) + late.var("block", ddof=1)) / quarter)
+    # the largest exponent of a flow's orbit is 0, along the flow
+    floor = least if "return_time" in ds else -least
     # not each by its own error: the blocks of an orbit with complex multipliers swing widely
-    ended = (before > least) & (after < -least) & (before - after > n_sigma * error)
+    ended = (before > least) & (after < floor) & (before - after > n_sigma * error)
     return ended.astype(np.int8).where(known, np.int8(-1)).assign_attrs(attrs)
 
 
@@ -194,7 +204,9 @@ def _drift(blocks: xr.DataArray) -> dict[str, xr.DataArray]:
 
 
 def _audit(ds: xr.Dataset) -> xr.DataArray:
-    total = ds["lyapunov_blocks"].mean("block").sum("exponent", skipna=False) - ds["divergence"]
+    # returns, and so blocks, are not of one length
+    means = ds["lyapunov"] if "return_time" in ds else ds["lyapunov_blocks"].mean("block")
+    total = means.sum("exponent", skipna=False) - ds["divergence"]
     if ds.sizes["exponent"] < ds.sizes["state"]:
         total = xr.full_like(total, np.nan)
     return total.assign_attrs(units="1/s", long_name="sum of the exponents minus the divergence")

@@ -15,7 +15,8 @@ variable                        own dims   meaning
 ``n_contradicting``                        closed, and yet with a positive exponent
 ``n_audit_failed``,                        with these flags
 ``n_unresolved``, ``n_failed``
-``exponents_from``                         0 none, 1 the orbit's multipliers, 2 its cells
+``exponents_from``                         0 none, 1 the orbit's multipliers, 2 its cells, 3 the equilibrium's
+                                           eigenvalues
 ``attractor_lyapunov``          rank       exponents [1/s]
 ``attractor_lyapunov_stderr``   rank       standard errors [1/s]; of multipliers 0
 ``attractor_lyapunov_between``  rank       standard deviation between cells beyond their errors [1/s]
@@ -46,14 +47,16 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from magpend_core.multipliers import orbit_exponents
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
 from pipeline.analysis.chaos.sections import Floats, geometry_of
 from pipeline.layout.vocabulary import (
     BOUNDED_SET,
     CLOSED_ORBIT,
-    FREQUENCY_DIM,
+    EQUILIBRIUM,
     PERIODIC,
+    model_of,
     split_dims,
 )
 from pipeline.products.chaos import ChaosOptions
@@ -90,7 +93,7 @@ class Nature(IntEnum):
         return self in (Nature.CHAOTIC, Nature.HYPERCHAOTIC, Nature.CHAOTIC_BY_TEST, Nature.UNDECIDED)
 
 
-_FROM = ("none", "multipliers", "cells")
+_FROM = ("none", "multipliers", "cells", "eigenvalues")
 
 
 @dataclass
@@ -101,12 +104,12 @@ class _Cells:
     ----------
     values : dict of ndarray
         By variable, cells on the first axis.
-    frequency : float
-        Of the drive [Hz].
+    is_flow : bool
+        Whether sections are crossings of a flow.
     """
 
     values: dict[str, npt.NDArray[Any]]
-    frequency: float
+    is_flow: bool
 
     @classmethod
     def of(cls, cells: xr.Dataset, starts: Sequence[str]) -> _Cells:
@@ -115,16 +118,10 @@ class _Cells:
             own = [d for d in array.dims if d not in starts]
             table = array.transpose(*starts, *own).values
             values[str(name)] = table.reshape(-1, *table.shape[len(starts) :])
-        return cls(values, _frequency(cells))
+        return cls(values, model_of(cells).crossing is not None)
 
     def get(self, name: str) -> npt.NDArray[Any] | None:
         return self.values.get(name)
-
-
-def _frequency(one: xr.Dataset) -> float:
-    if FREQUENCY_DIM in one.coords:
-        return float(one.coords[FREQUENCY_DIM])
-    return float(one.attrs.get("frequency_hz", np.nan))
 
 
 def chaos_per_attractor(
@@ -144,7 +141,11 @@ def chaos_per_attractor(
         Those of the exponents' signs, and `n_max` points of a correlation dimension; 0 for none.
     """
     dims, starts = split_dims(cells["motion"])
-    copied = ["kind", "orbit_period", "n_cells", "share", "multiplier_real", "multiplier_imag", "is_stable"]
+    copied = [
+        "kind", "orbit_period", "n_cells", "share", "multiplier_real", "multiplier_imag", "is_stable",
+        "period_s",
+    ]  # fmt: skip
+    copied += [name for name in ("eigenvalue_real", "eigenvalue_imag") if name in attractors]
     own = attractors[copied].transpose(*dims, "attractor", ...)
     shape, n_states = own["kind"].shape, ds.sizes["state"]
     arrays = {
@@ -171,7 +172,7 @@ def chaos_per_attractor(
     natures = " ".join(n.name.lower() for n in Nature)
     result["nature"].attrs |= {"flag_values": np.arange(len(Nature), dtype=np.int8), "flag_meanings": natures}
     result["exponents_from"].attrs |= {
-        "flag_values": np.arange(3, dtype=np.int8),
+        "flag_values": np.arange(len(_FROM), dtype=np.int8),
         "flag_meanings": " ".join(_FROM),
     }
     rank = ("rank", np.arange(1, n_states + 1), {"units": "1", "long_name": "exponents in falling order"})
@@ -223,12 +224,17 @@ def _exponents(
 ) -> dict[str, Any]:
     real, imaginary = one["multiplier_real"].values, one["multiplier_imag"].values
     if int(one["kind"]) == CLOSED_ORBIT and np.isfinite(real).all():
-        modulus = np.maximum(np.hypot(real, imaginary), 1e-300)
-        rate = np.log(modulus) * cells.frequency / int(one["orbit_period"])
+        rate = orbit_exponents(real + 1j * imaginary, float(one["period_s"]), cells.is_flow)
         zero = np.zeros(n_states)
         return {
             "exponents_from": 1, "attractor_lyapunov": rate, "attractor_lyapunov_stderr": zero,
             "attractor_lyapunov_between": zero,
+        }  # fmt: skip
+    if int(one["kind"]) == EQUILIBRIUM:
+        zero = np.zeros(n_states)
+        return {
+            "exponents_from": 3, "attractor_lyapunov": one["eigenvalue_real"].values,
+            "attractor_lyapunov_stderr": zero, "attractor_lyapunov_between": zero,
         }  # fmt: skip
     rates, flag = cells.get("lyapunov"), cells.get("lyapunov_flag")
     if rates is None or flag is None:
@@ -247,14 +253,14 @@ def _exponents(
 
 
 def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Nature:
-    if int(one["kind"]) == CLOSED_ORBIT and int(one["is_stable"]) == 1:
+    if int(one["kind"]) in (CLOSED_ORBIT, EQUILIBRIUM) and int(one["is_stable"]) == 1:
         return Nature.REGULAR
     if found["n_transient"] == int(one["n_cells"]):
         return Nature.TRANSIENT
     rate = found.get("attractor_lyapunov")
     if rate is not None and np.isfinite(rate[0]):
         margin = np.maximum(options.n_sigma * found["attractor_lyapunov_stderr"], options.least)
-        if int(one["kind"]) == CLOSED_ORBIT:
+        if int(one["kind"]) in (CLOSED_ORBIT, EQUILIBRIUM):
             return Nature.REGULAR if rate[0] <= margin[0] else Nature.UNDECIDED
         if rate[0] > margin[0]:
             return Nature.HYPERCHAOTIC if len(rate) > 1 and rate[1] > margin[1] else Nature.CHAOTIC
@@ -305,7 +311,8 @@ def _with_kaplan_yorke(result: xr.Dataset) -> xr.Dataset:
     }
     spectra = xr.Dataset(exponents).reset_coords(drop=True)
     # exponents that were not taken are not those of a whole spectrum
-    found = kaplan_yorke_dimension(spectra, name="attractor_lyapunov", dim="rank")
+    flow = model_of(result).crossing is not None
+    found = kaplan_yorke_dimension(spectra, name="attractor_lyapunov", dim="rank", flow=flow)
     about = {"units": "1", "long_name": "Kaplan-Yorke dimension of the section"}
     error = {"units": "1", "long_name": "standard error of the Kaplan-Yorke dimension"}
     dims = result["nature"].dims

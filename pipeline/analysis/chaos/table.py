@@ -158,7 +158,8 @@ def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[
     period = with_error(row["lyapunov_1_per_period"], row["lyapunov_1_stderr_per_period"])
     place = ", ".join(f"{d} {row[d]:g}{unit_of(ds, d)}" for d in dims)
     who = f"attractor {row['attractor_id']}, {_nature_words(row)}"
-    return [f"  largest exponent: {rate} per s, {period} per drive period, {who}, at {place}"]
+    each = f", {period} per drive period" if period != "-" else ""
+    return [f"  largest exponent: {rate} per s{each}, {who}, at {place}"]
 
 
 # ---- correlation dimension ---------------------------------------------------------------------

@@ -19,7 +19,7 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    "magpend_core.models": ("load_model", "load_preset", "model_names", "preset_names"),
+    "magpend_core.models": ("import_model", "load_model", "load_preset", "model_names", "preset_names"),
     "magpend_core.models.model": ("Model",),
     "magpend_core.models.parameters": ("ParameterError", "Parameters"),
     "magpend_core.models.presets": ("write_preset",),

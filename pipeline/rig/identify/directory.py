@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +24,11 @@ import numpy as np
 
 from magpend_core import kernel_version
 from magpend_core.meaning import meaning_digest
+from magpend_core.models.imported import is_object_path
 from pipeline.layout.identity import canonical, differences, digest_of
 from pipeline.rig.identify.specification import IdentificationSpec
+from pipeline.rig.recordings import load_mapping
+from pipeline.spec.models import is_model_file
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import (
     FIGURES,
@@ -117,14 +121,22 @@ def sources_of(spec: IdentificationSpec) -> list[Source]:
     for i, table in enumerate(spec.recordings):
         try:
             data = spec.path(table.file).read_bytes()
-            text = spec.path(table.mapping).read_text("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
+            text = _kept(spec.path(table.mapping))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             problems.append(f"recordings[{i}]: cannot be read ({error}).")
             continue
         found.append(Source(Path(table.file).name, hashlib.sha256(data).hexdigest(), text))
     if problems:
         raise SpecError(problems)
     return found
+
+
+def _kept(path: Path) -> str:
+    """Text of a mapping file; if its model is no name, the mapping as it was understood, which is whole."""
+    text = path.read_text("utf-8")
+    model = tomllib.loads(text).get("model")
+    is_whole = isinstance(model, str) and not is_model_file(model) and not is_object_path(model)
+    return text if is_whole else load_mapping(path).toml()
 
 
 def identity_of(spec: IdentificationSpec, sources: Sequence[Source]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.presets import write_preset
+from pipeline.layout.vocabulary import model_attribute
 from pipeline.rig.identify.directory import Source
 from pipeline.rig.identify.identifiability import Direction
 from pipeline.rig.identify.judging import Judgement
@@ -95,7 +96,7 @@ def result_of(
     return {
         "title": spec.title,
         "digest": digest,
-        "model": spec.model.name,
+        "model": spec.model.reference,
         "converged": True,
         "names": list(names),
         "channels": list(found.problem.channels),
@@ -225,7 +226,7 @@ def write_values(path: Path, spec: IdentificationSpec, found: Finding, sources: 
             own = "stated in the specification of the identification" if name in spec.parameters else ""
             phrases[name] = own or base.provenance.get(name, "")
     title = spec.title or f"identified parameters of {spec.model.name}"
-    write_preset(path, spec.model.name, found.values, phrases, title)
+    write_preset(path, spec.model, found.values, phrases, title)
 
 
 def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
@@ -254,7 +255,11 @@ def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
         ds[f"{channel}_residual"].attrs = {"units": unit, "long_name": f"{channel}, measured less computed"}
     ds["time"].attrs = {"units": "s", "long_name": "time since the piece's start"}
     ds["held_out"].attrs = {"long_name": "1 in pieces that were not fitted"}
-    attrs = {"model": spec.model.name, "title": spec.title, "channels": " ".join(found.problem.channels)}
+    attrs = {
+        "model": model_attribute(spec.model),
+        "title": spec.title,
+        "channels": " ".join(found.problem.channels),
+    }
     return ds.set_coords(["recording", "piece", "held_out", "time"]).assign_attrs(attrs)
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from magpend_core.models import ModelError, load_model, model_names
+from magpend_core.models import model_names
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import (
     Parameters,
@@ -21,6 +21,7 @@ from magpend_core.models.presets import is_file
 from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
 from pipeline.spec.files import read_toml
+from pipeline.spec.models import add_model
 from pipeline.spec.parsing import IDENTIFICATION
 from pipeline.spec.problems import SpecError, unknown_choice, unknown_key
 from pipeline.spec.tables import Table
@@ -158,7 +159,7 @@ class IdentificationSpec:
         """Plain data with all defaults filled in, the title left out; equal for equal identifications."""
         return {
             "kind": IDENTIFICATION,
-            "model": self.model.name,
+            "model": self.model.reference,
             "values": self.values.as_dict(),
             "identify": {
                 u.name: {
@@ -215,7 +216,7 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
         missing = f'kind: missing; add kind = "{IDENTIFICATION}".'
         problems.append(missing if kind is None else unknown_choice("kind", kind, [IDENTIFICATION]))
     title, preset = (_text(data, key, problems) for key in ("title", "preset"))
-    model = _model(data, problems)
+    model = _model(data, folder, problems)
     sensors = _table(data, "sensors", SensorsTable, problems)
     fit = _table(data, "fit", FitTable, problems)
     search = _table(data, "search", SearchTable, problems)
@@ -248,21 +249,11 @@ def _found(preset: str | None, folder: Path) -> str | Path | None:
     return folder / preset if preset is not None and is_file(preset) else preset
 
 
-def _model(data: Mapping[str, Any], problems: list[str]) -> Model | None:
-    name = data.get("model")
-    if not isinstance(name, str):
-        known = ", ".join(model_names())
-        problems.append(
-            f"model: missing; add the name of one ({known})."
-            if name is None
-            else f"model = {name!r}: must be a name in quotes ({known})."
-        )
+def _model(data: Mapping[str, Any], folder: Path, problems: list[str]) -> Model | None:
+    if "model" not in data:
+        problems.append(f"model: missing; add the name of one ({', '.join(model_names())}), or its text.")
         return None
-    try:
-        return load_model(name)
-    except ModelError as error:
-        problems += [f"model: {p}" for p in error.problems]
-        return None
+    return add_model(data["model"], folder, problems)
 
 
 def _table(data: Mapping[str, Any], key: str, model: type[Table], problems: list[str]) -> Any:

@@ -10,6 +10,7 @@ import xarray as xr
 
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.sides import flags_of
+from pipeline.layout.vocabulary import model_of
 from pipeline.rig.measured.computed import Computed
 from pipeline.rig.measured.distances import Candidate, cloud_of, distance_to, floor_of, geometry_of
 from pipeline.rig.measured.measuring import with_sides
@@ -54,7 +55,7 @@ def compare(
     SpecError
         If the run is of another model, has no frequency axis, or reaches none of the measured frequencies.
     """
-    computed = Computed.of(run, str(measured.attrs["model"]), at)
+    computed = Computed.of(run, model_of(measured), at)
     return compare_with(with_sides(measured, computed.parameters), computed, seed=seed)
 
 

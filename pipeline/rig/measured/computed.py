@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from magpend_core.models import load_model
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.selection import choose, select_points, start_dims
@@ -22,7 +23,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def cube_and_parameters(
-    run: AnalysedRun, model_name: str, at: Mapping[str, float] | None = None
+    run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None
 ) -> tuple[xr.Dataset, Parameters]:
     """Return a run's cells over the drive's frequency, and its parameters there.
 
@@ -32,9 +33,10 @@ def cube_and_parameters(
         If it is of another model, sweeps no frequency, or another axis has more than one value.
     """
     where = run.directory
-    if run.model.name != model_name:
+    model = load_model(model)
+    if run.model is not model:
         raise SpecError([
-            f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model_name}: "
+            f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model.name}: "
             "give a run of that model, or correct model in the mapping."
         ])  # fmt: skip
     cube = run.cube()
@@ -77,7 +79,7 @@ class Computed:
     digest: str
 
     @classmethod
-    def of(cls, run: AnalysedRun, model_name: str, at: Mapping[str, float] | None = None) -> Computed:
+    def of(cls, run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None) -> Computed:
         """Read a run and find its attractors, kept as every analysis.
 
         Raises
@@ -85,7 +87,7 @@ class Computed:
         SpecError
             If it is of another model, sweeps no frequency, or another axis has more than one value.
         """
-        cube, parameters = cube_and_parameters(run, model_name, at)
+        cube, parameters = cube_and_parameters(run, model, at)
         with refused(run.directory):
             found = run.derive("attractors")
             keep = (FREQUENCY_DIM, *start_dims(found))

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from magpend_core.models import load_model
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.sides import UNKNOWN, flags_of
+from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.rig.edges import Edges, edges_of
 from pipeline.rig.measured.phase import section_phase
 from pipeline.rig.measured.regimes import LIMIT, MAX_PERIOD, Regime, find_period
@@ -99,13 +99,13 @@ def measure(
         without sections.
     """
     way = way or Way()
-    models = sorted({str(r.attrs.get("model", "")) for r in recordings})
+    models = sorted({model_of(r) for r in recordings}, key=lambda model: model.name)
     if len(models) != 1:
         raise SpecError([
-            f"recordings: of the models {', '.join(models) or 'none'}; a diagram is drawn of one: give "
-            "recordings whose mappings name the same model."
+            f"recordings: of the models {', '.join(m.name for m in models) or 'none'}; a diagram is drawn of "
+            "one: give recordings whose mappings name the same model."
         ])  # fmt: skip
-    model = load_model(models[0])
+    (model,) = models
     known = model.load() if parameters is None else parameters
     steps = [step for i, r in enumerate(recordings) for step in _steps(r, i, way, known)]
     _check(steps, recordings)
@@ -251,7 +251,7 @@ def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Datas
     files = [{"file": name_of(r), "sha256": str(r.attrs.get("sha256", ""))} for r in recordings]
     simulated = any(int(r.attrs.get("simulated", 0)) for r in recordings)
     return found.assign_attrs(
-        title="measured diagram", model=model.name, simulated=int(simulated),
+        title="measured diagram", model=model_attribute(model), simulated=int(simulated),
         recordings=json.dumps(files),
     )  # fmt: skip
 

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from magpend_core.models import load_model
 from magpend_core.models.model import Model, State
+from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.rig.edges import Edges
 from pipeline.spec.problems import SpecError
 
@@ -111,7 +111,7 @@ def find_sections(
     SpecError
         If no state is measured, the window is too short for the sampling rate, or no edge has a window.
     """
-    model = load_model(str(recording.attrs["model"]))
+    model = model_of(recording)
     channels = channels_of(recording, model)
     _check(recording, window_s, order)
     known = sorted({c.place for c in channels} | {c.slope for c in channels} - {-1})
@@ -146,7 +146,7 @@ def find_sections(
             "state_units": ("state", units),
         },
         attrs={
-            "model": model.name, "file": name_of(recording), "window_s": window_s, "order": order,
+            "model": model_attribute(model), "file": name_of(recording), "window_s": window_s, "order": order,
             "noise": json.dumps({c.name: float(s) for c, s in zip(channels, noise, strict=True)}),
         },
     )  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.parameters import Parameters
+from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.rig.edges import DRIVE, Edges, edges_of
 from pipeline.rig.measured.phase import section_phase
 from pipeline.rig.measured.sections import ORDER, WINDOW_S, find_sections, name_of
@@ -67,9 +68,9 @@ def series_of(
         If the model diverges.
     """
     model = parameters.model
-    if str(recording.attrs["model"]) != model.name:
+    if model_of(recording) is not model:
         raise SpecError([
-            f"{name_of(recording)}: mapped to the model {recording.attrs['model']}, while {model.name} is to "
+            f"{name_of(recording)}: mapped to the model {model_of(recording).name}, while {model.name} is to "
             "be computed: choose one of them."
         ])  # fmt: skip
     if n_periods < 1:
@@ -168,7 +169,8 @@ def _dataset(
         variables[DRIVE] = ("time", recording[DRIVE].values[chosen], dict(recording[DRIVE].attrs))
     axis = ("time", time, {"units": "s", "long_name": f"time since {model.section}"})
     return xr.Dataset(variables, coords={"time": axis}).assign_attrs(
-        title="recording and model from the same state", model=model.name, frequency_hz=frequency_hz,
+        title="recording and model from the same state", model=model_attribute(model),
+        frequency_hz=frequency_hz,
         start_s=begin, start=json.dumps(dict(zip(model.state_names, start.tolist(), strict=True))),
         rms=json.dumps(rms), simulated=int(recording.attrs.get("simulated", 0)), file=name_of(recording),
         parameters="\n".join(f"{n} = {v!r}" for n, v in parameters.as_dict().items()),

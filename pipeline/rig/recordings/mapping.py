@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Mapping as AnyMapping
 from pathlib import Path
@@ -10,12 +9,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from magpend_core.models import ModelError, load_model
+from magpend_core.models import load_model
 from magpend_core.models.model import Model
 from pipeline.rig.recordings import units
 from pipeline.spec.files import read_toml
+from pipeline.spec.models import KEPT, add_model, kept_reference, model_toml
 from pipeline.spec.problems import SpecError, problems_of, unknown_key
 from pipeline.spec.tables import Table
+from pipeline.spec.toml import toml_key, toml_value
 
 FORMATS = ("tdms", "lvm", "csv", "matlab")
 DRIVE = "drive"
@@ -96,7 +97,9 @@ class Mapping(Table):
     The keys are those of the TOML file; `load_mapping` reads and checks one.
     """
 
-    model: str = Field(description="Model whose states are measured.")
+    model: str | dict[str, Any] = Field(
+        description="Model whose states are measured, as in a specification: a name, a file or a table."
+    )
     format: Literal["tdms", "lvm", "csv", "matlab"] | None = Field(
         default=None, description="By default by the suffix."
     )
@@ -138,10 +141,14 @@ class Mapping(Table):
         tables = {
             key: plain.pop(key) for key in ("csv", "channels", "drive") if isinstance(plain.get(key), dict)
         }
-        lines = [f"{key} = {_literal(value)}" for key, value in plain.items()]
-        channels = {f"channels.{_key(name)}": entry for name, entry in tables.pop("channels", {}).items()}
+        model = model_toml(plain.pop("model")).rstrip("\n")
+        is_line = not model.startswith("[")
+        lines = [model] if is_line else []
+        lines += [f"{key} = {toml_value(value)}" for key, value in plain.items()]
+        channels = {f"channels.{toml_key(name)}": entry for name, entry in tables.pop("channels", {}).items()}
         for head, table in {**channels, **tables}.items():
-            lines += ["", f"[{head}]", *(f"{key} = {_literal(value)}" for key, value in table.items())]
+            lines += ["", f"[{head}]", *(f"{key} = {toml_value(value)}" for key, value in table.items())]
+        lines += [] if is_line else ["", model]
         return "\n".join(lines) + "\n"
 
 
@@ -158,11 +165,22 @@ def load_mapping(path: str | Path) -> Mapping:
     SpecError
         With all problems at once; also if the file cannot be read or is not TOML.
     """
-    return parse_mapping(read_toml(path), str(path))
+    return parse_mapping(read_toml(path), str(path), Path(path).parent)
 
 
-def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "") -> Mapping:
+def parse_mapping(
+    data: AnyMapping[str, Any] | str, source: str = "", folder: str | Path | None = KEPT
+) -> Mapping:
     """Check a mapping given as plain data, or as the text of a TOML file.
+
+    Parameters
+    ----------
+    data
+        Tables, or their text.
+    source
+        What they are called in messages.
+    folder
+        From where the file of a model counts; None for what was kept: no file is read, nothing is imported.
 
     Raises
     ------
@@ -171,7 +189,7 @@ def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "") -> Mapping
     """
     tables = tomllib.loads(data) if isinstance(data, str) else dict(data)
     problems: list[str] = []
-    model = _model(tables, problems)
+    model = _model(tables, folder, problems)
     channels = _entries(tables, problems)
     drive = tables.get("drive", "none")
     if isinstance(drive, dict):
@@ -184,7 +202,8 @@ def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "") -> Mapping
         problems += _quantity_problems(model, channels, drive if isinstance(drive, DriveMap) else None)
     if problems:
         raise SpecError([f"{source}: {p}" if source else p for p in problems])
-    return Mapping(model=tables["model"], channels=channels, drive=drive, **known)
+    assert model is not None
+    return Mapping(model=kept_reference(model), channels=channels, drive=drive, **known)
 
 
 def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
@@ -212,17 +231,13 @@ def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
     return found
 
 
-def _model(tables: AnyMapping[str, Any], problems: list[str]) -> Model | None:
+def _model(tables: AnyMapping[str, Any], folder: str | Path | None, problems: list[str]) -> Model | None:
     if "model" not in tables:
         problems.append(
             "model: missing; name the model whose states are measured, as magpend models lists them."
         )
         return None
-    try:
-        return load_model(tables["model"])
-    except (ModelError, TypeError) as error:
-        problems += [f"model: {p}" for p in getattr(error, "problems", [f"{tables['model']!r} is no name."])]
-        return None
+    return add_model(tables["model"], folder, problems)
 
 
 def _entries(tables: AnyMapping[str, Any], problems: list[str]) -> dict[str, ChannelMap]:
@@ -305,16 +320,3 @@ def _angle_problems(
     elif other is not None and known.get(other) != known[name]:
         problems.append(f"{path}.relative_to = {other!r}: must be in the same unit, {known[name]}.")
     return problems
-
-
-def _literal(value: Any) -> str:
-    """Spell a value as TOML does."""
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(k)} = {_literal(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_literal, value)) + "]"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value).lower()
-
-
-def _key(name: str) -> str:
-    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.layout.vocabulary import model_of
 from pipeline.products.product import Table
 from pipeline.rig.recordings.clock import step_of
 from pipeline.rig.recordings.findings import Finding, findings_of, summary
@@ -85,7 +86,7 @@ def describe_recording(ds: xr.Dataset) -> tuple[Table, Table]:
     lines = [
         f"{ds.attrs['file']}: {ds.attrs['format']}, {len(time)} samples at "
         f"{ds.attrs['sampling_rate_hz']:.8g} Hz, {time[-1] - time[0]:.6g} s in {n_pieces} "
-        f"piece{'s' if n_pieces > 1 else ''}, model {ds.attrs['model']}"
+        f"piece{'s' if n_pieces > 1 else ''}, model {model_of(ds).name}"
         + (", simulated" if ds.attrs.get("simulated") else "")
     ]
     lines += _aligned(

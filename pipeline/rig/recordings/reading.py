@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.layout.vocabulary import model_attribute
 from pipeline.rig.recordings import checks, formats, units
 from pipeline.rig.recordings.clock import Clock, clock_of
 from pipeline.rig.recordings.findings import Finding, findings_of, to_json
@@ -259,7 +260,7 @@ def _labelled(
     }
     about: dict[str, Any] = {
         "sampling_rate_hz": 1.0 / clock.step_s, "file": str(raw.path), "sha256": raw.sha256,
-        "format": raw.format, "mapping": mapping.toml(), "model": mapping.model,
+        "format": raw.format, "mapping": mapping.toml(), "model": model_attribute(mapping.system),
         "findings": to_json(findings), "magpend_version": metadata.version("magpend"),
     }  # fmt: skip
     if raw.simulated:

@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from pipeline.layout.vocabulary import model_of
 from pipeline.rig.recordings.delimited import SIMULATED as SIMULATED_LINE
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, PieceMap, TimeMap
 from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.rig.recordings.tdms import SIMULATED
+from pipeline.spec.models import kept_reference
 from pipeline.spec.problems import SpecError
 
 SUFFIXES = (".tdms", ".csv", ".nc")
@@ -62,7 +64,7 @@ def mapping_for(ds: xr.Dataset, path: str | Path) -> Mapping:
     with_time = not _is_one_waveform(ds) or not is_tdms
     kind = ds[DRIVE].attrs["kind"] if DRIVE in ds else None
     return Mapping(
-        model=ds.attrs["model"],
+        model=kept_reference(model_of(ds)),
         time=TimeMap(channel=own("time")) if with_time else None,
         piece=PieceMap(channel=own("piece")) if not _is_one_waveform(ds) else None,
         channels={n: ChannelMap(channel=own(n), unit=u) for n, u in units.items() if n != DRIVE},

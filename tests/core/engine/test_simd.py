@@ -1,6 +1,7 @@
 """Each primitive has three forms: plain Python on arrays, compiled for a number, compiled for lanes."""
 
 import itertools
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -76,6 +77,9 @@ CASES = {
     "where_odd": [INTEGERS, [5.0, np.nan], [-6.0, np.inf]],
     "binary_exponent": [POSITIVE],
     "mantissa": [POSITIVE],
+    "floor": [[*ORDINARY, *SPECIAL, 2.5, -2.5, 1e300]],
+    "inverse_sqrt_rough": [POSITIVE],
+    "upper": [[*ORDINARY, np.inf, -np.inf, 1.0 + 2.0**-25, 1.0 + 2.0**-26]],
 }
 
 
@@ -110,6 +114,12 @@ def test_negate_if_bit__all_forms_agree(bit):
     assert same_bits(lanes, expected)
     assert same_bits([of_number(*pair) for pair in zip(x, shifted, strict=True)], expected)
     assert same_bits([negate_if_bit(*pair, bit) for pair in zip(x, shifted, strict=True)], expected)
+
+
+def test_upper__products_are_exact():
+    x, y = simd.upper(np.random.default_rng(2).normal(size=(2, 1000)))
+    exact = [Fraction(a) * Fraction(b) for a, b in zip(x.tolist(), y.tolist(), strict=True)]
+    assert [Fraction(v) for v in (x * y).tolist()] == exact
 
 
 def test_primitives__mean_what_they_say():

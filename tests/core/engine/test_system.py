@@ -15,7 +15,7 @@ def _rate(p):
 
 
 def test_positions__are_constants_of_compiled_code():
-    by_name = kernel(lambda p: _rate(p) + AT.q, cached=False)
+    by_name = kernel(lambda p: _rate(p) + AT.q, kept=None)
     assert AT == (0, 1, 2)
     assert by_name(np.array([2.0, 6.0, 0.0])) == 5.0
 

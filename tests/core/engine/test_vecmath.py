@@ -9,45 +9,21 @@ from numba import njit
 
 from magpend_core.engine import vecmath
 from magpend_core.engine.jit import OPTIONS
-from magpend_core.engine.simd import WIDTH, load, store
+from magpend_core.engine.plain import plain
+from magpend_core.engine.simd import WIDTH, load, store_rows
 
 NAMES = (
-    "exp",
-    "sine of sincos",
-    "cosine of sincos",
-    "sin",
-    "atan",
-    "log2_rough",
-    "exp2_rough",
-    "wrapped",
-    "log",
-    "cos",
-    "exp2_falling",
-    "hypot_rough",
-)
+    "exp", "sine of sincos", "cosine of sincos", "sin", "atan", "log2_rough", "exp2_rough", "wrapped",
+    "log", "cos", "exp2_falling", "hypot_rough", "tan", "tanh", "sinh", "cosh", "asin", "acos", "expm1",
+    "sign", "square_wave", "power 1.5", "power -0.3", "power 17.3", "atan2 of 0.7", "atan2 by -0.4",
+    "inverse_sqrt",
+)  # fmt: skip
 exp, sincos, sin, atan = vecmath.exp, vecmath.sincos, vecmath.sin, vecmath.atan
 log, cos, exp2_falling, hypot_rough = vecmath.log, vecmath.cos, vecmath.exp2_falling, vecmath.hypot_rough
 log2_rough, exp2_rough, wrapped = vecmath.log2_rough, vecmath.exp2_rough, vecmath.wrapped
-
-
-@njit(**OPTIONS)
-def _of_lanes(x, out):
-    n = len(x)
-    for i in range(0, n, WIDTH):
-        v = load(x, i)
-        sine, cosine = sincos(v)
-        store(out, i, exp(v))
-        store(out, n + i, sine)
-        store(out, 2 * n + i, cosine)
-        store(out, 3 * n + i, sin(v))
-        store(out, 4 * n + i, atan(v))
-        store(out, 5 * n + i, log2_rough(v))
-        store(out, 6 * n + i, exp2_rough(v))
-        store(out, 7 * n + i, wrapped(v))
-        store(out, 8 * n + i, log(v))
-        store(out, 9 * n + i, cos(v))
-        store(out, 10 * n + i, exp2_falling(v))
-        store(out, 11 * n + i, hypot_rough(v, 1.0))
+tan, tanh, sinh, cosh, expm1 = vecmath.tan, vecmath.tanh, vecmath.sinh, vecmath.cosh, vecmath.expm1
+asin, acos, atan2, power = vecmath.asin, vecmath.acos, vecmath.atan2, vecmath.power
+sign, square_wave, inverse_sqrt = vecmath.sign, vecmath.square_wave, vecmath.inverse_sqrt
 
 
 @njit(**OPTIONS)
@@ -55,8 +31,17 @@ def _of_number(v):
     sine, cosine = sincos(v)
     return (
         exp(v), sine, cosine, sin(v), atan(v), log2_rough(v), exp2_rough(v), wrapped(v), log(v),
-        cos(v), exp2_falling(v), hypot_rough(v, 1.0),
+        cos(v), exp2_falling(v), hypot_rough(v, 1.0), tan(v), tanh(v), sinh(v), cosh(v), asin(v), acos(v),
+        expm1(v), sign(v), square_wave(v, 0.3), power(v, 1.5), power(v, -0.3), power(v, 17.3),
+        atan2(0.7, v), atan2(v, -0.4), inverse_sqrt(v),
     )  # fmt: skip
+
+
+@njit(**OPTIONS)
+def _of_lanes(x, out):
+    n = len(x)
+    for i in range(0, n, WIDTH):
+        store_rows(out, i * len(NAMES), _of_number(load(x, i)))
 
 
 def evaluate(x):
@@ -65,7 +50,8 @@ def evaluate(x):
     padded = np.resize(x, -(-len(x) // WIDTH) * WIDTH)
     out = np.zeros(len(NAMES) * len(padded))
     _of_lanes(padded, out)
-    return {name: row[: len(x)] for name, row in zip(NAMES, out.reshape(len(NAMES), -1), strict=True)}
+    rows = out.reshape(-1, len(NAMES), WIDTH).transpose(1, 0, 2).reshape(len(NAMES), -1)
+    return {name: row[: len(x)] for name, row in zip(NAMES, rows, strict=True)}
 
 
 def worst_ulps(x, values, function):
@@ -86,7 +72,35 @@ def points(*ranges, n=3000):
 
 # where the functions are worst: atan just above tan(pi/8), the sines where a reduction ends
 SINE_RANGES = ((-0.79, 0.79), (-3.2, 3.2), (1.4, 1.8), (-30.0, 30.0), (-1e4, 1e4))
+EXP_RANGES = ((-1e-6, 1e-6), (-0.4, 0.4), (0.0, 1.0), (-3.0, 3.0), (-20.0, 20.0), (-700.0, 700.0))
+ARC_RANGES = ((-1e-6, 1e-6), (-0.5, 0.5), (0.49, 0.53), (-1.0, 1.0), (0.99, 1.0), (-1.0, -0.99))
+POWER_RANGES = ((1e-6, 1.0), (0.5, 2.0), (0.7, 0.72), (1.35, 1.45), (0.99, 1.01), (0.0, 100.0), (1e16, 1e17))
 CASES = {
+    "tan": (mpmath.tan, 3.0, SINE_RANGES),
+    "tanh": (mpmath.tanh, 4.0, EXP_RANGES),
+    "sinh": (mpmath.sinh, 2.5, EXP_RANGES),
+    "cosh": (mpmath.cosh, 1.5, EXP_RANGES),
+    "expm1": (mpmath.expm1, 2.0, EXP_RANGES),
+    "asin": (mpmath.asin, 2.5, ARC_RANGES),
+    "acos": (mpmath.acos, 1.5, ARC_RANGES),
+    "power 1.5": (lambda x: x ** mpmath.mpf(1.5), 1.0, (*POWER_RANGES, (1e-200, 1e-190))),
+    "power -0.3": (lambda x: x ** mpmath.mpf(-0.3), 1.0, (*POWER_RANGES, (1e-300, 1e-290))),
+    "power 17.3": (lambda x: x ** mpmath.mpf(17.3), 2.5, (*POWER_RANGES, (1e-17, 1e-16))),
+    "atan2 of 0.7": (
+        lambda x: mpmath.atan2(mpmath.mpf(0.7), x),
+        3.0,
+        ((-1e-6, 1e-6), (-1.0, 1.0), (0.2, 0.4), (1.6, 1.8), (-10.0, 10.0), (-1e5, 1e5)),
+    ),
+    "atan2 by -0.4": (
+        lambda x: mpmath.atan2(x, mpmath.mpf(-0.4)),
+        1.6,
+        ((-1e-6, 1e-6), (-1.0, 1.0), (0.1, 0.2), (-10.0, 10.0), (-1e5, 1e5)),
+    ),
+    "inverse_sqrt": (
+        lambda x: 1 / mpmath.sqrt(x),
+        1.5,
+        ((1e-6, 1.0), (0.5, 2.0), (1.0, 4.0), (0.0, 100.0), (1e-300, 1e-290), (1e290, 1e300)),
+    ),
     "exp": (mpmath.exp, 1.0, ((-1.0, 1.0), (-20.0, 20.0), (-700.0, 700.0), (-1e-6, 1e-6))),
     "sine of sincos": (mpmath.sin, 1.6, SINE_RANGES),
     "cosine of sincos": (mpmath.cos, 1.6, SINE_RANGES),
@@ -97,7 +111,7 @@ CASES = {
         1.0,
         ((-1.0, 0.0), (-20.0, 0.0), (-1000.0, 0.0), (-1e-6, 0.0)),
     ),
-    "log": (mpmath.log, 1.0, ((0.5, 2.0), (0.99, 1.01), (1e-6, 1e6), (1e-300, 1e-290))),
+    "log": (mpmath.log, 1.0, ((0.5, 2.0), (0.99, 1.01), (1e-6, 1e6), (1e-300, 1e-290), (5e-324, 2e-308))),
     "atan": (
         mpmath.atan,
         3.5,
@@ -149,13 +163,43 @@ def test_sines__near_their_zeros_lose_only_the_rest_of_pi(name, function, first)
 def test_vecmath__numbers_and_lanes_have_the_same_bits():
     x = np.concatenate([points((0.0, 1.0), (0.3, 3.0), (0.0, 700.0)), 10.0 ** points((-300.0, 2.8))])
     x = np.concatenate([x, -x])
+    x = np.concatenate([x, [0.0, -0.0, 0.5, -0.5, 1.0, -1.0, 5e-324, np.inf, -np.inf]])
     lanes = np.array(list(evaluate(x).values()))
     numbers = np.array([_of_number(v) for v in x]).T
-    positive = x > 0.0
-    assert (lanes[:, positive].view(np.int64) == numbers[:, positive].view(np.int64)).all()
-    # logarithms are for positive numbers only
-    rest = np.array([name not in ("log2_rough", "log") for name in NAMES])
-    assert (lanes[rest][:, ~positive].view(np.int64) == numbers[rest][:, ~positive].view(np.int64)).all()
+    same = (lanes.view(np.int64) == numbers.view(np.int64)) | (np.isnan(lanes) & np.isnan(numbers))
+    # the rough logarithm is for positive numbers only
+    rough = np.array([name == "log2_rough" for name in NAMES])
+    assert same[~rough].all()
+    assert same[rough][:, (x > 0.0) & np.isfinite(x)].all()
+
+
+@pytest.mark.parametrize("name", ["tan", "tanh", "sinh", "cosh", "expm1", "asin", "acos", "log", "exp"])
+def test_vecmath__in_plain_python_is_the_same_function(name):
+    # products and sums round twice there
+    x = points((0.0, 1.0))
+    values = plain(getattr(vecmath, name))(x)
+    assert np.allclose(values, evaluate(x)[name], rtol=1e-14, atol=0.0)
+    number = plain(getattr(vecmath, name))(x[0])
+    assert np.ndim(number) == 0
+
+
+@pytest.mark.parametrize("x", [np.array([0.7, 0.0, -1.0, np.inf, np.nan, 1e-310, 30.0])])
+def test_plain_python__of_powers_signs_and_angles(x):
+    at = evaluate(x)
+    plain_power, plain_atan2 = plain(power), plain(atan2)
+    for y in (1.5, -0.3, 17.3):
+        assert np.allclose(plain_power(x, y), at[f"power {y}"], rtol=1e-13, atol=0.0, equal_nan=True)
+    finite = x[np.isfinite(x)]
+    assert np.allclose(plain_atan2(0.7, finite), np.arctan2(0.7, finite), rtol=1e-14)
+    assert plain(sign)(x)[:3].tolist() == [1.0, 0.0, -1.0]
+    assert plain(square_wave)(np.array([0.1, 0.3, 0.9, 1.1, -0.8, -0.1]), 0.3).tolist() == [
+        1,
+        -1,
+        -1,
+        1,
+        1,
+        -1,
+    ]
 
 
 def test_exp__limits_and_special_values():
@@ -171,9 +215,10 @@ def test_exp__limits_and_special_values():
 def test_odd_functions__keep_signs_and_zeros():
     x = np.concatenate([points((0.0, 10.0)), [0.0, 1e-310, 1e-20]])
     right, left = evaluate(x), evaluate(-x)
-    for name in ("sin", "atan", "sine of sincos"):
+    for name in ("sin", "atan", "sine of sincos", "tan", "tanh", "sinh"):
         assert (right[name] == -left[name]).all(), name
-    assert (right["cosine of sincos"] == left["cosine of sincos"]).all()
+    for name in ("cosine of sincos", "cosh"):
+        assert (right[name] == left[name]).all(), name
     assert (np.copysign(1.0, evaluate([-0.0])["atan"]) == -1.0).all()
     assert (right["sin"][-3:] == x[-3:]).all()
     assert (right["atan"][-3:] == x[-3:]).all()
@@ -196,8 +241,69 @@ def test_sines__square_sum_and_quadrants():
 
 def test_nan__stays_nan_in_sines_and_atan():
     values = evaluate([np.nan])
-    for name in ("sine of sincos", "cosine of sincos", "sin", "cos", "atan", "wrapped"):
+    for name in set(NAMES) - {"log2_rough", "exp2_rough", "exp2_falling", "hypot_rough", "square_wave"}:
         assert np.isnan(values[name]).all(), name
+
+
+def test_log__ends_and_domain():
+    values = evaluate([0.0, -0.0, -1.0, -np.inf, np.inf, 5e-324])["log"]
+    assert values[:2].tolist() == [-np.inf, -np.inf]
+    assert np.isnan(values[2:4]).all()
+    assert values[4] == np.inf
+    assert values[5] == pytest.approx(-1074.0 * math.log(2.0), rel=1e-15)
+
+
+def test_power__ends_and_domain():
+    x = [0.0, -0.0, -2.0, np.inf, 1.0, 1e300]
+    raised, lowered = evaluate(x)["power 1.5"], evaluate(x)["power -0.3"]
+    assert raised[[0, 1, 3, 4]].tolist() == [0.0, 0.0, np.inf, 1.0]
+    assert lowered[[0, 1, 3, 4]].tolist() == [np.inf, np.inf, 0.0, 1.0]
+    assert np.isnan([raised[2], lowered[2]]).all()
+    assert raised[5] == evaluate([1000.0])["exp"][0]
+
+
+def test_inverse_sines__ends_and_domain():
+    values = evaluate([1.0, -1.0, 0.0, -0.0, 1.0000000000000002, -7.0])
+    half = math.pi / 2
+    assert values["asin"][:3].tolist() == [half, -half, 0.0]
+    assert math.copysign(1.0, values["asin"][3]) == -1.0
+    assert values["acos"][:3].tolist() == [0.0, math.pi, half]
+    assert np.isnan(values["asin"][4:]).all()
+    assert np.isnan(values["acos"][4:]).all()
+
+
+def test_hyperbolic__ends():
+    values = evaluate([0.0, -0.0, 800.0, -800.0, 1e-310, np.inf])
+    assert values["tanh"].tolist() == [0.0, 0.0, 1.0, -1.0, 1e-310, 1.0]
+    assert values["sinh"][[0, 4]].tolist() == [0.0, 1e-310]
+    assert values["sinh"][2] == -values["sinh"][3] == values["cosh"][2] == values["cosh"][5]
+    for name in ("tanh", "sinh"):
+        assert math.copysign(1.0, values[name][1]) == -1.0
+
+
+def test_atan2__quadrants_and_zeros():
+    ends = [(0.0, 1.0), (0.0, -1.0), (-0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 0.0), (1e-300, 1e-300)]
+
+    @njit(**OPTIONS)
+    def of_pairs(y, x):
+        return [atan2(y[i], x[i]) for i in range(len(x))]
+
+    y, x = np.array(ends).T
+    assert of_pairs(y, x) == [math.atan2(*pair) for pair in ends]
+
+
+def test_inverse_sqrt__ends_and_domain():
+    values = evaluate([4.0, 1.0, 0.25, 0.0, -0.0, -1.0, 1e-310, np.inf])["inverse_sqrt"]
+    assert values[:3] == pytest.approx([0.5, 1.0, 2.0], rel=3e-16)
+    assert np.isnan(values[3:-1]).all()
+    assert not np.isfinite(values[-1])
+
+
+def test_sign_and_square_wave():
+    values = evaluate([0.0, -0.0, 3.0, -1e-320, np.inf])["sign"]
+    assert values.tolist() == [0.0, 0.0, 1.0, -1.0, 1.0]
+    phases = [0.0, 0.29, 0.3, 0.9999, 1.0, -0.75, -0.5, 12.2]
+    assert evaluate(phases)["square_wave"].tolist() == [1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 1.0]
 
 
 def test_log__over_all_magnitudes():

@@ -69,6 +69,7 @@ def attractors_of(cube, ids, kinds, periods=None, multipliers=None):
             "multiplier_real": ((*at, "multiplier"), mu),
             "multiplier_imag": ((*at, "multiplier"), np.where(np.isfinite(mu), 0.0, np.nan)),
             "is_stable": (at, stable.astype(np.int8)),
+            "period_s": (at, periods / np.atleast_1d(cube["frequency"].values)[:, None]),
         },
         coords={"frequency": cube["frequency"], "attractor": np.arange(kinds.shape[1])},
     )

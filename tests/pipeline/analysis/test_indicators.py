@@ -193,6 +193,14 @@ def test_kaplan_yorke_dimension__known_values_and_edges():
     assert found == pytest.approx(expected, abs=1e-4, nan_ok=True)
 
 
+def test_kaplan_yorke_dimension__flow():
+    """The zero of a flow is left out, wherever noise has put it: Rossler, Lorenz, a limit cycle, rest."""
+    rows = [(0.0714, 2e-5, -5.3943), (0.9056, -1e-4, -14.5723), (3e-6, -0.2, -0.3), (-0.1, -0.2, -0.3)]
+    found = kaplan_yorke_dimension(spectra(*rows), flow=True)["kaplan_yorke_dimension"].values
+    # Sprott (2003): 2.0132 and 2.062 for the attractors, one more than for their sections
+    assert found == pytest.approx([1.0132, 1.0621, 0.0, 0.0], abs=1e-4)
+
+
 def test_kaplan_yorke_dimension__more_exponents():
     # j = 2 of 4, and a sum that is 0 at j = 2; the unit cancels
     rows = np.array([(0.5, 0.1, -0.9, -4.0), (0.5, -0.5, -1.0, -2.0), (0.2, -0.1, -0.05, -3.0)])

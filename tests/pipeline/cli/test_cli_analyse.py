@@ -200,6 +200,7 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
             "status": (cells_of, np.ones_like(cells, np.int8), flags),
             "kind": (("frequency", "attractor"), kind, {"flag_meanings": "absent closed_orbit bounded_set"}),
             "orbit_period": (("frequency", "attractor"), kind * np.array([1, 2])),
+            "period_s": (("frequency", "attractor"), kind * np.array([1, 2]) / frequency[:, None]),
             "side": (("frequency", "attractor"), 0 * kind, {"flag_meanings": "unknown left right"}),
             "rotation": (("frequency", "attractor", "link"), np.zeros((n, 2, 2))),
             "multiplier_real": (("frequency", "attractor", "multiplier"), nan[..., None]),

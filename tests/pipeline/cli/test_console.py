@@ -156,7 +156,7 @@ def test_completion__is_offered(main):
         ("magpend plot ga", "gallery"),
         ("magpend analyse basins --metric ch", "chessboard"),
         ("magpend run quick", "quickstart"),
-        ("magpend models duff", "duffing"),
+        ("magpend models doub", "double-pendulum"),
     ],
 )
 def test_completion__completes_names(environment, line, word):

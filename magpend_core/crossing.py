@@ -1,0 +1,97 @@
+"""A section by crossing: where the trajectories of a flow without a drive are looked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magpend_core.validation import check_array
+
+if TYPE_CHECKING:
+    from magpend_core.engine.system import System
+
+LEVEL = "section_value"
+"""Name of the level among the parameters of a system with such a section; the last of them."""
+
+DIRECTIONS = {"up": 1, "down": -1}
+"""Sign of the rate with which the level is crossed."""
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A section of a flow without forcing: where a state crosses a level.
+
+    A period is then the time from one crossing to the next, a *return*. Crossings are steps of the
+    integration that end on the level (see `engine.events`, which says what can be missed). An angle crosses
+    its level modulo 2 pi. The crossing that a trajectory starts on does not count.
+
+    Attributes
+    ----------
+    of : str
+        Name of a state.
+    value : float
+        The level, in the state's unit.
+    direction : str
+        "up" for crossings at which the state rises, "down" where it falls.
+    longest : float
+        Longest wait for a return [s]; a cell that has none within it ends as ``NO_RETURN``.
+
+    Raises
+    ------
+    ValueError
+        If the direction is neither, `value` is not finite, or `longest` not above 0 and finite.
+    """
+
+    of: str
+    value: float = 0.0
+    direction: str = "up"
+    longest: float = 100.0
+
+    def __post_init__(self) -> None:
+        if self.direction not in DIRECTIONS:
+            raise ValueError(f"direction = {self.direction!r} of a section must be 'up' or 'down'.")
+        check_array("value of a section", self.value, 0)
+        if not check_array("longest of a section", self.longest, 0) > 0.0:
+            raise ValueError(
+                f"longest = {self.longest} of a section is out of bounds: it must be greater than 0."
+            )
+
+    @property
+    def sign(self) -> int:
+        """+1 where the level is crossed upwards, -1 downwards."""
+        return DIRECTIONS[self.direction]
+
+    @property
+    def frequency_hz(self) -> float:
+        """What the engine takes for the drive's frequency: one over the longest wait [Hz]."""
+        return 1.0 / float(self.longest)
+
+    @property
+    def sentence(self) -> str:
+        """Where it lies, in words."""
+        return f"{self.of} = {self.value:g} going {self.direction}"
+
+    def applied(self, parameters: np.ndarray, system: System) -> tuple[System, np.ndarray, np.ndarray]:
+        """Return the system with this section, its packed parameters and the frequency to integrate with.
+
+        Parameters
+        ----------
+        parameters
+            Packed parameters of `system`, shape (..., n_parameters).
+        system
+            One without forcing.
+
+        Raises
+        ------
+        ValueError
+            If the system has no such state or depends on time.
+        """
+        from magpend_core.engine.crossing import with_section  # brings the compiler
+
+        packed = np.asarray(parameters, np.float64)
+        level = np.full((*packed.shape[:-1], 1), float(self.value))
+        frequency = np.full(packed.shape[:-1], self.frequency_hz)
+        crossed = with_section(system, self.of, self.sign)
+        return crossed, np.concatenate([packed, level], axis=-1), frequency

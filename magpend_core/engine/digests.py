@@ -1,0 +1,171 @@
+"""Digests of compiled functions from outside the package: what decides the machine code that they become.
+
+Machine code may be kept for such functions only under a digest of everything that they reach, since
+`jit.source_digest` does not change with them. What cannot be followed to its end has none, and is not kept.
+"""
+
+from __future__ import annotations
+
+import builtins
+import dis
+import hashlib
+import sys
+from collections.abc import Callable, Iterator
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+
+PACKAGE = __name__.partition(".")[0]
+
+_COMPILERS_OWN = ("math", "cmath", "numpy", "operator", "builtins")
+"""Modules whose functions mean to numba what its version says; that version names the cache folder."""
+
+_GLOBALS, _ATTRIBUTES = ("LOAD_GLOBAL", "LOAD_NAME"), ("LOAD_ATTR", "LOAD_METHOD")
+
+
+def code_length(function: Callable[..., Any]) -> int:
+    """Bytes of bytecode of a compiled function and of the compiled functions that it calls, once per name."""
+    source = getattr(function, "py_func", None)
+    if source is None:
+        return 0
+    total = len(source.__code__.co_code)
+    for path in _lookups(source.__code__):
+        if path[0] in source.__globals__:
+            total += code_length(_found(source.__globals__[path[0]], path[1:]))
+    return total
+
+
+class _UnknownError(Exception):
+    """Something that a function reaches cannot be followed."""
+
+
+def functions_digest(*functions: Callable[..., Any]) -> str | None:
+    """Return a digest of compiled functions and of all that they reach.
+
+    It covers the bytecode, its constants, the compiler's options, default values, and each global and
+    closed-over value that is looked up: other compiled functions in the same way; numbers, strings, tuples
+    and arrays by value; functions of this package, of numpy and of the standard library's arithmetic by name.
+
+    Parameters
+    ----------
+    functions
+        Dispatchers of numba's.
+
+    Returns
+    -------
+    str or None
+        64 hexadecimal digits; None if a function reaches something else, such as an object with a state.
+    """
+    digest = hashlib.sha256(sys.version.encode())
+    seen: dict[int, int] = {}
+    try:
+        for function in functions:
+            for part in _parts(function, seen):
+                digest.update(len(part).to_bytes(8, "little"))
+                digest.update(part)
+    except _UnknownError:
+        return None
+    return digest.hexdigest()
+
+
+def _parts(value: Any, seen: dict[int, int]) -> Iterator[bytes]:
+    if id(value) in seen:
+        yield b"again %d" % seen[id(value)]
+        return
+    source = getattr(value, "py_func", None)
+    if isinstance(source, FunctionType):
+        if source.__module__ not in sys.modules:
+            # machine code from the cache asks for its functions' modules
+            raise _UnknownError
+        seen[id(value)] = len(seen)
+        yield _options(value)
+        yield from _function(source, seen)
+    elif isinstance(value, tuple):
+        yield f"{type(value).__name__} {getattr(value, '_fields', '')} {len(value)}".encode()
+        for entry in value:
+            yield from _parts(entry, seen)
+    elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        yield f"array {value.dtype.str} {value.shape} {value.strides}".encode() + value.tobytes()
+    else:
+        yield _plain(value)
+
+
+def _plain(value: Any) -> bytes:
+    """A number by its bits, a function that the compiler knows by its name."""
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic):
+        return f"{type(value).__name__} {value!r}".encode()
+    module = getattr(value, "__module__", None) or ""
+    named = isinstance(value, FunctionType | BuiltinFunctionType | np.ufunc | type)
+    known = module.partition(".")[0] in (PACKAGE, *_COMPILERS_OWN)
+    if named and (known or isinstance(value, np.ufunc)):
+        return f"known {module}.{getattr(value, '__qualname__', value.__name__)}".encode()
+    raise _UnknownError
+
+
+def _options(dispatcher: Any) -> bytes:
+    """Options of the compiler; sets in order."""
+    options = {**dispatcher.targetoptions, "locals": dispatcher.locals}
+    rows = []
+    for name, option in sorted(options.items()):
+        if name == "fastmath":
+            flags = getattr(option, "flags", option)
+            option = sorted(flags) if isinstance(flags, set | frozenset) else flags
+        rows.append(f"{name}={option!r}")
+    text = ";".join(rows)
+    if " at 0x" in text:
+        raise _UnknownError
+    return text.encode()
+
+
+def _function(function: FunctionType, seen: dict[int, int]) -> Iterator[bytes]:
+    yield from _code(function.__code__, seen)
+    yield from _parts(function.__defaults__ or (), seen)
+    yield from _parts(tuple(sorted((function.__kwdefaults__ or {}).items())), seen)
+    for cell in function.__closure__ or ():
+        yield from _parts(cell.cell_contents, seen)
+    for path in _lookups(function.__code__):
+        yield ".".join(path).encode()
+        if path[0] in function.__globals__:
+            yield from _parts(_found(function.__globals__[path[0]], path[1:]), seen)
+        elif not hasattr(builtins, path[0]):
+            raise _UnknownError
+
+
+def _found(value: Any, attributes: tuple[str, ...]) -> Any:
+    """What stands at the end of a path through modules."""
+    for name in attributes:
+        if not isinstance(value, ModuleType):
+            break
+        value = getattr(value, name, None)
+    return value
+
+
+def _code(code: CodeType, seen: dict[int, int]) -> Iterator[bytes]:
+    yield code.co_code
+    yield repr((code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)).encode()
+    yield repr((code.co_argcount, code.co_kwonlyargcount, code.co_flags)).encode()
+    yield code.co_exceptiontable
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _code(constant, seen)
+        elif isinstance(constant, frozenset):
+            yield repr(sorted(constant, key=repr)).encode()
+        else:
+            yield from _parts(constant, seen)
+
+
+def _lookups(code: CodeType) -> list[tuple[str, ...]]:
+    """Globals that a function and those defined in it look up, with the attributes read of each."""
+    found: set[tuple[str, ...]] = set()
+    path: tuple[str, ...] = ()
+    for instruction in dis.get_instructions(code):
+        if instruction.opname in _ATTRIBUTES and path:
+            path = (*path, instruction.argval)
+            continue
+        found.add(path)
+        path = (instruction.argval,) if instruction.opname in _GLOBALS else ()
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            found.update(_lookups(constant))
+    return sorted(found - {()})

@@ -1,0 +1,285 @@
+"""Events: zeros of functions along a trajectory on which a step must end.
+
+Templates for the engine, see `lanes`. An attempted step that ends beyond a zero is taken back; the next
+attempt ends where the cubic through values and rates at both ends has its zero, and so on until an attempt
+ends beyond the zero by no more than the resolution: `NARROW` times the first attempt's length, and four
+times as much with each further attempt, so that some 25 attempts are the most that there can be. An attempt
+that ends before the zero is an ordinary step. So a state at an event is one of the integration's own, of its
+accuracy; nothing is interpolated.
+
+A pair of zeros within a step, at whose ends the signs are the same, is looked for where the rates make it
+possible: an attempt then ends in the cubic's extremum. What can be missed is a pair that the cubic does not
+have: an excursion beyond zero by less than its error, (h**4/384) max |f''''| in a step h.
+
+An event has a side, +1 or -1: the sign of its value as of the last step, turned over where a step ends beyond
+zero. After an event it is the side that the trajectory goes to, whatever the last digit of the value says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from magpend_core.engine.jit import inline
+from magpend_core.engine.simd import (
+    WIDTH,
+    absolute,
+    any_nonzero,
+    copysign,
+    load,
+    load_rows,
+    maximum,
+    minimum,
+    multiply_add,
+    sqrt,
+    store,
+    store_rows,
+    where_less,
+)
+from magpend_core.engine.system import System
+from magpend_core.engine.vecmath import cos, sincos
+
+NARROW = 2e-15
+"""Resolution of an event's instant, in units of the attempt that first passed it."""
+
+WIDEN = 4.0
+"""Growth of the resolution with each attempt: rounding can hide a zero at which the rate is small."""
+
+ROOT_STEPS = 4
+"""Steps of Newton's method for the zero of a cubic; what they leave, the next attempt finds."""
+
+SAME = 1e-9
+"""A start so near to a section, in units of the state's scale, is on it: no crossing."""
+
+ACCEPT, TAKE_BACK, LANDED = 0.0, 1.0, 2.0
+
+
+def _events_of(system: System) -> Callable[..., Any]:
+    """Return a function that gives values and rates of all events, one after the other, as one flat tuple.
+
+    Switches first, then impacts, then the section. It passes for one of the system's module.
+    """
+    lines, parts = ["def event_values(t, y, dy, c, level):"], []
+    for name, n in (("switches", system.n_switches), ("impacts", system.n_impacts)):
+        if n:
+            lines.append(f"{name} = _{name}(t, y, dy, c)")
+            parts += [f"{name}[{k}][{j}]" for k in range(n) for j in range(2)]
+    if system.section is not None:
+        i = system.section[0]
+        if system.is_angle[i]:
+            # the sine has a second zero, half a turn away, which the scalar pass tells apart
+            lines.append(f"s, k = sincos(y[{i}] - level)")
+            parts += ["s", f"k * dy[{i}]"]
+        else:
+            parts += [f"y[{i}] - level", f"dy[{i}]"]
+    lines.append(f"return ({', '.join(parts)},)" if parts else "return ()")
+    scope: dict[str, Any] = {
+        "__name__": system.rhs.__module__, "_switches": system.switches, "_impacts": system.impacts,
+        "sincos": sincos,
+    }  # fmt: skip
+    exec("\n    ".join(lines), scope)
+    return inline(scope["event_values"])
+
+
+def event_bindings(system: System) -> dict[str, Any]:
+    """Names that the templates of events use, for a system."""
+    of, direction = system.section or (0, 0)
+    directions = [0.0] * system.n_switches + [float(d) for d in system.impact_directions]
+    starts = [1.0] * system.n_switches + [-float(d) for d in system.impact_directions]
+    same = [0.0] * (system.n_switches + system.n_impacts)
+    if system.section is not None:
+        directions, starts = [*directions, float(direction)], [*starts, float(direction)]
+        same = [*same, SAME * (1.0 if system.is_angle[of] else system.scales[of])]
+    return {
+        "HAS_EVENTS": system.n_events > 0,
+        "HAS_SECTION": system.section is not None,
+        "SECTION_OF": of,
+        "N_EVENTS": system.n_events,
+        "N_SWITCHES": system.n_switches,
+        "N_IMPACTS": system.n_impacts,
+        # one more entry, because numba has no numbers in an empty tuple
+        "DIRECTIONS": (*directions, 0.0),
+        "STARTS": (*starts, 0.0),
+        "SAME_VALUE": (*same, 0.0),
+        "event_values": _events_of(system),
+    }
+
+
+def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
+    """Where in (0, 1) the cubic with values `a`, `b` and slopes `da`, `db` at the ends dips below 0, or 2."""
+    c3 = 2.0 * (a - b) + (da + db)
+    c2 = multiply_add(3.0, b - a, -(da + da) - db)
+    square = multiply_add(c2, c2, (-3.0 * c3) * da)
+    root = sqrt(maximum(square, 0.0))
+    x = where_less(0.0, c2, -da / (c2 + root), (root - c2) / (3.0 * c3))
+    lowest = multiply_add(multiply_add(multiply_add(c3, x, c2), x, da), x, a)
+    found = where_less(lowest, 0.0, x, 2.0)
+    found = where_less(0.0, square, found, 2.0)
+    return where_less(0.0, found, where_less(found, 1.0, found, 2.0), 2.0)
+
+
+def may_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
+    """1 where the cubic of `cubic_dip` can have a dip, as far as control polygons tell; else 0."""
+    least = minimum(multiply_add(1.0 / 3.0, da, a), multiply_add(-1.0 / 3.0, db, b))
+    steepest = maximum(maximum(da, db), multiply_add(3.0, b - a, -(da + db)))
+    return where_less(least, 0.0, where_less(0.0, steepest, 1.0, 0.0), 0.0)
+
+
+def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
+    """Zero in [0, right] of the cubic with values `a` >= 0, `b` and slopes `da`, `db` at 0 and 1."""
+    c3 = 2.0 * (a - b) + (da + db)
+    c2 = multiply_add(3.0, b - a, -(da + da) - db)
+    left = 0.0 * right
+    # from the end that is nearer to zero; from the left one only if Newton's first step goes right
+    x = where_less(a, -b, where_less(da, 0.0, left, right), right)
+    for _ in range(ROOT_STEPS):
+        value = multiply_add(multiply_add(multiply_add(c3, x, c2), x, da), x, a)
+        slope = multiply_add(multiply_add(3.0 * c3, x, c2 + c2), x, da)
+        left = where_less(0.0, value, x, left)
+        right = where_less(0.0, value, right, x)
+        newton = x - value / slope
+        middle, half = 0.5 * (left + right), 0.5 * (right - left)
+        # a little beyond the ends is allowed: at the zero a step of Newton's goes nowhere
+        x = where_less(absolute(newton - middle), 1.000001 * half, newton, middle)
+    # already at zero and on its way beyond it
+    return where_less(0.0, a, x, where_less(da, 0.0, 0.0 * x, x))
+
+
+def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
+    """Values of event `k` at two ends as margins, positive on its side, and its rates likewise.
+
+    `near` and `far` are pairs of value and rate. A value at the near end that is beyond zero, by rounding
+    or after an event, counts as zero.
+    """
+    side = load(w, base + ROWS.side + k * WIDTH)
+    value = side * near[0]
+    excess = minimum(value, 0.0)
+    return value - excess, side * near[1], side * far[0] - excess, side * far[1]
+
+
+def pair(w: Any, row: int, k: int) -> Any:
+    """Value and rate of event `k` in rows that begin at `row`."""
+    return load(w, row + 2 * k * WIDTH), load(w, row + (2 * k + 1) * WIDTH)
+
+
+def fires(w: Any, base: int, k: int) -> Any:
+    """1 where a change of side of event `k` is an event, 0 where it is only noted."""
+    return where_less(DIRECTIONS[k] * load(w, base + ROWS.side + k * WIDTH), 0.5, 1.0, 0.0)
+
+
+def judge_events(w: Any, base: int, failed: Any) -> Any:
+    """Say lane by lane what events make of an attempt that error control has `failed` (1) or not (0).
+
+    ACCEPT, TAKE_BACK or LANDED; in the last case `fired` tells on which.
+    """
+    h = load(w, base + ROWS.step)
+    y = load_rows(w, base + ROWS.trial, N)
+    dy = load_rows(w, base + ROWS.slopes + (N_STAGES - 1) * N * WIDTH, N)
+    c = load_rows(w, base + ROWS.constants, NC)
+    found = event_values(load(w, base + ROWS.time) + h, y, dy, c, load(w, base + ROWS.level))
+    store_rows(w, base + ROWS.found, found)
+    doubt = where_less(0.0, load(w, base + ROWS.resolution), 1.0, 0.0 * h)
+    for k in range(N_EVENTS):
+        value = load(w, base + ROWS.found + 2 * k * WIDTH)
+        side = load(w, base + ROWS.side + k * WIDTH)
+        first = where_less(SAME_VALUE[k], absolute(value), copysign(1.0, value), STARTS[k])
+        store(w, base + ROWS.side + k * WIDTH, where_less(absolute(side), 0.5, first, side))
+        a, da, b, db = margin(w, base, k, pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k))
+        doubt = maximum(doubt, where_less(b, 0.0, 1.0, may_dip(a, h * da, b, h * db)))
+    verdict = 0.0 * h
+    if any_nonzero(doubt):
+        verdict = settle_events(w, base, failed)
+    stays = maximum(failed, where_less(absolute(verdict - TAKE_BACK), 0.5, 1.0, 0.0))
+    for k in range(2 * N_EVENTS):
+        row = base + k * WIDTH
+        old, new = load(w, row + ROWS.known), load(w, row + ROWS.found)
+        store(w, row + ROWS.known, where_less(0.5, stays, old, new))
+    return verdict
+
+
+def settle_events(w: Any, base: int, failed: Any) -> Any:
+    """Judge an attempt that may have passed an event, and aim the next one."""
+    h = load(w, base + ROWS.step)
+    narrow = load(w, base + ROWS.resolution)
+    first = where_less(0.0, narrow, 0.0, 1.0)
+    narrow = where_less(0.0, narrow, narrow, NARROW * h)
+    passed, beyond = 0.0 * h, 0.0 * h
+    for k in range(N_EVENTS):
+        a, da, b, db = margin(w, base, k, pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k))
+        crossed = where_less(b, 0.0, fires(w, base, k), 0.0)
+        passed = maximum(passed, crossed)
+        beyond = maximum(beyond, where_less(narrow * absolute(db), -b, crossed, 0.0))
+        # a dip is looked for once in a step, so that each step comes to an end
+        may, dip = first * may_dip(a, h * da, b, h * db), 2.0 + 0.0 * h
+        if any_nonzero(may):
+            dip = where_less(0.5, may, cubic_dip(a, h * da, b, h * db), dip)
+        store(w, base + ROWS.dip + k * WIDTH, dip)
+        beyond = maximum(beyond, where_less(dip, 1.0, 1.0, 0.0))
+    judged = where_less(0.0, h, 1.0 - failed, 0.0)
+    takes = judged * beyond
+    lands = judged * passed * (1.0 - beyond)
+    turn_sides(w, base, judged * (1.0 - beyond), lands)
+    aim(w, base, takes, (judged - takes) * (1.0 - lands) * (1.0 - first), narrow)
+    return where_less(0.5, takes, TAKE_BACK, where_less(0.5, lands, LANDED, ACCEPT * h))
+
+
+def turn_sides(w: Any, base: int, accepted: Any, lands: Any) -> None:
+    """Turn the sides of events of which an accepted step ends beyond zero; note those that happened."""
+    for k in range(N_EVENTS):
+        row = base + k * WIDTH
+        _, _, b, _ = margin(w, base, k, pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k))
+        crossed = where_less(b, 0.0, accepted, 0.0)
+        store(w, row + ROWS.fired, where_less(0.5, crossed, lands * fires(w, base, k), 0.0 * lands))
+        side = load(w, row + ROWS.side)
+        store(w, row + ROWS.side, where_less(0.5, crossed, -side, side))
+
+
+def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
+    """Set the length of the next attempt: to the nearest zero between here and where one was passed.
+
+    After an attempt that is taken back, that is within its length; after a step that ended before the
+    zero, within what is left of an earlier one.
+    """
+    h = load(w, base + ROWS.step)
+    length = where_less(0.5, takes, h, load(w, base + ROWS.ahead) - h)
+    on = maximum(takes, where_less(0.0, length, goes_on, 0.0))
+    if not any_nonzero(on):
+        for row in (ROWS.resolution, ROWS.ahead, ROWS.aimed):
+            store(w, base + row, 0.0 * h)
+        return
+    nearest = length
+    for k in range(2 * N_EVENTS):
+        row = base + k * WIDTH
+        far, new = load(w, row + ROWS.passed), load(w, row + ROWS.found)
+        store(w, row + ROWS.passed, where_less(0.5, takes, new, far))
+    for k in range(N_EVENTS):
+        known, found = pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k)
+        near = (where_less(0.5, takes, known[0], found[0]), where_less(0.5, takes, known[1], found[1]))
+        a, da, b, db = margin(w, base, k, near, pair(w, base + ROWS.passed, k))
+        da, db = length * da, length * db
+        dip = where_less(0.5, takes, load(w, base + ROWS.dip + k * WIDTH), 2.0)
+        root = cubic_root(a, da, b, db, minimum(dip, 1.0))
+        x = where_less(b, 0.0, where_less(0.5, fires(w, base, k), root, dip), dip)
+        nearest = minimum(nearest, x * length)
+    narrow = WIDEN * narrow
+    store(w, base + ROWS.resolution, where_less(0.5, on, narrow, 0.0 * h))
+    store(w, base + ROWS.ahead, where_less(0.5, on, length, 0.0 * h))
+    # a little further, so that rounding does not leave it on the near side
+    store(w, base + ROWS.aimed, where_less(0.5, on, multiply_add(0.125, narrow, nearest), 0.0 * h))
+
+
+def section_counts(w: Any, base: int, lane: int) -> bool:
+    """Whether a zero is a crossing of the section: an angle's sine has another half a turn away."""
+    if w[base + ROWS.fired + (N_EVENTS - 1) * WIDTH + lane] < 0.5:
+        return False
+    if not IS_ANGLE[SECTION_OF]:
+        return True
+    x = w[base + ROWS.state + SECTION_OF * WIDTH + lane]
+    return cos(x - w[base + ROWS.level + lane]) > 0.0
+
+
+INLINE = ("cubic_dip", "may_dip", "cubic_root", "margin", "pair", "fires", "section_counts")
+"""Templates here that dissolve into their callers, callees first; they come before those of `CALLED`."""
+
+CALLED = ("turn_sides", "aim", "settle_events", "judge_events")
+"""The others."""

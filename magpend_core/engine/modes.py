@@ -1,0 +1,318 @@
+"""What happens at events: switches turn, states jump, tangent vectors with them.
+
+Templates for the engine's scalar pass, see `lanes`; they run once per event, on plain numbers of one lane.
+
+At a switch the right-hand side changes from f- to f+. If both sides point to the surface, the trajectory
+slides along it (Filippov): the mode is 0 until the equivalent control leaves its bounds. A tangent vector v
+changes by the saltation matrix, v + (f+ - f-) (grad g . v)/(dg/dt-), where g is the event's function; at an
+impact with the map R it becomes R'(v + f- s) - f+ s with s = -(grad g . v)/(dg/dt-), the shift of the
+impact's time (di Bernardo et al., Piecewise-smooth Dynamical Systems, Springer 2008, section 2.5). R' is a
+difference of order four, exact for maps up to the fourth power.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from magpend_core.engine.jit import inline
+from magpend_core.engine.simd import WIDTH
+from magpend_core.engine.system import System
+from magpend_core.engine.variational import DIVERGENCE
+from magpend_core.engine.vecmath import log
+
+STEP = 1e-3
+"""Step of the differences of an impact's map, in units of the states' scales."""
+
+NEAR = 1e-12
+"""An impact that leaves its function so near to zero, in units of rate and period, leaves it there."""
+
+
+AWAY = 1e-7
+"""A switch further from zero after an edge, in units of its rate and the period, is not on its surface."""
+
+LEAST_VOLUME = 1e-300
+"""Factor by which volumes count as changed where they vanish: where a trajectory begins to slide."""
+
+
+def _numbers(n: int) -> Callable[..., Any]:
+    """Return a function that reads `n` rows of one lane as a tuple."""
+    entries = "".join(f"w[at + {i * WIDTH}], " for i in range(n))
+    scope: dict[str, Any] = {"__name__": __name__}
+    exec(f"def numbers(w, at):\n    return ({entries})\n", scope)
+    return inline(scope["numbers"])
+
+
+def _reset_along(system: System, n: int) -> Callable[..., Any]:
+    """Return a function that gives an impact's map on the line through a state and a time."""
+    line = "".join(f"y[{i}] + s * dy[{i}], " for i in range(n))
+    scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_reset": system.reset}
+    exec(f"def reset_along(k, t, y, c, dt, dy, s):\n    return _reset(k, t + s * dt, ({line}), c)\n", scope)
+    return inline(scope["reset_along"])
+
+
+def mode_bindings(system: System) -> dict[str, Any]:
+    """Names that these templates use, for a system."""
+    base = system.tangents_of or system
+    has_divergence = system.tangents_of is not None and system.state_names[-1] == DIVERGENCE
+    n_vectors = (system.n_states - has_divergence) // base.n_states - 1
+    n_stages = system.tableau.n_stages
+    if has_divergence and system.n_impacts and base.n_states**2 > n_stages * system.n_states:
+        raise ValueError(
+            f"{system.name} has impacts and {base.n_states} states: the change of volumes at an impact needs "
+            f"{base.n_states**2 // n_stages // base.n_states} tangent vectors at least; give more exponents."
+        )
+    return {
+        "HAS_SEGMENTS": system.has_segments,
+        "HAS_SWITCHES": system.n_switches > 0,
+        "HAS_IMPACTS": system.n_impacts > 0,
+        "HAS_VECTORS": n_vectors > 0,
+        "SLIDES": (*system.slides, False),
+        "ZEROS": (0.0,) * system.n_states,
+        "N_BASE": base.n_states,
+        "N_VECTORS": n_vectors,
+        # with unit vectors, where the change of volumes is wanted
+        "N_THROUGH": n_vectors + (base.n_states if has_divergence else 0),
+        "HAS_DIVERGENCE": has_divergence,
+        "lane_states": _numbers(system.n_states),
+        "lane_base": _numbers(base.n_states),
+        "lane_constants": _numbers(system.n_constants + system.n_modes),
+        "reset_along": _reset_along(system, base.n_states),
+    }
+
+
+def lane_pairs(w: Any, base: int, lane: int, dy: Any) -> Any:
+    """Values and rates of a lane's events, for any rates `dy` of its states."""
+    y = lane_states(w, base + ROWS.state + lane)
+    c = lane_constants(w, base + ROWS.constants + lane)
+    level = w[base + ROWS.level + lane] if HAS_SECTION else 0.0
+    return event_values(w[base + ROWS.time + lane], y, dy, c, level)
+
+
+def lane_rates(w: Any, base: int, lane: int) -> Any:
+    """Rates of a lane's states."""
+    c = lane_constants(w, base + ROWS.constants + lane)
+    u = forcing(w[base + ROWS.time + lane], c)
+    return rhs(lane_states(w, base + ROWS.state + lane), u, c)
+
+
+def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
+    """Put the switches on the sides where the state is; on the surface on those they have, if `given`."""
+    for k in range(N_SWITCHES):
+        mode = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
+        if not given or w[mode] == 0.0:
+            w[mode] = 1.0
+    pairs = lane_pairs(w, base, lane, lane_states(w, base + ROWS.state + lane))
+    for k in range(N_SWITCHES):
+        mode = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
+        if pairs[2 * k] != 0.0:
+            w[mode] = 1.0 if pairs[2 * k] > 0.0 else -1.0
+        w[base + ROWS.side + k * WIDTH + lane] = w[mode]
+
+
+def gradient_along(w: Any, base: int, lane: int, k: int, vector: Any) -> float:
+    """Derivative of event `k`'s function along a change of the states."""
+    at_rest = lane_pairs(w, base, lane, ZEROS)
+    return lane_pairs(w, base, lane, vector)[2 * k + 1] - at_rest[2 * k + 1]
+
+
+def switch_rate(w: Any, base: int, lane: int, k: int, side: float) -> float:
+    """Rate of switch `k` with the right-hand side of one side."""
+    w[base + ROWS.constants + (N_OWN + k) * WIDTH + lane] = side
+    return lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * k + 1]
+
+
+def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
+    """Mode of switch `k` after its event."""
+    if not SLIDES[k]:
+        return -mode
+    above, below = switch_rate(w, base, lane, k, 1.0), switch_rate(w, base, lane, k, -1.0)
+    if mode == 0.0:
+        return 1.0 if above + below > 0.0 else -1.0
+    if above < 0.0 and below > 0.0:
+        return 0.0
+    if above > 0.0 and below > 0.0:
+        return 1.0
+    if above < 0.0 and below < 0.0:
+        return -1.0
+    return -mode
+
+
+def keep_switches(w: Any, base: int, lane: int) -> None:
+    """Change the modes that no longer fit after a jump in time: at an edge values and forces can jump."""
+    pairs = lane_pairs(w, base, lane, lane_states(w, base + ROWS.state + lane))
+    for k in range(N_SWITCHES):
+        own = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
+        mode = w[own]
+        if mode == 0.0:
+            # the surface can have jumped away from the state that slid on it
+            fastest = max(abs(switch_rate(w, base, lane, k, 1.0)), abs(switch_rate(w, base, lane, k, -1.0)))
+            value = lane_pairs(w, base, lane, lane_states(w, base + ROWS.state + lane))[2 * k]
+            w[own] = mode
+            if abs(value) > AWAY * fastest * w[base + ROWS.period + lane]:
+                mode = 1.0 if value > 0.0 else -1.0
+            elif pairs[2 * k] < 0.0:
+                mode = next_mode(w, base, lane, k, mode)
+        elif mode != 0.0 and pairs[2 * k] != 0.0:
+            mode = 1.0 if pairs[2 * k] > 0.0 else -1.0
+        w[own] = mode
+        w[base + ROWS.side + k * WIDTH + lane] = mode if mode != 0.0 else 1.0
+
+
+def begin_events(w: Any, base: int, lane: int) -> None:
+    """Let a lane know nothing of its events but where its switches are; the rest is found with the slopes."""
+    for k in range(N_EVENTS):
+        w[base + ROWS.side + k * WIDTH + lane] = 0.0
+        w[base + ROWS.fired + k * WIDTH + lane] = 0.0
+    w[base + ROWS.aimed + lane] = 0.0
+    w[base + ROWS.resolution + lane] = 0.0
+    if HAS_SWITCHES:
+        seat_switches(w, base, lane, False)
+
+
+def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
+    """Change the mode of a switch on whose surface a lane is, and its tangent vectors."""
+    own = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
+    mode = w[own]
+    if HAS_VECTORS:
+        before = lane_rates(w, base, lane)
+        rate = lane_pairs(w, base, lane, before)[2 * k + 1]
+        for j in range(N_VECTORS):
+            at = base + ROWS.state + N_BASE * (1 + j) * WIDTH + lane
+            along = gradient_along(w, base, lane, k, lane_base(w, at))
+            w[base + ROWS.trial + j * WIDTH + lane] = along / rate if rate != 0.0 else 0.0
+    new = next_mode(w, base, lane, k, mode)
+    w[own] = new
+    if HAS_VECTORS:
+        after = lane_rates(w, base, lane)
+        for j in range(N_VECTORS):
+            share = w[base + ROWS.trial + j * WIDTH + lane]
+            for i in range(N_BASE):
+                w[base + ROWS.state + (N_BASE * (1 + j) + i) * WIDTH + lane] += (after[i] - before[i]) * share
+        if HAS_DIVERGENCE:
+            # the determinant of the saltation matrix is the quotient of the rates of the same function
+            w[own] = mode
+            quotient = lane_pairs(w, base, lane, after)[2 * k + 1] / rate if rate != 0.0 else 1.0
+            w[own] = new
+            w[base + ROWS.state + (N - 1) * WIDTH + lane] += log(max(abs(quotient), LEAST_VOLUME))
+    w[base + ROWS.side + k * WIDTH + lane] = new if new != 0.0 else 1.0
+
+
+def vector_row(base: int, lane: int, j: int) -> int:
+    """Where vector number `j` of those that go through an impact begins: tangents, then unit vectors."""
+    if j < N_VECTORS:
+        return base + ROWS.state + N_BASE * (1 + j) * WIDTH + lane
+    return base + ROWS.slopes + N_BASE * (j - N_VECTORS) * WIDTH + lane
+
+
+def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
+    """Take vectors through the map of impact `k`, and note the shifts of its time in `trial`."""
+    t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
+    c = lane_constants(w, base + ROWS.constants + lane)
+    before = lane_rates(w, base, lane)
+    rate = lane_pairs(w, base, lane, before)[2 * (N_SWITCHES + k) + 1]
+    for j in range(N_THROUGH):
+        at = vector_row(base, lane, j)
+        along = gradient_along(w, base, lane, N_SWITCHES + k, lane_base(w, at))
+        shift = -along / rate if rate != 0.0 else 0.0
+        w[base + ROWS.trial + j * WIDTH + lane] = shift
+        size = 0.0
+        for i in range(N_BASE):
+            w[at + i * WIDTH] += before[i] * shift
+            size = max(size, abs(w[at + i * WIDTH]) / SCALES[i])
+        s = STEP / size if size > 0.0 else 1.0
+        v = lane_base(w, at)
+        far, near = reset_along(k, t, y, c, shift, v, 2.0 * s), reset_along(k, t, y, c, shift, v, s)
+        back, behind = reset_along(k, t, y, c, shift, v, -s), reset_along(k, t, y, c, shift, v, -2.0 * s)
+        for i in range(N_BASE):
+            w[at + i * WIDTH] = (8.0 * (near[i] - back[i]) - (far[i] - behind[i])) / (12.0 * s)
+
+
+def set_units(w: Any, base: int, lane: int) -> None:
+    """Put unit vectors behind the tangent vectors of `vector_row`; the slopes there are used no more."""
+    for j in range(N_VECTORS, N_THROUGH):
+        for i in range(N_BASE):
+            w[vector_row(base, lane, j) + i * WIDTH] = 1.0 if i == j - N_VECTORS else 0.0
+
+
+def log_volume(w: Any, at: int) -> float:
+    """Logarithm of the absolute determinant of the N_BASE vectors in rows from `at`, which are used up."""
+    total, n = 0.0, N_BASE
+    for j in range(n):
+        best = j
+        for i in range(j + 1, n):
+            if abs(w[at + (n * i + j) * WIDTH]) > abs(w[at + (n * best + j) * WIDTH]):
+                best = i
+        for i in range(n):
+            a, b = at + (n * j + i) * WIDTH, at + (n * best + i) * WIDTH
+            w[a], w[b] = w[b], w[a]
+        pivot = w[at + (n * j + j) * WIDTH]
+        total += log(max(abs(pivot), LEAST_VOLUME))
+        for i in range(j + 1, n):
+            factor = w[at + (n * i + j) * WIDTH] / pivot if pivot != 0.0 else 0.0
+            for m in range(j, n):
+                w[at + (n * i + m) * WIDTH] -= factor * w[at + (n * j + m) * WIDTH]
+    return total
+
+
+def jump(w: Any, base: int, lane: int, k: int) -> None:
+    """Apply the map of impact `k` to a lane on its surface, and to its tangent vectors."""
+    event = N_SWITCHES + k
+    pairs = lane_pairs(w, base, lane, lane_rates(w, base, lane))
+    value, rate = pairs[2 * event], pairs[2 * event + 1]
+    t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
+    new = reset_along(k, t, y, lane_constants(w, base + ROWS.constants + lane), 0.0, y, 0.0)
+    if HAS_VECTORS:
+        set_units(w, base, lane)
+        jump_vectors(w, base, lane, k)
+    for i in range(N_BASE):
+        w[base + ROWS.state + i * WIDTH + lane] = new[i]
+    if HAS_SWITCHES:
+        seat_switches(w, base, lane, True)
+    if HAS_VECTORS:
+        after = lane_rates(w, base, lane)
+        for j in range(N_THROUGH):
+            shift, at = w[base + ROWS.trial + j * WIDTH + lane], vector_row(base, lane, j)
+            for i in range(N_BASE):
+                w[at + i * WIDTH] -= after[i] * shift
+        if HAS_DIVERGENCE:
+            volume = log_volume(w, base + ROWS.slopes + lane)
+            w[base + ROWS.state + (N - 1) * WIDTH + lane] += volume
+    # it comes back to the side that it came from, unless the map has put it elsewhere
+    side = -w[base + ROWS.side + event * WIDTH + lane]
+    moved = side * lane_pairs(w, base, lane, ZEROS)[2 * event]
+    bound = 4.0 * abs(value) + NEAR * abs(rate) * w[base + ROWS.period + lane]
+    for i in range(N_SWITCHES, N_EVENTS):
+        w[base + ROWS.side + i * WIDTH + lane] = 0.0
+    w[base + ROWS.side + event * WIDTH + lane] = -side if moved < -bound else side
+
+
+def act_on_events(w: Any, base: int, lane: int) -> bool:
+    """Do what the events ask for on which a lane's step has ended; return whether it is on a section."""
+    on_section = False
+    if HAS_SECTION:
+        on_section = section_counts(w, base, lane)
+    fired = base + ROWS.fired + lane
+    if HAS_SWITCHES:
+        for k in range(N_SWITCHES):
+            if w[fired + k * WIDTH] > 0.5:
+                turn_switch(w, base, lane, k)
+                w[base + ROWS.fresh + lane] = 1.0
+    if HAS_IMPACTS:
+        for k in range(N_IMPACTS):
+            if w[fired + (N_SWITCHES + k) * WIDTH] > 0.5:
+                jump(w, base, lane, k)
+                w[base + ROWS.fresh + lane] = 1.0
+    for k in range(N_EVENTS):
+        w[fired + k * WIDTH] = 0.0
+    return on_section
+
+
+INLINE = ("lane_pairs", "lane_rates", "gradient_along", "switch_rate", "vector_row")
+"""Templates here that dissolve into their callers, callees first; they come before those of `CALLED`."""
+
+CALLED = (
+    "seat_switches", "next_mode", "keep_switches", "begin_events", "turn_switch", "jump_vectors", "set_units",
+    "log_volume", "jump", "act_on_events",
+)  # fmt: skip
+"""The others."""

@@ -1,0 +1,110 @@
+"""Equilibria of flows: Newton's method on the rates, with the eigenvalues of their Jacobian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magpend_core.engine.system import System
+from magpend_core.pointwise import jacobian_at, rates_at
+
+TRUST = 0.5
+"""Longest Newton step in units of the system's scales."""
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibria:
+    """Equilibria near given states, one per row.
+
+    Attributes
+    ----------
+    states : ndarray, (n, n_states)
+        The last iterate.
+    eigenvalues : ndarray of complex, (n, n_states)
+        Of the Jacobian [1/s], by falling real part: their real parts are the Lyapunov exponents.
+    residual : ndarray, (n,)
+        Scaled length of the Newton step from there: the distance from the equilibrium to first order.
+    converged : ndarray of bool, (n,)
+        Whether that is within the tolerance.
+    """
+
+    states: np.ndarray
+    eigenvalues: np.ndarray
+    residual: np.ndarray
+    converged: np.ndarray
+
+    @property
+    def is_stable(self) -> np.ndarray:
+        """Whether all eigenvalues have negative real parts."""
+        return np.asarray(self.eigenvalues.real.max(axis=1) < 0.0)
+
+
+def newton_steps(system: System, states: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Newton steps to an equilibrium, and the Jacobians, at states with common parameters.
+
+    Parameters
+    ----------
+    system
+        Without a drive.
+    states
+        Finite ones, shape (n, n_states).
+    packed
+        Parameters, shape (n_parameters,).
+
+    Returns
+    -------
+    steps : ndarray, (n, n_states)
+        In the least-squares sense where the Jacobian is singular.
+    jacobians : ndarray, (n, n_states, n_states)
+    """
+    rates, jacobians = rates_at(system, states, packed), jacobian_at(system, states, packed)
+    good = np.isfinite(rates).all(axis=1) & np.isfinite(jacobians).all(axis=(1, 2))
+    steps = np.full(states.shape, np.nan)
+    inverse = np.linalg.pinv(jacobians[good], rcond=1e-14)
+    steps[good] = -np.einsum("nij,nj->ni", inverse, rates[good])
+    return steps, jacobians
+
+
+def find_equilibria(
+    system: System,
+    states: np.ndarray,
+    packed: np.ndarray,
+    *,
+    tolerance: float = 1e-10,
+    max_iterations: int = 30,
+) -> Equilibria:
+    """Find the equilibria near given states.
+
+    Parameters
+    ----------
+    system
+        Without a drive, with a Jacobian.
+    states
+        Guesses, shape (n, n_states).
+    packed
+        Parameters of all, shape (n_parameters,).
+    tolerance
+        Scaled length of a Newton step at which an equilibrium counts as found.
+    max_iterations
+        Limit on the steps.
+    """
+    found = np.array(states, np.float64)
+    scales = np.asarray(system.scales)
+    residual = np.full(len(found), np.nan)
+    jacobians = np.full((len(found), system.n_states, system.n_states), np.nan)
+    rows = np.flatnonzero(np.isfinite(found).all(axis=1))
+    for _ in range(max_iterations + 1):
+        if not len(rows):
+            break
+        steps, jacobians[rows] = newton_steps(system, found[rows], packed)
+        residual[rows] = np.abs(steps / scales).max(axis=1)
+        going = residual[rows] > 0.01 * tolerance
+        rows, steps, lengths = rows[going], steps[going], residual[rows[going]]
+        found[rows] += steps * np.minimum(1.0, TRUST / lengths)[:, None]
+    converged = residual <= tolerance
+    eigenvalues = np.full((len(found), system.n_states), np.nan, np.complex128)
+    for row in np.flatnonzero(converged):
+        values = np.linalg.eigvals(jacobians[row])
+        eigenvalues[row] = values[np.lexsort((values.imag, -values.real))]
+    return Equilibria(found, eigenvalues, residual, converged)

@@ -1,0 +1,135 @@
+"""A model of a flow seen through a section by crossing: its level is one more parameter, the last."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magpend_core.crossing import LEVEL, Crossing
+from magpend_core.models.model import Mirror, Model
+from magpend_core.models.parameters import Parameter, Parameters
+from magpend_core.models.presets import Preset
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from magpend_core.engine.system import System
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SectionedModel(Model):
+    """A model whose sections are crossings; made by `sectioned`.
+
+    Attributes
+    ----------
+    whole : Model
+        The model without the section.
+    through : Crossing
+        The section.
+    """
+
+    whole: Model
+    through: Crossing
+
+    @property
+    def crossing(self) -> Crossing | None:
+        """The section."""
+        return self.through
+
+    @property
+    def flow(self) -> Model:
+        """The model without the section."""
+        return self.whole
+
+    @property
+    def section_states(self) -> tuple[str, ...]:
+        """Names of the states but the one that crosses; of a flow of one state that one."""
+        return tuple(name for name in self.state_names if name != self.through.of) or self.state_names
+
+    @property
+    def reference(self) -> str | Mapping[str, Any]:
+        """What runs keep of the model without the section."""
+        return self.whole.reference
+
+    @cached_property
+    def system(self) -> System:
+        """What the engine integrates, with its crossing; imports the compiler."""
+        from magpend_core.engine.crossing import with_section
+
+        return with_section(self.whole.system, self.through.of, self.through.sign)
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of the model's meaning and of the state and direction of the section."""
+        seen = f"{self.whole.digest} {self.through.of} {self.through.direction}"
+        return hashlib.sha256(seen.encode()).hexdigest()[: len(self.whole.digest)]
+
+    def preset(self, name: str | Path | Preset | None = None) -> Preset:
+        """Return a preset of the model with the section's level added; see `Model.preset`."""
+        if isinstance(name, Preset) and LEVEL in name.values:
+            return name
+        return _with_level(self.whole.preset(name), self.through)
+
+
+@cache
+def sectioned(model: Model, crossing: Crossing) -> SectionedModel:
+    """Return a model seen through a section: the same object for the same model and section.
+
+    Parameters
+    ----------
+    model
+        Of a flow without a drive.
+    crossing
+        Its section.
+
+    Raises
+    ------
+    ParameterError
+        If the section is of no state of the model.
+    ValueError
+        If the model is forced, or has a parameter named like the section's level.
+    """
+    if not model.autonomous:
+        raise ValueError(
+            f"{model.name} is forced: its sections are at the drive's period; drop the crossing."
+        )
+    if LEVEL in model.parameter_names:
+        raise ValueError(f"{model.name} has a parameter named {LEVEL}, which is the level's name; rename it.")
+    state = model.state(crossing.of)
+    own = {f.name: getattr(model, f.name) for f in dataclasses.fields(Model)}
+    level = Parameter(LEVEL, state.unit, f"level of {state.name} at the section")
+    changes: dict[str, Any] = {
+        "parameters": (*model.parameters, level),
+        "presets": tuple(_with_level(p, crossing) for p in model.presets),
+        "section": crossing.sentence,
+        "mirror": _mirror(model, crossing),
+    }
+    return SectionedModel(**{**own, **changes}, whole=model, through=crossing)
+
+
+def of_flow(parameters: Parameters) -> Parameters:
+    """Return the parameters of the flow without its section, whose trajectories are the same."""
+    model = parameters.model.flow
+    if model is parameters.model:
+        return parameters
+    return Parameters(model, {name: parameters[name] for name in model.parameter_names})
+
+
+def _with_level(preset: Preset, crossing: Crossing) -> Preset:
+    return dataclasses.replace(
+        preset,
+        values={**preset.values, LEVEL: crossing.value},
+        provenance={**preset.provenance, LEVEL: "the section of the run"},
+    )
+
+
+def _mirror(model: Model, crossing: Crossing) -> Mirror | None:
+    """Return the model's symmetry if it maps the section on itself, and takes no part of a drive's period."""
+    mirror = model.mirror
+    if mirror is None or mirror.half_period or mirror.signs[model.state_names.index(crossing.of)] < 0:
+        return None
+    return mirror

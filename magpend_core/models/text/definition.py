@@ -1,0 +1,135 @@
+"""What a text says of a model, once it has been read and holds together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from magpend_core.models.model import Mirror, Preset, Quantity, State
+from magpend_core.models.parameters import Parameter
+from magpend_core.models.text.grammar import Tree, names, written
+
+
+@dataclass(frozen=True)
+class Impact:
+    """An instant at which states jump: where an expression passes zero.
+
+    Attributes
+    ----------
+    of : Tree
+    direction : int
+        +1 for rising through zero, -1 for falling.
+    set : dict
+        New value by name of the state; the others stay.
+    """
+
+    of: Tree
+    direction: int
+    set: Mapping[str, Tree]
+
+
+@dataclass(frozen=True)
+class DrawingText:
+    """A drawing: places of points as expressions, see `magpend_core.models.model.Drawing`."""
+
+    points: Mapping[str, tuple[Tree, Tree]]
+    fixed: Mapping[str, tuple[Tree, Tree]]
+    lines: tuple[tuple[str, ...], ...]
+    trace: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class ClassifierText:
+    """Words for motions, each with a condition on the states that all kept sections must meet."""
+
+    meaning: str
+    words: Mapping[str, Tree]
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A text that holds together: every name is known, every expression is one.
+
+    Attributes
+    ----------
+    name, title, source, section : str
+    states, parameters : tuple
+    define, equations, quantities : mapping of str to Tree
+        Equations in the order of the states.
+    described : tuple of Quantity
+        In the order of `quantities`.
+    impacts, drawing, mirror, presets, classifier
+        The first of the presets has the values of the table of parameters.
+    table : dict
+        The text as plain data.
+    """
+
+    name: str
+    title: str
+    source: str
+    section: str
+    states: tuple[State, ...]
+    parameters: tuple[Parameter, ...]
+    define: Mapping[str, Tree]
+    equations: Mapping[str, Tree]
+    quantities: Mapping[str, Tree]
+    described: tuple[Quantity, ...]
+    impacts: tuple[Impact, ...]
+    drawing: DrawingText | None
+    mirror: Mirror | None
+    presets: tuple[Preset, ...]
+    classifier: ClassifierText | None
+    table: Mapping[str, Any] = field(repr=False)
+
+    def used(self, trees: Iterable[Tree]) -> tuple[str, ...]:
+        """All names that expressions need, through definitions; each definition after those that it needs."""
+        found: dict[str, None] = {}
+        pending = [(name, False) for tree in trees for name, _ in names(tree)][::-1]
+        while pending:
+            name, complete = pending.pop()
+            if name in found:
+                continue
+            if complete or name not in self.define:
+                found[name] = None
+            else:
+                pending.append((name, True))
+                pending += [(inner, False) for inner, _ in names(self.define[name])][::-1]
+        return tuple(found)
+
+    @property
+    def autonomous(self) -> bool:
+        """Whether neither the equations nor the impacts need time or frequency."""
+        trees = [*self.equations.values(), *(i.of for i in self.impacts)]
+        trees += [tree for impact in self.impacts for tree in impact.set.values()]
+        return not {"t", "f", "phase"} & set(self.used(trees))
+
+    def meaning(self) -> str:
+        """What decides numbers, in one way of writing: the same for texts that differ in layout or words."""
+        bounds = [[p.name, p.bound] for p in self.parameters]
+        plain = {
+            "states": [[s.name, s.on_circle, repr(s.scale), repr(s.escape)] for s in self.states],
+            "parameters": bounds,
+            "define": {name: written(tree) for name, tree in self.define.items()},
+            "equations": {name: written(tree) for name, tree in self.equations.items()},
+            "quantities": [[name, written(tree)] for name, tree in self.quantities.items()],
+            "impacts": [
+                [written(i.of), i.direction, {name: written(tree) for name, tree in i.set.items()}]
+                for i in self.impacts
+            ],
+        }
+        return json.dumps(plain, sort_keys=True)
+
+
+def needed(tree: Tree, define: Mapping[str, Tree]) -> Iterator[str]:
+    """All names that an expression needs, through definitions."""
+    seen: set[str] = set()
+    pending = [name for name, _ in names(tree)]
+    while pending:
+        name = pending.pop()
+        if name not in seen:
+            seen.add(name)
+            yield name
+            pending += [inner for inner, _ in names(define[name])] if name in define else []

@@ -1,0 +1,374 @@
+"""Source of the engine's functions from derived expressions.
+
+No name and no character of a model's text stands in it: states, parameters and constants are numbered.
+
+Sums are written as nested ``multiply_add``, so that no two bare products are added: the compiler could fuse
+either of them, and its choice depends on what else it sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from magpend_core.models.text.derive import Derived
+from magpend_core.models.text.graph import CONSTANT, STATED, Node, in_order
+
+SIMD = ("sqrt", "absolute", "minimum", "maximum", "copysign", "where_less", "multiply_add", "floor")
+"""What comes from `engine.simd`; other functions come from `engine.vecmath`."""
+_NAMES = {"less": "where_less", "square": "square_wave"}
+
+
+class Writer:
+    """Writes the lines of one function.
+
+    Parameters
+    ----------
+    leaves
+        How a node is called that is given, by its number.
+    """
+
+    def __init__(self, leaves: Mapping[int, str]) -> None:
+        self.leaves = leaves
+        self.lines: list[str] = []
+        self.inverse_roots: set[int] = set()
+
+    def write(self, roots: Iterable[Node]) -> list[str]:
+        """Write all that some nodes need; return how they are called."""
+        roots = list(roots)
+        wanted = self._wanted(roots)
+        for node in in_order(wanted.values()):
+            if node.number in wanted and node.op != "number" and node.number not in self.leaves:
+                self._line(node, wanted)
+        return [self.name(root) for root in roots]
+
+    def _wanted(self, roots: list[Node]) -> dict[int, Node]:
+        """Nodes whose value is needed by itself; products within sums are not among them."""
+        wanted: dict[int, Node] = {}
+        pending = list(roots)
+        while pending:
+            node = pending.pop()
+            if node.number in wanted:
+                continue
+            wanted[node.number] = node
+            if node.number in self.leaves:
+                continue
+            under = root_under(node)
+            if under is not None:
+                pending += (node.args[0], under[0])
+                continue
+            for arg in node.args:
+                unfolds = arg.op == "neg" and node.op == "add" and arg.number not in self.leaves
+                inner = arg.args[0] if unfolds else arg
+                fused = node.op == "add" and inner.op == "mul" and inner.number not in self.leaves
+                pending += inner.args if fused else (inner,)
+        return wanted
+
+    def name(self, node: Node) -> str:
+        """How a node is called."""
+        if node.number in self.leaves:
+            return self.leaves[node.number]
+        if node.op == "number":
+            return repr(node.value)
+        return f"v{node.number}"
+
+    def _line(self, node: Node, wanted: Mapping[int, Node]) -> None:
+        target = f"v{node.number}"
+        under = root_under(node)
+        if under is not None:
+            self.lines.append(f"{target} = {self._by_root(node.args[0], *under)}")
+            return
+        if node.op in ("sin", "cos"):
+            other = _twin(node, wanted)
+            if other is not None and other.number not in self.leaves:
+                if other.number > node.number:
+                    sine, cosine = (node, other) if node.op == "sin" else (other, node)
+                    names = f"v{sine.number}, v{cosine.number}"
+                    self.lines.append(f"{names} = sincos({self.name(node.args[0])})")
+                return
+        self.lines.append(f"{target} = {self._value(node)}")
+
+    def _by_root(self, above: Node, x: Node, n: int) -> str:
+        """A number over the n-th power of a root, without division; no bare product: it could be fused."""
+        root = f"w{x.number}"
+        if x.number not in self.inverse_roots:
+            self.inverse_roots.add(x.number)
+            self.lines.append(f"{root} = inverse_sqrt({self.name(x)})")
+        factors = [root] if n == 1 else [root, f"({root} * {root})"] if n == 3 else []
+        if n == 5:
+            self.lines.append(f"{root}_2 = {root} * {root}")
+            factors = [root, f"({root}_2 * {root}_2)"]
+        if not above.is_number(1.0):
+            factors = [self.name(above), " * ".join(factors)]
+        return factors[0] if len(factors) == 1 else f"multiply_add({factors[0]}, {factors[1]}, 0.0)"
+
+    def _value(self, node: Node) -> str:
+        args = [self.name(arg) for arg in node.args] if node.op != "add" else []
+        if node.op == "add":
+            return self._sum(node)
+        if node.op == "mul":
+            return f"{args[0]} * {args[1]}"
+        if node.op == "div":
+            return f"{args[0]} / {args[1]}"
+        if node.op == "neg":
+            return f"-{args[0]}"
+        if node.op == "held":
+            return args[0]
+        if node.op == "choice":
+            raise AssertionError("choices are spelled out before")
+        return f"{_NAMES.get(node.op, node.op)}({', '.join(args)})"
+
+    def _sum(self, node: Node) -> str:
+        plain: list[tuple[str, Node]] = []
+        products: list[tuple[str, Node]] = []
+        for term in node.args:
+            known = term.number in self.leaves  # minus a parameter is a constant of the cell
+            sign, inner = ("-", term.args[0]) if term.op == "neg" and not known else ("", term)
+            fused = inner.op == "mul" and inner.number not in self.leaves
+            (products if fused else plain).append((sign, inner))
+        plain.sort(key=lambda term: term[0] == "-")  # begin with what needs no sign
+        total = ""
+        for sign, inner in plain:
+            name = self.name(inner)
+            total = f"{total} {sign or '+'} {name}" if total else f"{sign}{name}"
+        for sign, inner in products:
+            a, b = (self.name(arg) for arg in inner.args)
+            total = f"multiply_add({sign}{a}, {b}, {total})" if total else f"{sign}{a} * {b}"
+        return total
+
+
+def root_under(node: Node) -> tuple[Node, int] | None:
+    """For a quotient by sqrt(x), x sqrt(x) or x x sqrt(x) that changes with the state: x, and 1, 3 or 5."""
+    if node.op != "div" or node.args[1].kind != STATED:
+        return None
+    below = node.args[1]
+    if below.op == "sqrt":
+        return below.args[0], 1
+    if below.op != "mul":
+        return None
+    for whole, root in (below.args, below.args[::-1]):
+        if root.op == "sqrt":
+            x = root.args[0]
+            if whole is x:
+                return x, 3
+            if whole.op == "mul" and whole.args[0] is x and whole.args[1] is x:
+                return x, 5
+    return None
+
+
+def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
+    """The cosine of a sine's argument, or the other way round, if that is wanted, too."""
+    other = "cos" if node.op == "sin" else "sin"
+    for candidate in wanted.values():
+        if candidate.op == other and candidate.args[0] is node.args[0]:
+            return candidate
+    return None
+
+
+def constants_of(roots: Iterable[Node]) -> list[Node]:
+    """What changes with the cell alone, and is wanted or used by what changes with time or state."""
+    roots = list(roots)
+    found = {root.number: root for root in roots if root.kind == CONSTANT}
+    for node in in_order(roots):
+        if node.kind != CONSTANT:
+            found.update({a.number: a for a in node.args if a.kind == CONSTANT})
+    return [node for _, node in sorted(found.items()) if node.op != "number"]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Generated functions.
+
+    Attributes
+    ----------
+    text : str
+        Python source.
+    n_constants, n_modes, n_edges : int
+        Numbers of what they use and fill.
+    """
+
+    text: str
+    n_constants: int
+    n_modes: int
+    n_edges: int
+
+
+def source_of(derived: Derived) -> Source:
+    """Write all functions of a system that it has."""
+    forcing = () if derived.forcing is None else (derived.forcing,)
+    layers = [node for la in derived.layers for node in (la.value, la.rate, la.half_width, la.per_strength)]
+    switches = [node for pair in derived.sliding.pairs for node in pair]
+    impacts = [node for jump in derived.impacts for node in (jump.value, jump.rate)]
+    resets = [node for jump in derived.impacts for node in jump.states]
+    roots = (
+        *derived.rates,
+        *derived.jacobian,
+        *derived.quantities,
+        *forcing,
+        *layers,
+        *switches,
+        *impacts,
+        *resets,
+    )
+    constants = constants_of(roots)
+    n_constants, n_modes = max(1, len(constants)), len(derived.switches) + bool(derived.instants)
+    leaves = _leaves(derived, constants, n_constants, n_modes)
+    timed = leaves | {n.number: "t" for n in derived.graph.nodes if n.op == "time"}
+    behind = dict.fromkeys((n for n, name in timed.items() if name == "t"), f"dy[{len(derived.rates)}]")
+    driven = leaves if derived.forcing is None else leaves | {derived.forcing.number: "u"}
+    parts = [
+        *_edges(derived),
+        _constants(constants),
+        _forcing(derived.forcing, timed),
+        _tuple("rhs", "y, u, c", derived.rates, driven),
+        _tuple("jacobian", "y, u, c", derived.jacobian, driven),
+        _tuple("quantities", "t, y, dy, u, c", derived.quantities, timed | driven),
+        _tuple("layers", "y, dy, c", layers, leaves | behind, 4),
+        _tuple("switches", "t, y, dy, c", switches, timed, 2),
+        _tuple("impacts", "t, y, dy, c", impacts, timed, 2),
+        _reset(derived, timed),
+    ]
+    return Source("\n\n".join(parts) + "\n", n_constants, n_modes, derived.n_edges)
+
+
+def _leaves(derived: Derived, constants: list[Node], n_constants: int, n_modes: int) -> dict[int, str]:
+    names = {node.number: f"c[{i}]" for i, node in enumerate(constants)}
+    for node in derived.graph.nodes:
+        if node.op in ("state", "rate"):
+            names[node.number] = f"{'y' if node.op == 'state' else 'dy'}[{int(node.value)}]"
+        if node.op in ("mode_side", "mode_clock"):
+            names[node.number] = f"c[{n_constants + int(node.value)}]"
+        if node.op == "segment":
+            names[node.number] = f"c[{n_constants + n_modes - 1}]"
+    return names
+
+
+def _cell(roots: Iterable[Node]) -> dict[int, str]:
+    """Leaves of what changes with the cell alone."""
+    names = {}
+    for node in in_order(roots):
+        if node.op == "parameter":
+            names[node.number] = f"p[{int(node.value)}]"
+        if node.op == "frequency":
+            names[node.number] = "frequency"
+        if node.op == "time":
+            names[node.number] = "t"
+        if node.op == "rank":
+            names[node.number] = f"(rank(at, {int(node.value)}) + 1.0)"
+    return names
+
+
+def _function(name: str, arguments: str, lines: list[str]) -> str:
+    return "\n    ".join((f"def {name}({arguments}):", *lines))
+
+
+def _constants(constants: list[Node]) -> str:
+    writer = Writer(_cell(constants))
+    names = writer.write(constants)
+    lines = [f"out[{i}] = {name}" for i, name in enumerate(names)] or ["out[0] = 0.0"]
+    ranked = any(n.op == "rank" for n in in_order(constants))
+    first = ["at = instants(frequency, p)"] if ranked else []
+    return _function("constants", "frequency, p, out", [*first, *writer.lines, *lines])
+
+
+def _scalar(name: str, arguments: str, roots: list[Node]) -> str:
+    """A function of plain numbers of the cell, and of time if it is an argument."""
+    writer = Writer(_cell(roots))
+    names = [f"{name} + 0.0" for name in writer.write(roots)]
+    return _function(name, arguments, [*writer.lines, f"return {', '.join(names)}" + "," * (len(names) > 1)])
+
+
+def _edges(derived: Derived) -> list[str]:
+    """Functions of the instants of a period: those of jumps, then the zeros of waves."""
+    n_instants, parts, names = len(derived.instants), [], []
+    for i, instant in enumerate(derived.instants):
+        parts.append(_scalar(f"instant{i}", "frequency, p", [instant.time]))
+        names.append(f"within(instant{i}(frequency, p), period)")
+    widths, jumps = ["math_inf"] * n_instants, ["1.0"] * n_instants
+    for i, wave in enumerate(derived.waves):
+        parts.append(_scalar(f"wave{i}", "t, frequency, p", [wave.value]))
+        parts.append(_scalar(f"slope{i}", "t, frequency, p", [wave.slope]))
+        parts.append(_scalar(f"strength{i}", "frequency, p", [wave.distance, wave.jump]))
+        parts.append(_ZERO.format(i=i))
+        for k in range(wave.count):
+            names.append(f"zero{i}(frequency, p, {k})")
+            slope = f"max(abs(slope{i}(at[{len(names) - 1}], frequency, p)), 1e-300)"
+            widths.append(f"max(strength{i}(frequency, p)[0] / {slope}, 1e-300)")
+            jumps.append(f"strength{i}(frequency, p)[1]")
+    if not names:
+        return []
+    lines = ["period = 1.0 / frequency", f"return ({', '.join(names)},)"]
+    parts.append(_function("instants", "frequency, p", lines))
+    lines = ["at = instants(frequency, p)", "set_times(at, 1.0 / frequency, times)"]
+    for i, (width, jump) in enumerate(zip(widths, jumps, strict=True)):
+        lines += [f"half_widths[rank(at, {i})] = {width}", f"jumps[rank(at, {i})] = {jump}"]
+    parts.append(_function("edges", "frequency, p, times, half_widths, jumps", lines))
+    return parts
+
+
+# bisected between instants that do not lie symmetrically about 0, where drives like to begin
+_ZERO = """def zero{i}(frequency, p, k):
+    period = 1.0 / frequency
+    step = period / 256.0
+    found = 0
+    for j in range(256):
+        low = (j - 0.37) * step
+        high = low + step
+        below = wave{i}(low, frequency, p)
+        if below * wave{i}(high, frequency, p) < 0.0 or below == 0.0:
+            if found == k:
+                for _ in range(60):
+                    middle = 0.5 * (low + high)
+                    if below * wave{i}(middle, frequency, p) > 0.0:
+                        low = middle
+                    else:
+                        high = middle
+                time = 0.5 * (low + high)
+                return within(time + period if time < 0.0 else time, period)
+            found += 1
+    return period * (1.0 - 1e-6 * (k + 1))"""
+
+
+def _forcing(forcing: Node | None, leaves: Mapping[int, str]) -> str:
+    if forcing is None or forcing.op == "time":
+        return _function("forcing", "t, c", [f"return {0.0 if forcing is None else 1.0} * t"])
+    writer = Writer(leaves)
+    if forcing.op == "held":
+        forcing = forcing.args[0]
+    sign, inner = ("-", forcing.args[0]) if forcing.op == "neg" else ("", forcing)
+    if inner.op == "mul":  # no bare product: where it is added to another, either could be fused
+        a, b = writer.write(inner.args)
+        value = f"multiply_add({sign}{a}, {b}, 0.0)"
+    else:
+        (value,) = writer.write((forcing,))
+    return _function("forcing", "t, c", [*writer.lines, f"return {value}"])
+
+
+def _tuple(
+    name: str, arguments: str, roots: Iterable[Node], leaves: Mapping[int, str], group: int = 0
+) -> str:
+    """A function that returns a tuple of numbers per lane, or of groups of them."""
+    roots = list(roots)
+    writer = Writer(leaves)
+    values = writer.write(roots)
+    results = []
+    for root, value in zip(roots, values, strict=True):
+        if root.is_number(0.0):
+            results.append("zero")
+        else:  # a number per lane, whatever it depends on
+            results.append(value if root.kind == STATED else f"zero + {value}")
+    if group:
+        results = [f"({', '.join(results[i : i + group])})" for i in range(0, len(results), group)]
+    lines = [*writer.lines, "zero = 0.0 * y[0]"]
+    return _function(name, arguments, [*lines, f"return ({', '.join(results)}{',' if results else ''})"])
+
+
+def _reset(derived: Derived, leaves: Mapping[int, str]) -> str:
+    lines = ["zero = 0.0 * y[0]"]
+    for k, jump in enumerate(derived.impacts):
+        writer = Writer(leaves)
+        values = [f"zero + {value}" for value in writer.write(jump.states)]
+        lines.append(f"if k == {k}:")
+        lines += [f"    {line}" for line in (*writer.lines, f"return ({', '.join(values)},)")]
+    same = ", ".join(f"zero + y[{i}]" for i in range(len(derived.rates)))
+    return _function("reset", "k, t, y, c", [*lines, f"return ({same},)"])

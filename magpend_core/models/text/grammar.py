@@ -1,0 +1,408 @@
+"""Arithmetic as text: a parser with a whitelist, of its own, that evaluates nothing.
+
+Numbers, names, ``+ - * / **``, comparisons, ``and or not``, and calls of `FUNCTIONS`. There is nothing else:
+no attributes, no indices, no text, no assignment. Length, nesting, and what numbers may be are bounded, so
+that whatever is given ends in a tree or in one `GrammarError`, in time proportional to its length.
+"""
+
+from __future__ import annotations
+
+import keyword
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+from magpend_core.models.parameters import near_names
+
+MAX_LENGTH = 8000
+"""Characters of one expression."""
+MAX_DEPTH = 60
+"""Parentheses, calls and signs within one another."""
+MAX_NAME = 40
+"""Characters of a name."""
+
+MANY = 8
+"""Most arguments of `min` and `max`."""
+
+FUNCTIONS: dict[str, tuple[int, int]] = {
+    **dict.fromkeys(
+        ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "abs",
+         "sign"),
+        (1, 1),
+    ),
+    "atan2": (2, 2), "min": (2, MANY), "max": (2, MANY), "where": (3, 3), "square": (2, 2),
+}  # fmt: skip
+"""Least and greatest number of arguments by name."""
+
+BUILT_IN = ("t", "f", "phase", "pi")
+"""Time since the section [s], drive frequency [Hz], t f in [0, 1), and pi."""
+
+ELSEWHERE = {
+    "ln": "log", "arctan": "atan", "arcsin": "asin", "arccos": "acos", "arctan2": "atan2", "fabs": "abs",
+    "pow": "**", "sgn": "sign", "heaviside": "where", "if": "where", "Piecewise": "where", "Abs": "abs",
+    "power": "**", "minimum": "min", "maximum": "max", "time": "t", "frequency": "f", "frequency_hz": "f",
+}  # fmt: skip
+"""What other languages call it."""
+
+_TOKEN = re.compile(
+    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_][A-Za-z0-9_]*)"
+    r"|(?P<sign>\*\*|<=|>=|==|!=|[-+*/(),<>^=])"
+)
+_SPACE = re.compile(r"[ \t\r\n]*")
+_COMPARISONS = ("<", "<=", ">", ">=")
+_OR, _AND, _NOT, _COMPARE, _SUM, _PRODUCT, _SIGN, _POWER = range(1, 9)
+_BINDING = {
+    "or": _OR, "and": _AND, **dict.fromkeys(_COMPARISONS, _COMPARE), "+": _SUM, "-": _SUM, "*": _PRODUCT,
+    "/": _PRODUCT, "**": _POWER,
+}  # fmt: skip
+
+
+class GrammarError(ValueError):
+    """A text is no expression: what is wrong, with its place."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tree:
+    """An expression as it was written.
+
+    Attributes
+    ----------
+    kind : str
+        ``number``, ``name``, ``call``, ``sum``, ``product``, ``negative``, ``inverse``, ``power``,
+        ``compare``, ``and``, ``or`` or ``not``. A difference is the sum with a negative, a quotient the
+        product with an inverse.
+    at : int
+        Character of the text, from 1.
+    value : float or str
+        Of a number; the name of a name or function; the sign of a comparison.
+    args : tuple of Tree
+    """
+
+    kind: str
+    at: int
+    value: float | str = ""
+    args: tuple[Tree, ...] = ()
+
+    @property
+    def is_condition(self) -> bool:
+        """Whether it is true or false and not a number."""
+        return self.kind in ("compare", "and", "or", "not")
+
+
+def parse(text: object) -> Tree:
+    """Read an expression.
+
+    Parameters
+    ----------
+    text
+        A string; a number, as TOML has it without quotes, stands for itself.
+
+    Raises
+    ------
+    GrammarError
+        If it is no expression. Names are not judged here but for their form: see `names`.
+    """
+    if isinstance(text, (int, float)) and not isinstance(text, bool):
+        if not -1e300 < text < 1e300:
+            raise GrammarError("is not a finite number")
+        return _number(float(text), 1)
+    tree = _parse(text)
+    if tree.is_condition:
+        raise GrammarError("is true or false and not a number; use where(condition, a, b)")
+    return tree
+
+
+def parse_condition(text: object) -> Tree:
+    """Read a condition, such as ``x < 0 and v > 1``.
+
+    Raises
+    ------
+    GrammarError
+        If it is none.
+    """
+    tree = _parse(text)
+    if not tree.is_condition:
+        raise GrammarError("must be a condition, such as x < 0")
+    return tree
+
+
+def _parse(text: object) -> Tree:
+    if not isinstance(text, str):
+        raise GrammarError("must be an expression in quotes")
+    if len(text) > MAX_LENGTH:
+        raise GrammarError(f"has {len(text)} characters; {MAX_LENGTH} are the most, use define for parts")
+    if not text.strip():
+        raise GrammarError("is empty; write an expression")
+    return _Parser(text).whole()
+
+
+def names(tree: Tree) -> Iterator[tuple[str, int]]:
+    """Each name in an expression with its place; functions are not among them."""
+    if tree.kind == "name":
+        yield str(tree.value), tree.at
+    for arg in tree.args:
+        yield from names(arg)
+
+
+def name_problem(name: object) -> str | None:
+    """What is wrong with a name that someone gives, or None."""
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        return "must begin with a letter and go on with letters, digits and underscores"
+    if len(name) > MAX_NAME:
+        return f"has {len(name)} characters; {MAX_NAME} are the most"
+    if name in FUNCTIONS or name in BUILT_IN:
+        return "has a meaning of its own in expressions; choose another name"
+    if keyword.iskeyword(name) or name in ("nan", "inf"):
+        return f"is a word of Python; choose another name, such as {name}_"
+    return None
+
+
+def written(tree: Tree) -> str:
+    """Write a tree as text in one way, which reads back to the same tree: spaces and brackets are gone."""
+    return _WRITE[tree.kind](tree, [written(arg) for arg in tree.args])
+
+
+def _write_call(tree: Tree, args: list[str]) -> str:
+    return f"{tree.value}({','.join(args)})"
+
+
+def _joined(sign: str) -> Callable[[Tree, list[str]], str]:
+    return lambda tree, args: f"({sign.join(args)})"
+
+
+def _write_product(tree: Tree, args: list[str]) -> str:
+    # an inverse writes its sign itself; one that stands first needs something to divide
+    text = "".join(a if i == 0 or a.startswith("/") else f"*{a}" for i, a in enumerate(args))
+    return f"({text})"
+
+
+_WRITE: dict[str, Callable[[Tree, list[str]], str]] = {
+    "number": lambda tree, args: repr(tree.value),
+    "name": lambda tree, args: str(tree.value),
+    "call": _write_call,
+    "sum": _joined("+"),
+    "product": _write_product,
+    "negative": lambda tree, args: f"(-{args[0]})",
+    "inverse": lambda tree, args: f"/{args[0]}",
+    "power": lambda tree, args: f"({args[0]}**{args[1]})",
+    "compare": lambda tree, args: f"({args[0]}{tree.value}{args[1]})",
+    "and": _joined(" and "),
+    "or": _joined(" or "),
+    "not": lambda tree, args: f"(not {args[0]})",
+}
+
+
+def _number(value: float, at: int) -> Tree:
+    if value < 0.0:
+        return Tree("negative", at, "", (Tree("number", at, -value),))
+    return Tree("number", at, value)
+
+
+@dataclass(frozen=True, slots=True)
+class _Token:
+    kind: str  # number, name, sign, end
+    text: str
+    at: int
+
+
+def _tokens(text: str) -> list[_Token]:
+    found: list[_Token] = []
+    place = 0
+    while True:
+        space = _SPACE.match(text, place)
+        place = space.end() if space else place
+        if place == len(text):
+            return [*found, _Token("end", "", place + 1)]
+        match = _TOKEN.match(text, place)
+        if match is None:
+            raise GrammarError(f"{text[place]!r} at character {place + 1} has no meaning here")
+        found.append(_Token(str(match.lastgroup), match.group(), place + 1))
+        place = match.end()
+
+
+class _Parser:
+    """Precedence climbing; two calls for each level of nesting."""
+
+    def __init__(self, text: str) -> None:
+        self.tokens = _tokens(text)
+        self.next = 0
+        self.depth = 0
+
+    @property
+    def token(self) -> _Token:
+        return self.tokens[self.next]
+
+    def take(self) -> _Token:
+        """Return the next token and go on."""
+        token = self.token
+        self.next += token.kind != "end"
+        return token
+
+    def whole(self) -> Tree:
+        """Read all of the text."""
+        tree = self.expression(_OR)
+        if self.token.kind != "end":
+            raise self.unexpected(self.token)
+        return tree
+
+    def unexpected(self, token: _Token) -> GrammarError:
+        """What is wrong with a token that cannot follow, with a remedy where one is known."""
+        hints = {
+            "^": "; powers are written **", "==": "; compare with < or >", "!=": "; compare with < or >",
+            "=": "; an expression assigns nothing", ")": ": there is no ( for it",
+        }  # fmt: skip
+        if token.kind == "end":
+            return GrammarError("ends where something must follow")
+        before = self.tokens[self.next - 1] if self.next else None
+        # where an operator is missing
+        if before is not None and token is self.token and (token.kind != "sign" or token.text == "("):
+            return GrammarError(
+                f"{token.text!r} at character {token.at} follows {before.text!r} without a sign; for a "
+                f"product write {before.text}*{token.text}"
+            )
+        return GrammarError(
+            f"{token.text!r} at character {token.at} cannot stand here{hints.get(token.text, '')}"
+        )
+
+    def expression(self, least: int) -> Tree:
+        """Read as far as signs bind at least as strongly as `least`."""
+        self.depth += 1
+        if self.depth > MAX_DEPTH:
+            raise GrammarError(f"is nested more than {MAX_DEPTH} deep; use define for parts")
+        left = self.prefix()
+        while True:
+            token = self.token
+            binding = _BINDING.get(token.text, 0) if token.kind != "number" else 0
+            if binding == 0 or binding < least:
+                break
+            left = self.joined(left, self.take(), binding)
+        self.depth -= 1
+        return left
+
+    def joined(self, left: Tree, token: _Token, binding: int) -> Tree:
+        """Read what follows a sign."""
+        if binding == _POWER:
+            right = self.expression(_SIGN)
+            return Tree("power", token.at, "", _numbers((left, right), token))
+        right = self.expression(binding + 1)
+        if binding == _COMPARE:
+            _numbers((left, right), token)
+            if self.token.text in _COMPARISONS:
+                raise GrammarError(
+                    f"{self.token.text!r} at character {self.token.at}: compare two at a time, joined by and"
+                )
+            return Tree("compare", token.at, token.text, (left, right))
+        if binding in (_AND, _OR):
+            _conditions((left, right), token)
+            return _flat(token.text, left, right)
+        _numbers((left, right), token)
+        if token.text == "-":
+            right = Tree("negative", token.at, "", (right,))
+        if token.text == "/":
+            right = Tree("inverse", token.at, "", (right,))
+        return _flat("sum" if binding == _SUM else "product", left, right)
+
+    def prefix(self) -> Tree:
+        """Read what an expression can begin with."""
+        token = self.take()
+        if token.kind == "number":
+            value = float(token.text)
+            if not math.isfinite(value):
+                raise GrammarError(f"the number at character {token.at} is too large")
+            return Tree("number", token.at, value)
+        if token.text in ("+", "-"):
+            right = self.expression(_SIGN)
+            _numbers((right,), token)
+            return Tree("negative", token.at, "", (right,)) if token.text == "-" else right
+        if token.text == "not":
+            right = self.expression(_NOT)
+            _conditions((right,), token)
+            return Tree("not", token.at, "", (right,))
+        if token.text == "(":
+            inner = self.expression(_OR)
+            self.close(token)
+            return inner
+        if token.kind == "name" and token.text not in ("and", "or"):
+            return self.call(token) if self.token.text == "(" else _name(token)
+        self.next -= token.kind != "end"
+        raise GrammarError(
+            "ends where something must follow"
+            if token.kind == "end"
+            else f"{token.text!r} at character {token.at} cannot stand here"
+        )
+
+    def close(self, opened: _Token) -> None:
+        """Read the ) that belongs to a (."""
+        if self.token.text == ")":
+            self.take()
+        elif self.token.kind == "end":
+            raise GrammarError(f"the ( at character {opened.at} is not closed")
+        else:
+            raise self.unexpected(self.token)
+
+    def call(self, name: _Token) -> Tree:
+        """Read the arguments of a function."""
+        opened = self.take()
+        if name.text not in FUNCTIONS:
+            raise GrammarError(unknown(name.text, name.at, FUNCTIONS, "function"))
+        args: list[Tree] = []
+        while self.token.text != ")":
+            args.append(self.expression(_OR))
+            if self.token.text != ",":
+                break
+            self.take()
+        self.close(opened)
+        least, most = FUNCTIONS[name.text]
+        if not least <= len(args) <= most:
+            wanted = f"{least}" if least == most else f"{least} to {most}"
+            raise GrammarError(
+                f"{name.text} at character {name.at} has {len(args)} arguments; it takes {wanted}"
+            )
+        if name.text == "where":
+            if not args[0].is_condition:
+                raise GrammarError(
+                    f"where at character {name.at} needs a condition first, such as where(x < 0, a, b)"
+                )
+            _numbers(tuple(args[1:]), name)
+        else:
+            _numbers(tuple(args), name)
+        return Tree("call", name.at, name.text, tuple(args))
+
+
+def unknown(name: str, at: int, known: Iterable[str], what: str) -> str:
+    """Sentence on an unknown name, with the nearest known ones."""
+    if name in ELSEWHERE:
+        return f"unknown {what} {name!r} at character {at}; here it is {ELSEWHERE[name]}"
+    hint = near_names(name[:MAX_NAME], known, f"{what}s").rstrip(".")
+    return f"unknown {what} {name[:MAX_NAME]!r} at character {at}; {hint}"
+
+
+def _name(token: _Token) -> Tree:
+    if len(token.text) > MAX_NAME:
+        raise GrammarError(f"the name at character {token.at} has more than {MAX_NAME} characters")
+    return Tree("name", token.at, token.text)
+
+
+def _flat(kind: str, left: Tree, right: Tree) -> Tree:
+    """Join to what is joined already, so that long sums are not deep."""
+    args = left.args if left.kind == kind else (left,)
+    return Tree(kind, left.at, "", (*args, right))
+
+
+def _numbers(parts: tuple[Tree, ...], token: _Token) -> tuple[Tree, ...]:
+    for part in parts:
+        if part.is_condition:
+            raise GrammarError(
+                f"a condition stands at character {part.at} where {token.text!r} needs a number; "
+                "use where(condition, a, b)"
+            )
+    return parts
+
+
+def _conditions(parts: tuple[Tree, ...], token: _Token) -> None:
+    for part in parts:
+        if not part.is_condition:
+            raise GrammarError(
+                f"a number stands at character {part.at} where {token.text!r} needs a condition (x < 0, say)"
+            )

@@ -1,0 +1,157 @@
+"""Expressions as LaTeX, as they were written: nothing is multiplied out or put in another order."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from magpend_core.models.text.definition import Definition
+from magpend_core.models.text.grammar import Tree
+
+_OR, _AND, _COMPARE, _SUM, _PRODUCT, _POWER, _ATOM = range(7)
+_GREEK = (
+    "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu",
+    "nu", "xi", "pi", "rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta", "Theta",
+    "Lambda", "Xi", "Pi", "Sigma", "Phi", "Psi", "Omega",
+)  # fmt: skip
+_NAMED = {
+    "asin": r"\arcsin", "acos": r"\arccos", "atan": r"\arctan", "sinh": r"\sinh", "cosh": r"\cosh",
+    "tanh": r"\tanh", "sin": r"\sin", "cos": r"\cos", "tan": r"\tan", "log": r"\ln", "min": r"\min",
+    "max": r"\max", "sign": r"\operatorname{sign}", "atan2": r"\operatorname{atan2}",
+    "square": r"\operatorname{square}",
+}  # fmt: skip
+_SIGNS = {"<": "<", "<=": r"\le", ">": ">", ">=": r"\ge"}
+
+
+def latex_of(tree: Tree, symbols: Mapping[str, str]) -> str:
+    """LaTeX of an expression, without dollar signs.
+
+    Parameters
+    ----------
+    tree
+        What was read.
+    symbols
+        LaTeX by name; other names are spelled from their letters, see `symbol_of`.
+    """
+    return _written(tree, symbols)[0]
+
+
+def equations_of(definition: Definition) -> list[str]:
+    """Lines of LaTeX: definitions in the order of their need, then the rate of each state."""
+    symbols = {s.name: s.symbol for s in definition.states if s.symbol}
+    symbols |= {p.name: p.symbol for p in definition.parameters if p.symbol}
+    used = definition.used(definition.equations.values())
+    lines = [
+        f"{symbol_of(name, symbols)} &= {latex_of(definition.define[name], symbols)}"
+        for name in used
+        if name in definition.define
+    ]
+    for name, tree in definition.equations.items():
+        rate = rf"\frac{{\mathrm{{d}}{symbol_of(name, symbols)}}}{{\mathrm{{d}}t}}"
+        lines.append(f"{rate} &= {latex_of(tree, symbols)}")
+    return lines
+
+
+def symbol_of(name: str, symbols: Mapping[str, str]) -> str:
+    """LaTeX of a name: its own symbol, a Greek letter, one letter, or a word upright, with an index."""
+    if name in symbols:
+        return symbols[name]
+    head, _, index = name.partition("_")
+    if not index and (found := re.fullmatch(r"([A-Za-z]+?)(\d+)", name)):
+        head, index = found[1], found[2]
+    head = "\\" + head if head in _GREEK else _upright(head)
+    return head if not index else f"{head}_{{{_upright(index.replace('_', ','))}}}"
+
+
+def _upright(word: str) -> str:
+    """A word of several letters upright; one letter stands as a variable."""
+    return word if len(word) == 1 else rf"\mathrm{{{word}}}"
+
+
+def _written(tree: Tree, symbols: Mapping[str, str]) -> tuple[str, int]:
+    """LaTeX, and how strongly its outermost sign binds."""
+    if tree.kind == "number":
+        return _number(float(tree.value))
+    if tree.kind == "name":
+        return symbol_of(str(tree.value), symbols), _ATOM
+    if tree.kind == "product":
+        return _product(tree, symbols)
+    if tree.kind == "call":
+        return _call(tree, symbols), _ATOM
+    if tree.kind == "power":
+        base, exponent = tree.args
+        return f"{_in(base, symbols, _ATOM)}^{{{latex_of(exponent, symbols)}}}", _POWER
+    if tree.kind == "sum":
+        return _sum(tree, symbols), _SUM
+    if tree.kind == "negative":
+        return f"-{_in(tree.args[0], symbols, _PRODUCT)}", _SUM
+    if tree.kind == "compare":
+        left, right = (_in(arg, symbols, _SUM) for arg in tree.args)
+        return f"{left} {_SIGNS[str(tree.value)]} {right}", _COMPARE
+    if tree.kind == "not":
+        return rf"\neg {_in(tree.args[0], symbols, _ATOM)}", _ATOM
+    binds, sign = (_AND, r" \land ") if tree.kind == "and" else (_OR, r" \lor ")
+    return sign.join(_in(arg, symbols, binds + 1) for arg in tree.args), binds
+
+
+def _in(tree: Tree, symbols: Mapping[str, str], least: int) -> str:
+    """LaTeX of a part, in brackets if it binds less than it must."""
+    text, binds = _written(tree, symbols)
+    return text if binds >= least else rf"\left({text}\right)"
+
+
+def _number(value: float) -> tuple[str, int]:
+    digits, _, power = f"{value:.15g}".partition("e")
+    if not power:
+        return digits, _ATOM if value >= 0 else _SUM
+    tens = f"10^{{{int(power)}}}"
+    return (tens if digits == "1" else rf"{digits} \cdot {tens}"), _PRODUCT
+
+
+def _sum(tree: Tree, symbols: Mapping[str, str]) -> str:
+    text = _in(tree.args[0], symbols, _SUM)
+    for arg in tree.args[1:]:
+        is_less = arg.kind == "negative"
+        part = _in(arg.args[0] if is_less else arg, symbols, _PRODUCT)
+        text += f" {'-' if is_less else '+'} {part}"
+    return text
+
+
+def _product(tree: Tree, symbols: Mapping[str, str]) -> tuple[str, int]:
+    above = [arg for arg in tree.args if arg.kind != "inverse"]
+    below = [arg.args[0] for arg in tree.args if arg.kind == "inverse"]
+    if not below:
+        return _times(above, symbols), _SUM if above[0].kind == "negative" else _PRODUCT
+    numerator = "1" if not above else _alone(above, symbols)
+    return rf"\frac{{{numerator}}}{{{_alone(below, symbols)}}}", _PRODUCT
+
+
+def _alone(parts: list[Tree], symbols: Mapping[str, str]) -> str:
+    return latex_of(parts[0], symbols) if len(parts) == 1 else _times(parts, symbols)
+
+
+def _times(parts: list[Tree], symbols: Mapping[str, str]) -> str:
+    texts = [_in(part, symbols, _PRODUCT) for part in parts]
+    if parts[0].kind == "negative":  # a sign that comes first needs no brackets
+        texts[0] = latex_of(parts[0], symbols)
+    # two numbers side by side would be read as one
+    joined = texts[0]
+    for text in texts[1:]:
+        joined += (r" \cdot " if text[0].isdigit() else r" \, ") + text
+    return joined
+
+
+def _call(tree: Tree, symbols: Mapping[str, str]) -> str:
+    args = [latex_of(arg, symbols) for arg in tree.args]
+    if tree.value == "sqrt":
+        return rf"\sqrt{{{args[0]}}}"
+    if tree.value == "abs":
+        return rf"\left|{args[0]}\right|"
+    if tree.value == "exp":
+        return rf"\mathrm{{e}}^{{{args[0]}}}"
+    if tree.value == "where":
+        condition, first, second = args
+        return (
+            rf"\begin{{cases}} {first} & \text{{if }} {condition} \\ {second} & \text{{else}} \end{{cases}}"
+        )
+    return rf"{_NAMED[str(tree.value)]}\left({', '.join(args)}\right)"

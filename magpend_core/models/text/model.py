@@ -1,0 +1,116 @@
+"""Models that are read from text."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magpend_core.models.model import Model, ModelError
+from magpend_core.models.text.definition import Definition
+from magpend_core.models.text.derive import Derived, derive
+from magpend_core.models.text.generate import Source, source_of
+from magpend_core.models.text.graph import GraphError
+from magpend_core.models.text.scene import classifier_of, drawing_of
+
+if TYPE_CHECKING:
+    from magpend_core.engine.system import System
+
+_ROOM = Path(__file__).parent
+SOURCES = tuple(
+    _ROOM / f"{name}.py"
+    for name in (
+        "compiled",
+        "derive",
+        "derivatives",
+        "generate",
+        "graph",
+        "grammar",
+        "layers",
+        "runtime",
+        "sliding",
+        "switching",
+    )
+)
+"""What decides, with the text, what is integrated."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TextModel(Model):
+    """A model whose system is derived from its text when it is first needed.
+
+    Attributes
+    ----------
+    definition : Definition
+    shipped : bool
+        Whether `load_model` finds it by name.
+    """
+
+    definition: Definition
+    shipped: bool = False
+
+    @property
+    def reference(self) -> str | Mapping[str, Any]:
+        """Its name if it ships, else its text."""
+        return self.name if self.shipped else self.definition.table
+
+    @cached_property
+    def derived(self) -> Derived:
+        """What follows from the text: rates, Jacobian, layers, edges, switches. Needs no compiler.
+
+        Raises
+        ------
+        ModelError
+            If there is too much of something.
+        """
+        try:
+            return derive(self.definition)
+        except GraphError as error:
+            raise ModelError([f"model: {error}; simplify them, or write the model in Python."]) from None
+
+    @cached_property
+    def source(self) -> Source:
+        """The engine's functions, as text."""
+        return source_of(self.derived)
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of what the text means, and of what makes a system of it."""
+        from magpend_core.meaning import meaning_digest
+
+        # the source, too: what is found at the default parameters, edges say, is in it
+        parts = meaning_digest(self.sources), self.definition.meaning(), self.source.text
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+    @cached_property
+    def system(self) -> System:
+        """What the engine integrates; imports the compiler."""
+        from magpend_core.models.text.compiled import system_of
+
+        return system_of(self.definition, self.derived, self.source)
+
+
+def model_of(definition: Definition, shipped: bool = False) -> TextModel:
+    """Make a model of what a text says."""
+    section = "" if definition.autonomous else "the start of the drive's period"
+    return TextModel(
+        name=definition.name,
+        title=definition.title or definition.name,
+        states=definition.states,
+        parameters=definition.parameters,
+        presets=definition.presets,
+        system_path="",
+        sources=SOURCES,
+        section=definition.section or section or "one instant of every period",
+        quantities=definition.described,
+        classifier=classifier_of(definition),
+        mirror=definition.mirror,
+        drawing=drawing_of(definition),
+        autonomous=definition.autonomous,
+        text=None if shipped else definition.table,
+        definition=definition,
+        shipped=shipped,
+    )

@@ -1,0 +1,144 @@
+"""Tables of text and numbers, read with all their problems at once, each with its place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from magpend_core.models.parameters import near_names
+from magpend_core.models.text.grammar import (
+    GrammarError,
+    Tree,
+    name_problem,
+    names,
+    parse,
+    parse_condition,
+    unknown,
+)
+
+MAX_TEXT = 2000
+"""Characters of a title, a unit, a phrase."""
+SHOWN = 60
+"""Characters of an expression that a sentence repeats."""
+
+
+def shown(value: object, around: int = 1) -> str:
+    """A value as a sentence repeats it: its part next to a character, if it is long."""
+    text = " ".join(value.split()) if isinstance(value, str) else repr(value)
+    if len(text) > SHOWN:
+        begin = max(0, min(around - 1 - SHOWN // 2, len(text) - SHOWN))
+        end = begin + SHOWN
+        text = ("..." if begin else "") + text[begin:end] + ("..." if end < len(text) else "")
+    return f'"{text}"' if isinstance(value, str) else text
+
+
+class Reader:
+    """Reads entries of tables; what is wrong goes to `problems`, and something harmless is returned."""
+
+    def __init__(self) -> None:
+        self.problems: list[str] = []
+
+    def report(self, place: str, sentence: str) -> None:
+        """Note a problem."""
+        self.problems.append(f"{place}: {sentence}")
+
+    def table(self, value: Any, place: str, most: int, what: str = "entries") -> dict[str, Any]:
+        """Return a table; {} if it is none, without keys that are no text."""
+        if not isinstance(value, Mapping):
+            self.report(
+                place, f"{shown(value)} must be a table; write {place.rpartition('.')[2]} = {{ ... }}."
+            )
+            return {}
+        if len(value) > most:
+            self.report(place, f"has {len(value)} {what}; {most} are the most.")
+            return {}
+        bad = [key for key in value if not isinstance(key, str)]
+        for key in bad:
+            self.report(place, f"the key {shown(key)} must be a text.")
+        return {key: value[key] for key in value if isinstance(key, str)}
+
+    def keys(self, table: Mapping[str, Any], place: str, known: Iterable[str]) -> None:
+        """Report keys that do not belong there."""
+        known = tuple(known)
+        for key in table:
+            if key not in known:
+                self.report(
+                    f"{place}.{key[:SHOWN]}", f"is no key here; {near_names(key[:SHOWN], known, 'keys')}"
+                )
+
+    def text(self, table: Mapping[str, Any], key: str, place: str, default: str = "") -> str:
+        """Return a phrase."""
+        value = table.get(key, default)
+        if not isinstance(value, str):
+            self.report(f"{place}.{key}", f"{shown(value)} must be a text in quotes.")
+            return default
+        if len(value) > MAX_TEXT:
+            self.report(f"{place}.{key}", f"has {len(value)} characters; {MAX_TEXT} are the most.")
+            return default
+        return value
+
+    def flag(self, table: Mapping[str, Any], key: str, place: str) -> bool:
+        """Return true or false."""
+        value = table.get(key, False)
+        if not isinstance(value, bool):
+            self.report(f"{place}.{key}", f"{shown(value)} must be true or false.")
+        return value is True
+
+    def number(self, value: Any, place: str, default: float = 0.0) -> float:
+        """Return a finite number."""
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            self.report(place, f"{shown(value)} must be a number.")
+            return default
+        if not -1e300 < value < 1e300:  # an integer may be too long for a float
+            self.report(place, "must be a finite number, below 1e300.")
+            return default
+        return float(value)
+
+    def positive(self, table: Mapping[str, Any], key: str, place: str, default: float) -> float:
+        """Return a number above 0, or infinity."""
+        value = table.get(key, default)
+        if isinstance(value, float) and value == math.inf:
+            return value
+        number = self.number(value, f"{place}.{key}", default)
+        if not number > 0.0:
+            self.report(f"{place}.{key}", f"{shown(value)} must be greater than 0.")
+            return default
+        return number
+
+    def name(self, value: Any, place: str, taken: Mapping[str, str]) -> bool:
+        """Check a name that is given here; `taken` says what each name means already."""
+        problem = name_problem(value)
+        if problem is None and value in taken:
+            problem = f"is the name of a {taken[value]} already; choose another"
+        if problem is not None:
+            self.report(place, f"{problem}.")
+        return problem is None
+
+    def expression(self, value: Any, place: str, known: Mapping[str, str]) -> Tree | None:
+        """Return an expression of known names, or None."""
+        return self._tree(value, place, known, parse)
+
+    def condition(self, value: Any, place: str, known: Mapping[str, str]) -> Tree | None:
+        """Return a condition of known names, or None."""
+        return self._tree(value, place, known, parse_condition)
+
+    def _tree(
+        self, value: Any, place: str, known: Mapping[str, str], read: Callable[[Any], Tree]
+    ) -> Tree | None:
+        try:
+            tree = read(value)
+        except GrammarError as error:
+            self.report(place, f"{shown(value)}: {_closed(str(error))}")
+            return None
+        bad: dict[str, int] = {}
+        for name, at in names(tree):
+            if name not in known:
+                bad.setdefault(name, at)
+        for name, at in list(bad.items())[:3]:
+            self.report(place, f"{shown(value, at)}: {_closed(unknown(name, at, known, 'name'))}")
+        return None if bad else tree
+
+
+def _closed(sentence: str) -> str:
+    return sentence if sentence.endswith(("?", ".")) else f"{sentence}."

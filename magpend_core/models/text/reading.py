@@ -1,0 +1,282 @@
+"""Reads the tables of a model: names and expressions are checked, all problems told at once.
+
+Needs nothing but numpy; takes milliseconds, whatever is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from magpend_core.models.model import Quantity, State
+from magpend_core.models.parameters import FINITE, FRACTION, NON_NEGATIVE, POSITIVE, Parameter, near_names
+from magpend_core.models.text.definition import Definition, Impact
+from magpend_core.models.text.grammar import Tree, names
+from magpend_core.models.text.reader import shown
+from magpend_core.models.text.scene import mirror_problem
+from magpend_core.models.text.views import MAX_OTHERS, MAX_PARAMETERS, MAX_STATES, ViewsReader
+
+MAX_DEFINED = 200
+ESCAPE = 1e9
+"""Bound beyond which a trajectory has diverged, if the text gives none."""
+BOUNDS = {"finite": FINITE, "positive": POSITIVE, "non-negative": NON_NEGATIVE, "fraction": FRACTION}
+KEYS = (
+    "name", "title", "source", "section", "states", "parameters", "define", "equations", "quantities",
+    "impacts", "drawing", "mirror", "presets", "classifier",
+)  # fmt: skip
+_STATE_KEYS = ("unit", "meaning", "symbol", "on_circle", "scale", "escape")
+_PARAMETER_KEYS = ("value", "unit", "meaning", "symbol", "bound")
+_QUANTITY_KEYS = ("value", "unit", "meaning", "symbol")
+# dims, coordinates and keys of runs: a state, a parameter or a quantity of the name would be taken for them
+_OF_RUNS = (
+    "frequency", "frequency_hz", "state", "quantity", "branch", "cell", "angle", "period_index", "kind",
+    "preset", "drive_period", "time",
+)  # fmt: skip
+
+
+def read_definition(table: Any, place: str = "model") -> tuple[Definition | None, list[str]]:
+    """Read the tables of a model.
+
+    Parameters
+    ----------
+    table
+        Plain data, as TOML has it under ``[model]``.
+    place
+        How sentences call it.
+
+    Returns
+    -------
+    Definition or None
+        None if there are problems.
+    list of str
+        All of them, each with its place.
+    """
+    reading = _Reading(place)
+    try:
+        definition = reading.definition(table)
+    except RecursionError:  # the caller has used up the stack
+        return None, [f"{place}: is nested too deep."]
+    problems = reading.problems
+    if definition is not None and not problems and (wrong := mirror_problem(definition)) is not None:
+        problems.append(f"{place}.mirror: {wrong}")
+    return (None if problems else definition), problems
+
+
+class _Reading(ViewsReader):
+    """One pass through the tables of a model."""
+
+    def definition(self, given: Any) -> Definition | None:
+        table = self.table(given, self.place, len(KEYS) + 20, "keys")
+        if self.problems:
+            return None
+        self.keys(table, self.place, KEYS)
+        for key in ("name", "states", "equations"):
+            if key not in table:
+                self.report(
+                    f"{self.place}.{key}", "missing; a model has name, states and equations at least."
+                )
+        head = {key: self.text(table, key, self.place) for key in ("name", "title", "source", "section")}
+        self._model_name(head["name"], "name" in table)
+        states = self._states(table.get("states", {}))
+        parameters, values = self._parameters(table.get("parameters", {}))
+        define = self._defined(table.get("define", {}))
+        states, equations = self._equations(table.get("equations", {}), states, "equations" in table)
+        described, quantities = self._quantities(table.get("quantities", {}))
+        state_names = tuple(s.name for s in states)
+        impacts = self._impacts(table.get("impacts", []), state_names)
+        drawing = self._drawing(table.get("drawing"), define)
+        mirror = self._mirror(table.get("mirror"), state_names)
+        classifier = self._classifier(table.get("classifier"), define)
+        presets = self._presets(table.get("presets", {}), parameters, values, head["source"])
+        if self.problems:
+            return None
+        return Definition(
+            **head, states=states, parameters=parameters, define=define, equations=equations,
+            quantities=quantities, described=described, impacts=impacts, drawing=drawing, mirror=mirror,
+            presets=presets, classifier=classifier, table=_plain(table),
+        )  # fmt: skip
+
+    def _model_name(self, name: str, given: bool) -> None:
+        plain = name.replace("-", "").replace("_", "")
+        if given and not (plain.isascii() and plain.isalnum() and len(name) <= 60 and name[0].isalpha()):
+            self.report(
+                self.at("name"), f"{shown(name)} must be a letter, then letters, digits, - and _, 60 at most."
+            )
+
+    def _new_name(self, name: str, place: str, kind: str) -> bool:
+        if name in _OF_RUNS:
+            self.report(
+                place, f"{name!r} names something else in runs; choose another name, such as {name}_."
+            )
+            return False
+        if not self.name(name, place, self.known):
+            return False
+        self.known[name] = kind
+        return True
+
+    def _entry(self, value: Any, place: str, keys: tuple[str, ...], short: str) -> dict[str, Any]:
+        """Return a table, of which `short` may stand alone."""
+        if not isinstance(value, Mapping):
+            return {short: value}
+        entry = self.table(value, place, 20, "keys")
+        self.keys(entry, place, keys)
+        return entry
+
+    def _states(self, given: Any) -> tuple[State, ...]:
+        states = []
+        for name, value in self.table(given, self.at("states"), MAX_STATES, "states").items():
+            place = self.at("states", name)
+            if not self._new_name(name, place, "state"):
+                continue
+            entry = self._entry(value, place, _STATE_KEYS, "unit")
+            unit, symbol = self.text(entry, "unit", place, "1"), self.text(entry, "symbol", place)
+            meaning = self.text(entry, "meaning", place) or name
+            on_circle = self.flag(entry, "on_circle", place)
+            scale = self.positive(entry, "scale", place, 1.0)
+            escape = self.positive(entry, "escape", place, ESCAPE)
+            states.append(State(name, unit, meaning, symbol, on_circle, scale, escape))
+        if isinstance(given, Mapping) and not given and not self.problems:
+            self.report(self.at("states"), "is empty; a model has one state at least.")
+        return tuple(states)
+
+    def _parameters(self, given: Any) -> tuple[tuple[Parameter, ...], dict[str, float]]:
+        parameters, values = [], {}
+        for name, value in self.table(given, self.at("parameters"), MAX_PARAMETERS, "parameters").items():
+            place = self.at("parameters", name)
+            if not self._new_name(name, place, "parameter"):
+                continue
+            entry = self._entry(value, place, _PARAMETER_KEYS, "value")
+            unit, symbol = self.text(entry, "unit", place, "1"), self.text(entry, "symbol", place)
+            meaning = self.text(entry, "meaning", place) or name
+            bound = entry.get("bound", "finite")
+            if not isinstance(bound, str) or bound not in BOUNDS:
+                self.report(f"{place}.bound", f"{shown(bound)} must be one of {', '.join(BOUNDS)}.")
+                bound = "finite"
+            parameter = Parameter(name, unit, meaning, BOUNDS[bound], symbol)
+            if "value" not in entry:
+                self.report(place, "has no value; add value = ... .")
+            elif (problem := parameter.problem(entry["value"])) is not None:
+                self.report(place, problem)
+            else:
+                values[name] = self.number(entry["value"], place)
+            parameters.append(parameter)
+        return tuple(parameters), values
+
+    def _defined(self, given: Any) -> dict[str, Tree]:
+        table = self.table(given, self.at("define"), MAX_DEFINED, "definitions")
+        table = {
+            name: v
+            for name, v in table.items()
+            if self._new_name(name, self.at("define", name), "definition")
+        }
+        trees = {name: self.expression(v, self.at("define", name), self.known) for name, v in table.items()}
+        found = {name: tree for name, tree in trees.items() if tree is not None}
+        circle = _circle(found)
+        if circle:
+            self.report(self.at("define", circle[0]), f"goes round in a circle: {' needs '.join(circle)}.")
+            return {}
+        return found
+
+    def _equations(
+        self, given: Any, states: tuple[State, ...], wanted: bool
+    ) -> tuple[tuple[State, ...], dict[str, Tree]]:
+        table = self.table(given, self.at("equations"), MAX_STATES, "equations")
+        own = [s.name for s in states]
+        for name in table:
+            if name not in own:
+                hint = near_names(name[:60], own, "states")
+                self.report(self.at("equations", name), f"there is no such state; {hint}")
+        trees = {}
+        for name in own:
+            if name not in table:
+                if wanted:
+                    self.report(self.at("equations", name), f"missing; give the rate of the state {name}.")
+                continue
+            trees[name] = self.expression(table[name], self.at("equations", name), self.known)
+        found = {name: tree for name, tree in trees.items() if tree is not None}
+        return tuple(_with_rate(s, found.get(s.name), own) for s in states), found
+
+    def _quantities(self, given: Any) -> tuple[tuple[Quantity, ...], dict[str, Tree]]:
+        described, trees = [], {}
+        known = dict(self.known)
+        for name, value in self.table(given, self.at("quantities"), MAX_OTHERS, "quantities").items():
+            place = self.at("quantities", name)
+            # a definition may be shown under its own name
+            if self.known.get(name) != "definition" and not self._new_name(name, place, "quantity"):
+                continue
+            entry = self._entry(value, place, _QUANTITY_KEYS, "value")
+            tree = self.expression(entry.get("value", ""), place, known)
+            unit, symbol = self.text(entry, "unit", place, "1"), self.text(entry, "symbol", place)
+            meaning = self.text(entry, "meaning", place) or name
+            if tree is not None:
+                trees[name] = tree
+                described.append(Quantity(name, unit, meaning, symbol))
+        return tuple(described), trees
+
+    def _impacts(self, given: Any, states: tuple[str, ...]) -> tuple[Impact, ...]:
+        if not isinstance(given, (list, tuple)):
+            self.report(self.at("impacts"), "must be a list of tables; write [[model.impacts]].")
+            return ()
+        if len(given) > 8:
+            self.report(self.at("impacts"), f"has {len(given)} entries; 8 are the most.")
+            return ()
+        found = [self._impact(value, self.at(f"impacts[{i}]"), states) for i, value in enumerate(given)]
+        return tuple(i for i in found if i is not None)
+
+    def _impact(self, given: Any, place: str, states: tuple[str, ...]) -> Impact | None:
+        table = self.table(given, place, 10, "keys")
+        self.keys(table, place, ("of", "direction", "set"))
+        for key in ("of", "direction", "set"):
+            if key not in table:
+                self.report(f"{place}.{key}", "missing; an impact has of, direction and set.")
+                return None
+        direction = table["direction"]
+        if not isinstance(direction, str) or direction not in ("up", "down"):
+            self.report(f"{place}.direction", f'{shown(direction)} must be "up" or "down".')
+        of = self.expression(table["of"], f"{place}.of", self.known)
+        values = {}
+        for name, value in self.table(table["set"], f"{place}.set", MAX_STATES, "states").items():
+            if name not in states:
+                hint = near_names(name[:60], states, "states")
+                self.report(f"{place}.set.{name[:60]}", f"there is no such state; {hint}")
+                continue
+            tree = self.expression(value, f"{place}.set.{name}", self.known)
+            if tree is not None:
+                values[name] = tree
+        return None if of is None else Impact(of, 1 if direction == "up" else -1, values)
+
+
+def _circle(define: Mapping[str, Tree]) -> list[str]:
+    """Names of a definition that needs itself, from one to the next and back; empty if there is none."""
+    complete: set[str] = set()
+    for first in define:
+        path: list[str] = []
+        pending: list[tuple[str, bool]] = [(first, False)]
+        while pending:
+            name, leaving = pending.pop()
+            if leaving:
+                complete.add(path.pop())
+            elif name in path:
+                return [*path[path.index(name) :], name]
+            elif name not in complete:
+                path.append(name)
+                pending.append((name, True))
+                inner = dict.fromkeys(n for n, _ in names(define[name]) if n in define)
+                pending += [(n, False) for n in inner]
+    return []
+
+
+def _with_rate(state: State, tree: Tree | None, states: Iterable[str]) -> State:
+    """Note which state is the rate of another: its equation says nothing else."""
+    if tree is None or tree.kind != "name" or str(tree.value) not in states or tree.value == state.name:
+        return state
+    return State(**{**vars(state), "rate": str(tree.value)})
+
+
+def _plain(value: Any) -> Any:
+    """Tables and lists of text and numbers alone, as JSON has them."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(inner) for inner in value]
+    return value

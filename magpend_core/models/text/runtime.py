@@ -1,0 +1,38 @@
+"""What generated functions call besides arithmetic: instants of a period in their order. Plain numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from magpend_core.engine.jit import inline
+
+
+@inline
+def rank(at: Any, i: int) -> int:
+    """Place of instant number `i` among all, from 0; of two at the same time the first comes first."""
+    place = 0
+    for j in range(len(at)):
+        if at[j] < at[i] or (at[j] == at[i] and j < i):
+            place += 1
+    return place
+
+
+@inline
+def set_times(at: Any, period: float, times: Any) -> None:
+    """Write instants in [0, period) in their order, each a little after the one before."""
+    for i in range(len(at)):
+        times[rank(at, i)] = at[i]
+    gap = 1e-12 * period
+    for i in range(1, len(at)):
+        times[i] = max(times[i], times[i - 1] + gap)
+    last = period - gap
+    for i in range(len(at) - 1, -1, -1):
+        times[i] = min(times[i], last)
+        last = times[i] - gap
+
+
+@inline
+def within(time: float, period: float) -> float:
+    """An instant brought into [0, period); what lies next to an end counts as 0."""
+    near = 1e-9 * period
+    return 0.0 if time < near or time > period - near else time

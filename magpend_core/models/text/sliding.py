@@ -1,0 +1,178 @@
+"""What stands for the side of a surface: the mode of the engine, and on the surface Filippov's equivalent.
+
+Where the motions of both sides point to the surface, the state stays on it. What then stands for the side is
+the number sigma in [-1, 1] for which the surface's value does not change: with the rate of that value, r(s),
+linear in the sides s, the solution of r(sigma) = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from magpend_core.models.text.derivatives import derivatives
+from magpend_core.models.text.graph import STATED, Graph, Node, in_order, made_again, substituted
+from magpend_core.models.text.switching import Switch
+
+MAX_JOINT = 3
+"""Most surfaces on which a state slides at once, each of which the others' sides act on."""
+
+
+@dataclass(frozen=True)
+class Sliding:
+    """How sides are written in the engine's functions.
+
+    Attributes
+    ----------
+    graph : Graph
+    effective : dict
+        What stands for each side, by its leaf.
+    slides : tuple of bool
+        For which switches sliding is looked for.
+    pairs : tuple of (Node, Node)
+        Value and rate of each switch, as `System.switches` has them.
+    """
+
+    graph: Graph
+    effective: Mapping[Node, Node]
+    slides: tuple[bool, ...]
+    pairs: tuple[tuple[Node, Node], ...]
+
+    def lowered(self, roots: Iterable[Node]) -> list[Node]:
+        """Return nodes in which sides are written with modes."""
+        return _spelled(self.graph, substituted(self.graph, list(roots), self.effective))
+
+
+def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) -> Sliding:
+    """Find which surfaces a state can slide on, and what stands for their sides.
+
+    Parameters
+    ----------
+    graph
+        To which all belong.
+    rates
+        Time derivatives of the states, with sides.
+    switches
+        All of them.
+    """
+    speeds = [_speed(graph, s.value, rates) for s in switches]
+    # on the surface, where all of this is used
+    speeds = [substituted(graph, [v], {s.mode: graph.zero})[0] for v, s in zip(speeds, switches, strict=True)]
+    pulls = [[_pull(graph, speed, s.side) for s in switches] for speed in speeds]
+    slides = [s.jumps and not pulls[k][k].is_number(0.0) for k, s in enumerate(switches)]
+    modes = [s.mode for s in switches]
+    sigma = _spelled(graph, _solved(graph, speeds, pulls, slides, switches, modes))
+    effective = {s.side: _while_sliding(graph, modes[k], sigma[k], modes[k]) for k, s in enumerate(switches)}
+    pairs = []
+    for k, s in enumerate(switches):
+        (value,) = _spelled(graph, substituted(graph, [s.value], effective))
+        pair = value, _along(graph, value)
+        if slides[k]:
+            room = graph.sub(graph.one, graph.mul(sigma[k], sigma[k]))
+            other = room, _along(graph, room)
+            pair = tuple(  # type: ignore[assignment]
+                _while_sliding(graph, modes[k], b, a) for a, b in zip(pair, other, strict=True)
+            )
+        pairs.append(pair)
+    return Sliding(graph, effective, tuple(slides), tuple(pairs))
+
+
+def _spelled(graph: Graph, roots: list[Node]) -> list[Node]:
+    """Write choices as comparisons; in between only where a side can be that."""
+    known: dict[int, Node] = {}
+    for node in in_order(roots):
+        args = tuple(known[a.number] for a in node.args)
+        if node.op == "choice":
+            side, yes, no = args
+            exact = side.kind != STATED or side.op == "mode_side"
+            known[node.number] = _chosen(graph, side, yes, no, exact)
+        else:
+            same = all(a is b for a, b in zip(args, node.args, strict=True))
+            known[node.number] = node if same else made_again(graph, node, args)
+    return [known[root.number] for root in roots]
+
+
+def _chosen(graph: Graph, side: Node, yes: Node, no: Node, exact: bool) -> Node:
+    if exact:
+        return graph.where_less(graph.zero, side, yes, no)
+    share = graph.add(graph.number(0.5), graph.mul(graph.number(0.5), side))
+    between = graph.add(no, graph.mul(share, graph.sub(yes, no)))
+    upper = graph.where_less(side, graph.one, between, yes)
+    return graph.where_less(graph.number(-1.0), side, upper, no)
+
+
+def _while_sliding(graph: Graph, mode: Node, sliding: Node, else_: Node) -> Node:
+    return graph.where_less(graph.call("absolute", mode), graph.number(0.5), sliding, else_)
+
+
+def _speed(graph: Graph, value: Node, rates: Sequence[Node]) -> Node:
+    """Rate of an expression along the motion."""
+    seeds = {n: rates[int(n.value)] for n in in_order([value]) if n.op == "state"}
+    (found,) = derivatives(graph, (value,), {**seeds, graph.leaf("time"): graph.one})
+    return found
+
+
+def _along(graph: Graph, value: Node) -> Node:
+    """Rate of an expression, with the states' rates as leaves."""
+    seeds = {n: graph.leaf("rate", int(n.value)) for n in in_order([value]) if n.op == "state"}
+    (found,) = derivatives(graph, (value,), {**seeds, graph.leaf("time"): graph.one})
+    return found
+
+
+def _pull(graph: Graph, speed: Node, side: Node) -> Node:
+    """Half the difference that a side makes."""
+    (slope,) = derivatives(graph, (speed,), {side: graph.one})
+    if side not in in_order([slope]):
+        return slope
+    above, below = (substituted(graph, [speed], {side: graph.number(s)})[0] for s in (1.0, -1.0))
+    return graph.mul(graph.number(0.5), graph.sub(above, below))
+
+
+def _solved(
+    graph: Graph,
+    speeds: Sequence[Node],
+    pulls: Sequence[Sequence[Node]],
+    slides: Sequence[bool],
+    switches: Sequence[Switch],
+    modes: Sequence[Node],
+) -> list[Node]:
+    """What stands for each side on its surface; the mode for those that are not slid on."""
+    zeros = {s.side: graph.zero for s in switches}
+    found = []
+    for k in range(len(switches)):
+        if not slides[k]:
+            found.append(modes[k])
+            continue
+        (rest,) = substituted(graph, [speeds[k]], zeros)
+        joint = [j for j in range(len(switches)) if j != k and not pulls[k][j].is_number(0.0)]
+        for j in joint:
+            (pull,) = substituted(graph, [pulls[k][j]], zeros)
+            rest = graph.add(rest, graph.mul(pull, modes[j]))
+        partner = [j for j in joint if slides[j] and not pulls[j][k].is_number(0.0)]
+        if partner and len(partner) < MAX_JOINT:
+            found.append(_joint(graph, k, partner[0], speeds, pulls, modes, zeros))
+            continue
+        (own,) = substituted(graph, [pulls[k][k]], zeros)
+        found.append(graph.neg(graph.div(rest, own)))
+    return found
+
+
+def _joint(
+    graph: Graph,
+    k: int,
+    j: int,
+    speeds: Sequence[Node],
+    pulls: Sequence[Sequence[Node]],
+    modes: Sequence[Node],
+    zeros: Mapping[Node, Node],
+) -> Node:
+    """What stands for side k while the state may slide on surface j, too: two linear equations."""
+    rest_k, rest_j, kk, kj, jk, jj = substituted(
+        graph, [speeds[k], speeds[j], pulls[k][k], pulls[k][j], pulls[j][k], pulls[j][j]], zeros
+    )
+    alone = graph.neg(graph.div(graph.add(rest_k, graph.mul(kj, modes[j])), kk))
+    both = graph.div(
+        graph.sub(graph.mul(kj, rest_j), graph.mul(jj, rest_k)),
+        graph.sub(graph.mul(kk, jj), graph.mul(kj, jk)),
+    )
+    return _while_sliding(graph, modes[j], both, alone)

@@ -1,0 +1,271 @@
+"""Where equations have corners and jumps: ``sign``, ``abs``, ``min``, ``max``, ``where`` and ``square``.
+
+Each is smooth between the places at which an expression passes zero, so it is written with the *side* on
+which that expression is: +1 or -1, a number that changes at these places alone and is the same throughout a
+step. Places in time alone whose instants can be told beforehand become edges; all others become switches, on
+which the engine ends a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from magpend_core.models.text.derivatives import derivatives
+from magpend_core.models.text.graph import (
+    CONSTANT,
+    STATED,
+    TIMED,
+    Graph,
+    GraphError,
+    Node,
+    in_order,
+    made_again,
+    substituted,
+)
+from magpend_core.models.text.layers import keeps_sign
+
+CORNERED = ("sign", "absolute", "minimum", "maximum", "less", "square")
+"""Functions that are not smooth."""
+MAX_SWITCHES, MAX_INSTANTS = 16, 64
+MAX_WAVES = 16
+"""Most periods of a square wave in one of the drive."""
+
+
+@dataclass
+class Switch:
+    """A surface on which equations have a corner or a jump.
+
+    Attributes
+    ----------
+    value : Node
+        Zero on the surface.
+    side : Node
+        The leaf that stands for its sign where something jumps.
+    mode : Node
+        The leaf that stands for its sign where slopes alone change: 0 on the surface.
+    written : Node
+        The value as the text has it, for people.
+    jumps : bool
+        Whether something jumps there.
+    """
+
+    value: Node
+    side: Node
+    mode: Node
+    written: Node
+    jumps: bool = False
+
+
+@dataclass
+class Instant:
+    """An instant of each period at which something jumps.
+
+    Attributes
+    ----------
+    time : Node
+        In seconds since the section, in [0, 1/f]; changes with the cell alone.
+    rank : Node
+        The leaf that stands for its place among all instants of a period, from 1.
+    """
+
+    time: Node
+    rank: Node
+
+
+@dataclass
+class Sides:
+    """Rewrites expressions with sides; collects what they need.
+
+    Attributes
+    ----------
+    graph : Graph
+    smoothed : set of int
+        Numbers of nodes whose corner lies in a layer of the same argument: they stay as they are.
+    switches, instants : list
+    left : list of Node
+        Jumps in time that were neither: steps do not end on them.
+    """
+
+    graph: Graph
+    smoothed: frozenset[int] = frozenset()
+    switches: list[Switch] = field(default_factory=list)
+    instants: list[Instant] = field(default_factory=list)
+    left: list[Node] = field(default_factory=list)
+    _known: dict[int, Node] = field(default_factory=dict)
+    _surface: dict[int, Node] = field(default_factory=dict)
+
+    def rewritten(self, roots: Iterable[Node], *, more: bool = True) -> list[Node]:
+        """Return nodes in which sides stand for corners and jumps.
+
+        Parameters
+        ----------
+        roots
+            Expressions.
+        more
+            Whether new places may be found; if not, what is not known yet stays as it is.
+        """
+        roots = list(roots)
+        known = self._known if more else dict(self._known)
+        for node in in_order(roots):
+            if node.number in known:
+                continue
+            args = tuple(known[a.number] for a in node.args)
+            known[node.number] = self._smooth(node, args, more)
+            self._surface[node.number] = self._as_surface(node, known[node.number])
+        return [known[root.number] for root in roots]
+
+    def _as_surface(self, node: Node, rewritten: Node) -> Node:
+        """Return a node as it stands in the value of a surface: with what the edges tell, without modes.
+
+        Engines find out on which sides a start is one after the other, so that none may need another.
+        """
+        free = not any(n.op in ("clock", "mode_clock") for n in in_order([rewritten]))
+        if node.kind == TIMED and free:
+            return rewritten
+        args = tuple(self._surface[a.number] for a in node.args)
+        same = all(a is b for a, b in zip(args, node.args, strict=True))
+        return node if same else made_again(self.graph, node, args)
+
+    def _smooth(self, node: Node, args: tuple[Node, ...], more: bool) -> Node:
+        """Return a node with arguments that have been rewritten; with a side, if it has a corner."""
+        g = self.graph
+        same = all(a is b for a, b in zip(args, node.args, strict=True))
+        plain = node if same else made_again(g, node, args)
+        if node.op not in CORNERED or node.number in self.smoothed or plain.kind == CONSTANT:
+            return plain
+        if node.op == "square":
+            return self._square(node, more) or plain
+        if node.op in ("sign", "absolute"):
+            surface = self._surface[node.args[0].number]
+            side = self.side(surface, args[0], node.op == "sign", more, _plain(surface, node.args[0]))
+            if side is None:
+                return plain
+            return side if node.op == "sign" else g.mul(side, args[0])
+        yes, no = args[-2:] if node.op != "maximum" else args[::-1]
+        a, b = (self._surface[arg.number] for arg in node.args[:2])
+        value, written = g.sub(b, a), g.sub(node.args[1], node.args[0])
+        side = self.side(value, g.sub(args[1], args[0]), node.op == "less", more, _plain(value, written))
+        return plain if side is None else g.choice(side, yes, no)
+
+    def side(
+        self, value: Node, rewritten: Node, jumps: bool, more: bool = True, written: Node | None = None
+    ) -> Node | None:
+        """Return what stands for the sign of an expression; None if nothing can."""
+        g = self.graph
+        if value.op == "neg":
+            inner = self.side(value.args[0], g.neg(rewritten), jumps, more, written)
+            return None if inner is None else g.neg(inner)
+        if value.op == "mul" and value.args[0].op == "number":  # above 0; it does not matter to `rewritten`
+            return self.side(value.args[1], rewritten, jumps, more, written)
+        if keeps_sign(g, value):
+            return g.one
+        if not any(n.op in ("state", "time") for n in in_order([rewritten])):
+            return g.call("sign", rewritten)
+        for switch in self.switches:
+            if switch.value is value:
+                switch.jumps = switch.jumps or jumps
+                return switch.side if jumps else switch.mode
+        if not more or value.kind == CONSTANT:
+            return None
+        if value.kind == TIMED:
+            found = self._in_time(value)
+            if found is not None:
+                return found
+        if len(self.switches) == MAX_SWITCHES:
+            raise GraphError(f"the equations have corners or jumps on more than {MAX_SWITCHES} surfaces")
+        op, k = "side" if value.kind == STATED else "clock", len(self.switches)
+        mode = g.leaf(f"mode_{op}", k)
+        switch = Switch(value, g.leaf(op, k), mode, value if written is None else written, jumps)
+        self.switches.append(switch)
+        return switch.side if jumps else switch.mode
+
+    def _in_time(self, value: Node) -> Node | None:
+        """The sign of a + b t with constant a and b: it changes once in a period, or not at all."""
+        g, time = self.graph, self.graph.leaf("time")
+        if any(n.op in CORNERED or n.op == "segment" for n in in_order([value])):
+            return None
+        (slope,) = derivatives(g, (value,), {time: g.one})
+        if slope.kind != CONSTANT or slope.is_number(0.0):
+            return None
+        offset = g.sub(value, g.mul(slope, time))
+        if any(n.kind != CONSTANT for n in in_order([offset])):
+            (offset,) = _at_time_zero(g, value)
+        period = g.div(g.one, g.leaf("frequency"))
+        self.break_at_start()
+        zero = g.neg(g.div(offset, slope))
+        after = g.call("sign", slope)
+        middle = g.call("sign", g.add(offset, g.mul(g.number(0.5), slope, period)))
+
+        def inside(yes: Node, no: Node) -> Node:
+            return g.where_less(zero, g.zero, no, g.where_less(zero, period, yes, no))
+
+        instant = self._instant(inside(zero, g.mul(g.number(0.5), period)))
+        return self._after(instant, inside(g.neg(after), middle), inside(after, middle))
+
+    def break_at_start(self) -> None:
+        """Let something jump where a period begins."""
+        self._instant(self.graph.zero)
+
+    def _instant(self, time: Node) -> Instant:
+        for known in self.instants:
+            if known.time is time:
+                return known
+        if len(self.instants) == MAX_INSTANTS:
+            raise GraphError(f"the equations have jumps at more than {MAX_INSTANTS} instants of a period")
+        self.instants.append(Instant(time, self.graph.leaf("rank", len(self.instants))))
+        return self.instants[-1]
+
+    def _after(self, instant: Instant, before: Node, after: Node) -> Node:
+        """A number that changes at an instant."""
+        g = self.graph
+        return g.where_less(g.leaf("segment"), g.sub(instant.rank, g.number(0.5)), before, after)
+
+    def _square(self, node: Node, more: bool) -> Node | None:
+        """A square wave of n t f + a: its edges are known beforehand for a whole number n."""
+        g = self.graph
+        phase, duty = node.args
+        (slope,) = derivatives(g, (phase,), {g.leaf("time"): g.one})
+        (offset,) = _at_time_zero(g, phase)
+        count = _multiple_of(slope, g.leaf("frequency"))
+        if not more or count is None or duty.kind != CONSTANT or offset.kind != CONSTANT:
+            if more and node.kind != CONSTANT:
+                self.left.append(node)
+            return None
+        rises: list[Instant] = []
+        falls: list[Instant] = []
+        for edges, shift in ((rises, g.zero), (falls, duty)):
+            for j in range(count):
+                turns = g.div(g.add(g.number(j), shift, g.neg(offset)), g.number(count))
+                share = g.sub(turns, g.call("floor", turns))
+                edges.append(self._instant(g.div(share, g.leaf("frequency"))))
+        first_rise, first_fall = (self._first([e.rank for e in edges]) for edges in (rises, falls))
+        wave = g.where_less(first_rise, first_fall, g.number(-1.0), g.one)
+        steps = [self._after(e, g.zero, g.number(2.0)) for e in rises]
+        steps += [self._after(e, g.zero, g.number(-2.0)) for e in falls]
+        return g.node("add", wave, *steps)
+
+    def _first(self, ranks: list[Node]) -> Node:
+        found = ranks[0]
+        for rank in ranks[1:]:
+            found = self.graph.call("minimum", found, rank)
+        return found
+
+
+def _plain(value: Node, written: Node) -> Node | None:
+    """The expression as it was written, if that is not the value of the surface."""
+    return None if value is written else written
+
+
+def _at_time_zero(graph: Graph, node: Node) -> list[Node]:
+    return substituted(graph, [node], {graph.leaf("time"): graph.zero})
+
+
+def _multiple_of(slope: Node, frequency: Node) -> int | None:
+    """The whole number that a slope is times the frequency."""
+    if slope is frequency:
+        return 1
+    if slope.op == "mul" and slope.args[0].op == "number" and slope.args[1] is frequency:
+        n = slope.args[0].value
+        return int(n) if n == int(n) and 1 <= n <= MAX_WAVES else None
+    return None

@@ -1,0 +1,131 @@
+"""``magpend model``: a system of one's own, shown as it was understood, or begun from a template."""
+
+from __future__ import annotations
+
+import json as json_text
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipeline.cli.common import EXIT_HELP
+from pipeline.cli.groups import SETTINGS
+from pipeline.cli.options import completing, speaking
+
+if TYPE_CHECKING:
+    from magpend_core.models.model import Model
+    from magpend_core.models.showing import Description
+
+model_app = typer.Typer(
+    help="A system of your own as text: begin one, and look at what magpend makes of it.",
+    no_args_is_help=True, rich_markup_mode=None, context_settings=SETTINGS,
+)  # fmt: skip
+
+
+def _names() -> list[str]:
+    from magpend_core.models import model_names
+
+    return list(model_names())
+
+
+def show(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME|FILE",
+            help="A model's name, a file of one, a specification, or package.module:NAME.",
+            autocompletion=completing(_names),
+        ),
+    ],
+    latex: Annotated[bool, typer.Option("--latex", help="The equations in LaTeX alone.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="All of it as JSON.")] = False,
+) -> None:
+    """Show a model's equations as they are understood, what was found in them, and checks.
+
+    What was found are the places that steps are chosen by: edges of the drive, steep layers, switches,
+    impacts. The checks run the equations at the starts of a specification, or near 0, and compile nothing.
+    """  # fmt: skip
+    from pipeline.cli import console
+    from pipeline.cli.exits import Exit
+    from pipeline.runs.modelling import examine
+
+    model, found = examine(name)
+    if json:
+        console.result(json_text.dumps(_as_dict(model, found), indent=1))
+    elif latex:
+        _latex(model, found)
+    else:
+        for line in _lines(model, found):
+            console.result(line)
+    if found.problems:
+        raise typer.Exit(Exit.REFUSED)
+
+
+def new(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FILE]", help="TOML file to write; by default the standard output."),
+    ] = None,
+) -> None:
+    """Write a specification with a model of your own, commented, which runs as it is."""
+    from pipeline.cli import console
+    from pipeline.runs.modelling import write_template
+
+    if file is None:
+        console.result(write_template(None).rstrip("\n"))
+        return
+    write_template(file)
+    console.result(f"specification: {file}")
+    console.note(f"look at it with: magpend model show {file}; run it with: magpend run {file} --smoke")
+
+
+for _command in (show, new):
+    model_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(_command))
+
+
+def _lines(model: Model, found: Description) -> list[str]:
+    from magpend_core.models.showing import checks_of
+    from pipeline.cli.models import all_of
+
+    lines = all_of(model)
+    if found.equations:
+        lines += ["", "equations"]
+        lines += [f"  {name} = {text}" for name, text in found.definitions.items()]
+        lines += [f"  d{name}/dt = {text}" for name, text in found.equations.items()]
+    lines += [
+        "",
+        "found",
+        *(f"  {line}" for line in found.found or ["no edges, layers, switches or impacts"]),
+    ]
+    if found.problems:
+        lines += ["", "checks: failed", *(f"  {line}" for line in found.problems)]
+    else:
+        lines += ["", f"checks: passed ({'; '.join(checks_of(model))})"]
+    return lines
+
+
+def _latex(model: Model, found: Description) -> None:
+    from pipeline.cli import console
+    from pipeline.spec.problems import SpecError
+
+    if not found.latex:
+        raise SpecError([f"--latex: {model.name} is no text, and has no equations to be written; drop it."])
+    console.result("\\begin{align}")
+    console.result(" \\\\\n".join(f"  {line}" for line in found.latex))
+    console.result("\\end{align}")
+
+
+def _as_dict(model: Model, found: Description) -> dict[str, Any]:
+    from pipeline.cli.models import described
+
+    return {
+        **described(model),
+        "autonomous": model.autonomous,
+        "section": model.section,
+        "digest": model.digest,
+        "definitions": found.definitions,
+        "equations": found.equations,
+        "latex": found.latex,
+        "found": found.found,
+        "problems": found.problems,
+    }

@@ -1,0 +1,90 @@
+"""Whether the equations have values where a run begins: said before anything is derived or computed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from magpend_core.models import load_model
+from magpend_core.models.text.model import TextModel
+from pipeline.layout.cells import initial_states, parameter_axes
+from pipeline.spec.parsing import Spec
+from pipeline.spec.problems import SpecError
+from pipeline.spec.tables import FREQUENCY
+
+if TYPE_CHECKING:
+    from magpend_core.models.model import Model
+    from magpend_core.models.text.domains import Fault
+
+MOST_STARTS = 4096
+"""Starts at which the equations are evaluated: all, or so many evenly spread."""
+MOST_CORNERS = 64
+"""Corners of the box of parameters at which they are."""
+
+
+def check_starts(spec: Spec) -> None:
+    """Refuse a run whose equations, as text, have no value at its starts.
+
+    They are evaluated at time 0 at all starts, or 4096 of them, for the ends of every axis.
+
+    Raises
+    ------
+    SpecError
+        Naming each part of the text that has no value, what is wrong, and the numbers.
+    """
+    states = initial_states(spec.initial_conditions)
+    chosen = np.unique(np.linspace(0, len(states) - 1, min(len(states), MOST_STARTS)).astype(np.int64))
+    axes = parameter_axes(spec)
+    ends = [np.unique([a.values.min(), a.values.max()]).tolist() for a in axes]
+    corners = list(itertools.islice(itertools.product(*ends), MOST_CORNERS))
+    names = [a.parameter for a in axes]
+    fixed = {**spec.values, FREQUENCY: spec.frequency_hz}
+    points = [{**fixed, **dict(zip(names, corner, strict=True))} for corner in corners]
+    check_states(load_model(spec.reference), states.at(chosen), points)
+
+
+def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse states at which the equations of a model as text have no value.
+
+    Parameters
+    ----------
+    model
+        Any; of one that is no text nothing is said here.
+    states
+        (n, n_states).
+    points
+        Parameters by name, and ``frequency_hz`` (None for none); the states are looked at for each.
+
+    Raises
+    ------
+    SpecError
+        As `check_starts`.
+    """
+    if not isinstance(model, TextModel):
+        return
+    from magpend_core.models.text.domains import domain_faults
+
+    n = len(states)
+    columns = dict(zip(model.state_names, np.tile(states, (len(points), 1)).T, strict=True))
+    for name in model.parameter_names:
+        columns[name] = np.repeat([float(p[name]) for p in points], n)
+    zero = np.zeros(n * len(points))
+    frequency = [p.get(FREQUENCY) or 1.0 for p in points]
+    columns |= {"t": zero, "phase": zero, "f": np.repeat(frequency, n)}
+    faults = domain_faults(model.definition, columns)
+    if faults:
+        raise SpecError([_sentence(model, fault, columns, n * len(points)) for fault in faults])
+
+
+def _sentence(model: Model, fault: Fault, columns: Mapping[str, np.ndarray], total: int) -> str:
+    own = {n: v for n, v in fault.values.items() if n not in model.state_names}
+    with_states = {name: columns[name][fault.row] for name in model.state_names}
+    at = ", ".join(f"{name} = {value:.6g}" for name, value in {**with_states, **own}.items())
+    share = f" ({fault.count} of {total} starts)" if total > 1 else ""
+    return (
+        f"model.{fault.place}: {fault.part}: {fault.why} at the start {at}{share}; begin elsewhere, or write "
+        "where(condition, a, b) with a value that exists there."
+    )

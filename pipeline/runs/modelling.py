@@ -1,0 +1,109 @@
+"""A model looked at before any run: what ``magpend model`` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import Parameters
+from pipeline.layout.cells import CellMap
+from pipeline.layout.domains import check_starts, check_states
+from pipeline.runs.workflows import find_spec
+from pipeline.spec.files import read_toml
+from pipeline.spec.models import find_model, is_model_file
+from pipeline.spec.parsing import KINDS, Spec, load_spec
+from pipeline.spec.problems import SpecError
+from pipeline.spec.tables import FREQUENCY
+
+if TYPE_CHECKING:
+    from magpend_core.models.showing import Description
+
+TEMPLATE = Path(__file__).parents[1] / "spec" / "template.toml"
+NEAR_ZERO = (0.0, 0.1, -0.2, 0.3)
+"""Starts in units of the states' scales, where no specification gives any."""
+
+
+def examine(name: str) -> tuple[Model, Description]:
+    """Describe a model, at the starts of a specification or near 0.
+
+    Parameters
+    ----------
+    name
+        Of a model that ships; a file of one, or of a specification; or ``package.module:NAME``, which is
+        imported.
+
+    Raises
+    ------
+    SpecError
+        If there is none, or it cannot be understood, or has no value where it starts.
+    """
+    from magpend_core.models.showing import describe
+
+    spec = _specification(name)
+    if spec is None:
+        model = find_model(name)
+        parameters, frequency_hz, states = _near_zero(model)
+    else:
+        check_starts(spec)
+        parameters, frequency_hz, states = _first_cells(spec)
+        model = parameters.model
+    return model, describe(parameters, frequency_hz, states)
+
+
+def _specification(name: str) -> Spec | None:
+    """The specification that a file is; None for a model's own."""
+    if not is_model_file(name) or read_toml(name).get("kind") not in KINDS:
+        return None
+    return load_spec(find_spec(name))
+
+
+def _near_zero(model: Model) -> tuple[Parameters, float, np.ndarray]:
+    parameters = model.load()
+    states = np.outer(NEAR_ZERO, np.asarray(model.scales))
+    good = []
+    for row in states:  # 0 is often where nothing moves, and sometimes where nothing has a value
+        try:
+            check_states(model, row[None], [{**parameters, FREQUENCY: 1.0}])
+            good.append(row)
+        except SpecError:
+            pass
+    if not good:
+        check_states(model, states, [{**parameters, FREQUENCY: 1.0}])
+    return parameters, 1.0, np.array(good)
+
+
+def _first_cells(spec: Spec) -> tuple[Parameters, float, np.ndarray]:
+    cells = CellMap(spec)
+    block = tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
+    inputs = cells.inputs(block)
+    names = spec.values.names
+    values = dict(zip(names, inputs.parameters[0, 0].tolist(), strict=True))
+    model = spec.model.flow
+    parameters = Parameters(model, {name: values[name] for name in model.parameter_names})
+    return parameters, float(inputs.frequency_hz[0, 0]), inputs.initial_states
+
+
+def write_template(path: Path | None) -> str:
+    """Return the template of a specification with a model of one's own; write it if a path is given.
+
+    Raises
+    ------
+    SpecError
+        If the file exists or its folder does not.
+    """
+    text = TEMPLATE.read_text("utf-8")
+    if path is None:
+        return text
+    if path.suffix != ".toml":
+        raise SpecError([f"{path}: the suffix must be .toml."])
+    if not path.parent.is_dir():
+        raise SpecError([f"{path.parent}: no such folder; make it first."])
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise SpecError([f"{path}: exists already and is not overwritten; give another FILE."]) from None
+    return text

@@ -1,0 +1,41 @@
+"""Plain data as TOML: what specifications hold, spelled so that it reads back as the same."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+
+def toml_key(key: str) -> str:
+    """Spell a key, in quotes where it must be."""
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
+
+
+def toml_value(value: Any) -> str:
+    """Spell a number, text, truth value, list, or a table within a line."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        # JSON escapes what TOML must have escaped, but for DEL
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{toml_key(k)} = {toml_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        items = [toml_value(v) for v in value]
+        if any(isinstance(v, list | tuple) for v in value):
+            return "[\n" + "".join(f"    {item},\n" for item in items) + "]"
+        return "[" + ", ".join(items) + "]"
+    return repr(value)
+
+
+def table_lines(head: str, table: Mapping[str, Any]) -> list[str]:
+    """Lines of a table, and of the tables in it, each below a head of its own."""
+    plain = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
+    lines = [f"[{head}]", *(f"{toml_key(key)} = {toml_value(value)}" for key, value in plain.items())]
+    for key, inner in table.items():
+        if key not in plain:
+            entries = (f"{toml_key(k)} = {toml_value(v)}" for k, v in inner.items())
+            lines += ["", f"[{head}.{toml_key(key)}]", *entries]
+    return lines

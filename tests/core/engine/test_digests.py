@@ -1,0 +1,243 @@
+"""Digests of functions from outside the package; machine code kept under them is never an old one."""
+
+import math
+from collections import namedtuple
+
+import numpy as np
+import pytest
+from numba import njit
+
+from magpend_core.engine import vecmath
+from magpend_core.engine.digests import functions_digest
+from magpend_core.engine.jit import inline, keeping
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
+
+SOURCE = """
+import math
+import numpy as np
+from magpend_core.engine import vecmath
+from magpend_core.engine.jit import inline
+from magpend_core.engine.vecmath import sincos
+
+FACTOR = 2.0
+TABLE = np.array([1.0, 2.0])
+AT = Places(0, 1)
+
+@inline
+def callee(x):
+    return 3.0 * x
+
+def closed(shift):
+    @inline
+    def inner(x):
+        return x + shift
+    return inner
+
+shifted = closed(0.5)
+
+@inline
+def entry(x, n=2):
+    much = TABLE[AT.b] + shifted(x) + math.sqrt(2.0) * np.pi
+    return FACTOR * callee(x) + much + sincos(x)[0] + vecmath.exp(x)
+"""
+
+
+def digest_of(source, module=__name__):
+    scope = {"Places": namedtuple("Places", ("a", "b")), "__name__": module}
+    exec(source, scope)
+    return functions_digest(scope["entry"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("3.0 * x", "3.0 + x"),
+        ("3.0 * x", "3.1 * x"),
+        ("FACTOR = 2.0", "FACTOR = 2.0000000000000004"),
+        ("FACTOR = 2.0", "FACTOR = 2"),
+        ("[1.0, 2.0]", "[1.0, 2.5]"),
+        ("[1.0, 2.0]", "[[1.0], [2.0]]"),
+        ("Places(0, 1)", "Places(0, 0)"),
+        ("closed(0.5)", "closed(0.25)"),
+        ("n=2", "n=3"),
+        ("np.pi", "np.e"),
+        ("math.sqrt", "math.exp"),
+        ("sincos(x)[0]", "sincos(x)[1]"),
+        ("vecmath.exp(x)", "vecmath.log(x)"),
+        ("@inline\ndef entry", "from numba import njit\n@njit(fastmath=True)\ndef entry"),
+    ],
+)
+def test_functions_digest__changes_with_all_that_is_reached(old, new):
+    assert SOURCE.count(old) == 1
+    assert digest_of(SOURCE.replace(old, new)) != digest_of(SOURCE)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("    return 3.0 * x", "    # a reason\n    return 3.0 * x"),
+        ("FACTOR = 2.0", "FACTOR = 2.0\nUNUSED = 5"),
+    ],
+)
+def test_functions_digest__does_not_change_with_the_rest(old, new):
+    assert digest_of(SOURCE.replace(old, new)) == digest_of(SOURCE)
+
+
+def test_functions_digest__none_for_functions_of_no_module():
+    # the compile cache imports the module when it is read
+    assert digest_of(SOURCE, "a_module_that_is_not_there") is None
+
+
+def test_functions_digest__is_the_same_in_every_process(run_python):
+    script = "from magpend_core.engine.digests import functions_digest\n"
+    script += "from magpend_core.models.pendulum.systems import PENDULUM_FITTED\n"
+    script += "print(functions_digest(*PENDULUM_FITTED.functions))"
+    here = functions_digest(*PENDULUM_FITTED.functions)
+    assert {run_python(script, PYTHONHASHSEED=seed).strip() for seed in ("1", "2")} == {here}
+
+
+class Counter:
+    value = 1.0
+
+
+COUNTER = Counter()
+later = {}
+
+
+def _plain_helper(x):
+    return x
+
+
+@njit
+def _of_state(x):
+    return x + COUNTER.value
+
+
+@njit
+def _of_plain_function(x):
+    return _plain_helper(x)
+
+
+@njit
+def _of_missing(x):
+    return x + not_there  # noqa: F821
+
+
+@njit
+def _of_module(x):
+    return len(dir(np)) + x
+
+
+@pytest.mark.parametrize("function", [_of_state, _of_plain_function, _of_missing, _of_module])
+def test_functions_digest__none_if_something_cannot_be_followed(function):
+    assert functions_digest(function) is None
+    assert keeping(function) is None
+
+
+def test_functions_digest__follows_functions_that_call_themselves():
+    @inline
+    def falling(n):
+        return 1.0 if n <= 0 else n * falling(n - 1)
+
+    assert len(functions_digest(falling)) == 64
+
+
+def test_keeping__nothing_for_the_package_and_a_digest_for_others():
+    @inline
+    def mine(x):
+        return vecmath.exp(x) + math.pi
+
+    assert keeping(vecmath.exp, vecmath.sin) == ""
+    assert keeping(vecmath.exp, mine) == functions_digest(vecmath.exp, mine)
+
+
+MODULE = """
+from magpend_core.engine.jit import inline
+from magpend_core.engine.system import System
+from other import stiffness
+
+@inline
+def constants(frequency, p, out):
+    out[0] = p[0]
+
+@inline
+def rhs(y, u, c):
+    return y[1], -stiffness(y[0]) - c[0] * y[1]
+
+SYSTEM = System(name="mine", state_names=("x", "v"), parameter_names=("d",), n_constants=1,
+                constants=constants, rhs=rhs)
+"""
+OTHER = """
+from magpend_core.engine.jit import inline
+
+SCALE = 1.0
+
+@inline
+def stiffness(x):
+    return SCALE * x
+"""
+RUN = """
+import sys
+sys.path.insert(0, "theirs")
+from magpend_core import run_branches
+from magpend_core.engine.lanes import _engine_of, engine_of
+from magpend_core.engine import entry
+from mine import SYSTEM
+engines = []
+entry.engine_of = lambda *a: engines.append(engine_of(*a)) or engines[-1]
+found = run_branches(parameters=[[[0.1]]], frequency_hz=[[0.5]], initial_states=[[1.0, 0.0]],
+                     n_transient=0, n_keep=1, rtol=1e-9, atol=1e-9, system=SYSTEM)
+stats = engines[0].stats
+print(found.section.ravel()[0].hex(), sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
+"""
+
+
+def test_kernel__of_a_system_from_outside_is_kept_and_never_old(run_python, tmp_path):
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    (folder / "mine.py").write_text(MODULE, "utf-8")
+    (folder / "other.py").write_text(OTHER, "utf-8")
+
+    def run():
+        # Python's own kept bytecode goes by seconds and sizes: too coarse for a test
+        return run_python(RUN, PYTHONDONTWRITEBYTECODE="1").split()
+
+    first, again = run(), run()
+    assert (first[1:], again[1:]) == (["0", "1"], ["1", "0"])
+    assert first[0] == again[0]
+    # an edit in the module that it calls, of a number that no bytecode shows
+    (folder / "other.py").write_text(OTHER.replace("SCALE = 1.0", "SCALE = 1.5"), "utf-8")
+    edited = run()
+    assert edited[1:] == ["0", "1"]
+    assert edited[0] != first[0]
+    # x'' = -1.5 x - x'/10 after 2 s
+    rate, turn = 0.05, math.sqrt(1.5 - 0.05**2)
+    x = math.exp(-2.0 * rate) * (math.cos(2.0 * turn) + rate / turn * math.sin(2.0 * turn))
+    assert float.fromhex(edited[0]) == pytest.approx(x, abs=1e-6)
+    # and back: the first answer is still there
+    (folder / "other.py").write_text(OTHER, "utf-8")
+    assert run() == again
+
+
+TEXT = """
+from magpend_core.engine.lanes import engine_of
+from magpend_core.engine import entry
+from magpend_core.models.text import read_model
+from magpend_core.sections import sections
+equations = {"x": "v", "v": "-x - d*v + A*sin(2*pi*f*t)"}
+model = read_model({"name": "mine", "states": {"x": {}, "v": {}}, "equations": equations,
+                    "parameters": {"d": 0.1, "A": AMPLITUDE}})
+engines = []
+entry.engine_of = lambda *a: engines.append(engine_of(*a)) or engines[-1]
+found = sections(model.load(), 0.5, [[1.0, 0.0]], n_transient=0, n_keep=1)
+stats = engines[0].stats
+print(found.section.ravel()[0].hex(), sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
+"""
+
+
+def test_kernel__of_a_text_is_kept_and_its_parameters_values_compile_nothing(run_python):
+    first, again, other = (run_python(TEXT.replace("AMPLITUDE", a)).split() for a in ("1.0", "1.0", "2.0"))
+    assert (first[1:], again[1:]) == (["0", "1"], ["1", "0"])
+    assert first[0] == again[0]
+    assert other[0] != first[0]
+    assert other[1:] == ["1", "0"]

@@ -1,0 +1,887 @@
+"""Events: sections by crossing against other integrators and published periods."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+from magpend_core import Crossing, Status, lyapunov_exponents, rates, run_branches, trajectory
+from magpend_core.engine.checks import SystemCheckError, check_system
+from magpend_core.engine.crossing import with_section
+from magpend_core.engine.events import cubic_dip, cubic_root, may_dip
+from magpend_core.engine.jit import inline
+from magpend_core.engine.simd import absolute
+from magpend_core.engine.system import System
+from magpend_core.engine.vecmath import sincos
+from magpend_core.orbits import polish_orbits, stroboscopic_map
+from magpend_core.sampling import sample
+
+
+@inline
+def copy_parameters(frequency, p, out):
+    for i in range(len(out)):
+        out[i] = p[i]
+
+
+def flow(name, states, parameters, rhs, **fields):
+    """An autonomous system whose constants are its parameters."""
+    return System(
+        name=name, state_names=states, parameter_names=parameters, n_constants=len(parameters),
+        constants=copy_parameters, rhs=rhs, **fields,
+    )  # fmt: skip
+
+
+@inline
+def _van_der_pol(y, u, c):
+    return y[1], c[0] * (1.0 - y[0] * y[0]) * y[1] - y[0]
+
+
+@inline
+def _rossler(y, u, c):
+    return -y[1] - y[2], y[0] + c[0] * y[1], c[1] + y[2] * (y[0] - c[2])
+
+
+@inline
+def _rotor(y, u, c):
+    return y[1], c[0] - c[1] * y[1] - sincos(y[0])[0]
+
+
+@inline
+def _circle(y, u, c):
+    # radius 1, angular velocity 1
+    return -y[1], 1.0 * y[0]
+
+
+VAN_DER_POL = flow("van_der_pol", ("x", "v"), ("mu",), _van_der_pol)
+ROSSLER = flow("rossler_flow", ("x", "y", "z"), ("a", "b", "c"), _rossler)
+ROTOR = flow("rotor", ("th", "w"), ("torque", "d"), _rotor, is_angle=(True, False))
+CIRCLE = flow("circle", ("x", "y"), (), _circle)
+
+
+def returns(system, parameters, starts, section, *, n_transient=0, n_keep=1, rtol=1e-10, **options):
+    starts = np.atleast_2d(np.asarray(starts, float))
+    packed = np.broadcast_to(np.asarray(parameters, float), (len(starts), 1, len(system.parameter_names)))
+    return run_branches(
+        packed, None, starts, n_transient=n_transient, n_keep=n_keep, rtol=rtol, atol=rtol, system=system,
+        section=section, **options,
+    )  # fmt: skip
+
+
+def crossings_of(rhs, start, level, of, direction, time):
+    """Times and states of crossings by another integrator and its own search for zeros."""
+
+    def event(t, y):
+        return y[of] - level
+
+    event.direction = direction
+    found = solve_ivp(rhs, (0.0, time), start, "DOP853", rtol=1e-13, atol=1e-13, events=event)
+    return found.t_events[0], found.y_events[0]
+
+
+# mu = 1: Amore, J. Comput. Appl. Math. 2022, and many before; checked here by DOP853 to 1e-11
+VAN_DER_POL_PERIOD = 6.6632868593231301
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_section__of_van_der_pol_has_the_published_period(direction):
+    found = returns(
+        VAN_DER_POL, [1.0], [[0.5, 0.1], [2.0, 3.0]], Crossing("v", 0.0, direction, 20.0),
+        n_transient=8, n_keep=6, rtol=1e-12,
+    )  # fmt: skip
+    assert found.status.tolist() == [[Status.PERIODIC]] * 2
+    assert found.orbit_period.tolist() == [[1]] * 2
+    assert abs(found.return_time - VAN_DER_POL_PERIOD).max() < 2e-11
+    # the amplitude of the cycle, on the side at which v falls through zero
+    side = 1.0 if direction == "down" else -1.0
+    assert found.section[..., 0] == pytest.approx(side * 2.00861986087, abs=1e-9)
+    # the step ends on the section, to the last digits of terms that are about 1
+    assert abs(found.section[..., 1]).max() < 1e-14
+
+
+@pytest.mark.parametrize(("of", "level", "direction"), [(0, 0.0, 1), (1, 0.0, -1), (2, 1.0, 1)])
+def test_section__of_rossler_is_that_of_another_integrator(of, level, direction):
+    a, b, c = 0.2, 0.2, 5.7
+    start = [-3.0, -4.0, 0.1]
+
+    def rhs(t, y):
+        return -y[1] - y[2], y[0] + a * y[1], b + y[2] * (y[0] - c)
+
+    times, states = crossings_of(rhs, start, level, of, direction, 80.0)
+    n = 8
+    section = Crossing("xyz"[of], level, "up" if direction > 0 else "down", 50.0)
+    found = returns(ROSSLER, [a, b, c], start, section, n_keep=n, rtol=1e-13)
+    # chaos doubles an error with each return or so
+    assert found.section[0, 0] == pytest.approx(states[:n], abs=1e-8)
+    assert np.cumsum(found.return_time[0, 0]) == pytest.approx(times[:n], abs=1e-8)
+    assert abs(found.section[0, 0, :, of] - level).max() < 1e-14
+
+
+def test_section__of_an_angle_is_crossed_modulo_a_turn_and_one_way():
+    # a rotor that turns over: th passes every level once a turn, backwards never
+    torque, d, start, level = 1.6, 0.5, [0.3, 2.0], 2.5
+
+    def rhs(t, y):
+        return y[1], torque - d * y[1] - math.sin(y[0])
+
+    found = returns(ROTOR, [torque, d], start, Crossing("th", level, "up", 30.0), n_keep=5, rtol=1e-12)
+    for i in range(5):
+        times, states = crossings_of(rhs, start, level + 2.0 * np.pi * i, 0, 1, 40.0)
+        assert np.cumsum(found.return_time[0, 0])[i] == pytest.approx(times[0], abs=1e-10)
+        assert found.section[0, 0, i] == pytest.approx([level, states[0, 1]], abs=1e-10)
+    assert found.turns[0, 0, 0] == 4
+    backwards = returns(ROTOR, [torque, d], start, Crossing("th", level, "down", 30.0))
+    assert backwards.status[0, 0] == Status.NO_RETURN
+    # mirrored, it turns backwards, and past the zero of the sine half a turn away the rising way
+    mirrored = returns(ROTOR, [-torque, d], [-0.3, -2.0], Crossing("th", -level, "down", 30.0), n_keep=5)
+    assert mirrored.return_time == pytest.approx(found.return_time, abs=1e-8)
+    backwards = returns(ROTOR, [-torque, d], [-0.3, -2.0], Crossing("th", -level, "up", 30.0))
+    assert backwards.status[0, 0] == Status.NO_RETURN
+
+
+def test_section__the_crossing_at_the_start_does_not_count():
+    # x = sin t, y = -cos t rises through x = 0 at the start and a period later
+    for x in (0.0, 1e-13, -1e-13):
+        found = returns(CIRCLE, [], [[x, -1.0]], Crossing("x"), rtol=1e-12)
+        assert found.return_time[0, 0, 0] == pytest.approx(2.0 * np.pi, abs=1e-10)
+    # a start before the section is another matter
+    found = returns(CIRCLE, [], [[-np.sin(0.01), -np.cos(0.01)]], Crossing("x"), rtol=1e-12)
+    assert found.return_time[0, 0, 0] == pytest.approx(0.01, abs=1e-12)
+
+
+def test_section__no_return_ends_the_cell_and_the_walk_goes_on():
+    # mu < 0: to rest; then mu = 1 at the second point
+    packed = np.array([[[-1.0], [1.0]]])
+    found = run_branches(
+        packed, None, [[1.0, 0.3]], n_transient=0, n_keep=2, rtol=1e-9, atol=1e-9, system=VAN_DER_POL,
+        section=Crossing("x", 0.5, "up", 60.0),
+    )  # fmt: skip
+    assert found.status[0].tolist() == [Status.NO_RETURN, Status.BOUNDED]
+    assert np.isnan(found.section[0, 0]).all()
+    assert np.isnan(found.return_time[0, 0]).all()
+    assert np.isfinite(found.section[0, 1]).all()
+    assert "section.longest" in Status.NO_RETURN.sentence
+
+
+def test_section__finds_a_pair_of_crossings_within_a_step():
+    # the top of a circle of radius 1 reaches beyond the level by 5e-5, for 0.02 s; steps are ten times longer
+    for depth in (1e-3, 5e-5, 1e-6):
+        section = Crossing("x", 1.0 - depth, "up", 20.0)
+        found = returns(CIRCLE, [], [[0.0, -1.0]], section, n_transient=1, n_keep=3, rtol=1e-9)
+        assert found.return_time[0, 0] == pytest.approx(2.0 * np.pi, abs=1e-5)
+        assert found.section[0, 0, :, 0] == pytest.approx(1.0 - depth, abs=1e-12)
+        section = Crossing("x", 1.0 - depth, "down", 20.0)
+        found = returns(CIRCLE, [], [[0.0, -1.0]], section, n_transient=1, n_keep=3, rtol=1e-9)
+        assert found.return_time[0, 0] == pytest.approx(2.0 * np.pi, abs=1e-5)
+
+
+def test_section__at_rest_on_the_section_is_no_crossing():
+    found = returns(VAN_DER_POL, [1.0], [[0.0, 0.0]], Crossing("v", 0.0, "up", 30.0))
+    assert found.status[0, 0] == Status.NO_RETURN
+
+
+def test_section__bits_depend_on_the_lane_alone():
+    rng = np.random.default_rng(3)
+    starts = rng.uniform(-3.0, 3.0, (75, 2))
+    section = Crossing("v", 0.3, "down", 40.0)
+    options = {"n_transient": 3, "n_keep": 4, "rtol": 1e-8}
+    whole = returns(VAN_DER_POL, [1.0], starts, section, **options)
+    order = rng.permutation(75)
+    for rows, n_lanes in ((order, 24), (np.arange(75), 1), (np.arange(7), 1000), (np.array([50]), 64)):
+        part = returns(VAN_DER_POL, [1.0], starts[rows], section, n_lanes=n_lanes, **options)
+        for name in ("section", "return_time", "n_steps", "n_rejected", "final_state", "step_size"):
+            assert getattr(part, name).tobytes() == getattr(whole, name)[rows].tobytes(), name
+
+
+def test_section__continues_from_its_final_state():
+    section = Crossing("v", 0.0, "down", 40.0)
+    whole = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], section, n_keep=6, rtol=1e-8)
+    first = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], section, n_keep=2, rtol=1e-8)
+    second = returns(
+        VAN_DER_POL, [1.0], first.final_state, section, n_keep=4, rtol=1e-8, step_size=first.step_size
+    )
+    together = np.concatenate([first.section, second.section], axis=2)
+    assert together.tobytes() == whole.section.tobytes()
+
+
+def test_section__watched_quantities_are_means_over_the_return():
+    # over a turn of the circle x is 0 in the mean, its extremes are 1
+    found = returns(
+        CIRCLE, [], [[0.6, -0.8]], Crossing("x", 0.6), n_transient=1, n_keep=2, rtol=1e-10, quantities=["x"]
+    )
+    assert found.extremes[0, 0, :, 0] == pytest.approx(np.tile([-1.0, 1.0, 0.0], (2, 1)), abs=1e-5)
+
+
+@pytest.mark.parametrize("steps", [1, 20])
+def test_section__too_many_steps_end_it(steps):
+    found = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], Crossing("v"), max_steps_per_period=steps)
+    assert found.status[0, 0] == Status.STEP_LIMIT
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"of": "v", "direction": "left"}, "direction = 'left'"),
+        ({"of": "v", "longest": 0.0}, "longest = 0.0"),
+        ({"of": "v", "value": np.nan}, "value of a section"),
+    ],
+)
+def test_crossing__refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Crossing(**arguments)
+
+
+def test_with_section__refuses(duffing):
+    with pytest.raises(ValueError, match="no such state; it has x, v"):
+        with_section(VAN_DER_POL, "w", 1)
+    with pytest.raises(ValueError, match="depends on time"):
+        with_section(duffing, "x", 1)
+    with pytest.raises(ValueError, match="has a section already"):
+        with_section(with_section(VAN_DER_POL, "x", 1), "v", 1)
+    with pytest.raises(ValueError, match="frequency_hz must be None"):
+        run_branches(
+            np.ones((1, 1, 1)), [[1.0]], [[1.0, 0.0]], n_transient=0, n_keep=1, rtol=1e-8, atol=1e-8,
+            system=VAN_DER_POL, section=Crossing("v"),
+        )  # fmt: skip
+
+
+def test_cubic__root_and_dip_are_those_of_numpy():
+    rng = np.random.default_rng(8)
+    a, b = rng.uniform(0.0, 1.0, 4000), rng.uniform(-1.0, 1.0, 4000)
+    da, db = rng.normal(0.0, 3.0, (2, 4000))
+    with np.errstate(all="ignore"):
+        dips, expected, errors = cubic_dip(a, da, b, db), [], []
+        possible = may_dip(a, da, b, db)
+        roots = cubic_root(a, da, b, db, np.minimum(dips, 1.0))
+    for i in range(4000):
+        c3, c2 = 2.0 * (a[i] - b[i]) + da[i] + db[i], 3.0 * (b[i] - a[i]) - 2.0 * da[i] - db[i]
+        cubic = np.polynomial.Polynomial([a[i], da[i], c2, c3])
+        low = [x.real for x in cubic.deriv().roots() if abs(x.imag) < 1e-12 and 0 < x.real < 1]
+        low = [x for x in low if cubic.deriv(2)(x) > 0.0 and cubic(x) < 0.0]
+        expected.append(low[0] if low else 2.0)
+        if b[i] < 0.0 or low:
+            zeros = [x.real for x in cubic.roots() if abs(x.imag) < 1e-9 and 0.0 <= x.real <= 1.0]
+            errors.append(abs(roots[i] - min(zeros)))
+    # what the few steps of Newton's method leave, the next attempt finds
+    assert np.median(errors) < 1e-7
+    assert np.mean(np.array(errors) < 1e-2) > 0.9
+    assert (possible[dips < 1.0] == 1.0).all()
+    assert dips == pytest.approx(expected, abs=1e-9)
+
+
+# --- switches, segments -------------------------------------------------------------------------------
+
+
+@inline
+def _relay(y, u, c):
+    return y[1], 0.0 * y[0] - c[0] * c[1]
+
+
+@inline
+def _of_position(t, y, dy, c):
+    return ((y[0], dy[0]),)
+
+
+@inline
+def _relay_jacobian(y, u, c):
+    zero = 0.0 * y[0]
+    return zero, zero + 1.0, zero, zero
+
+
+RELAY = flow(
+    "relay", ("x", "v"), ("k",), _relay, jacobian=_relay_jacobian, n_modes=1, n_switches=1,
+    switches=_of_position,
+)  # fmt: skip
+
+
+def run_cells(system, parameters, frequency, starts, *, n_transient=0, n_keep=1, rtol=1e-8, **options):
+    starts = np.atleast_2d(np.asarray(starts, float))
+    packed = np.broadcast_to(np.asarray(parameters, float), (len(starts), 1, len(system.parameter_names)))
+    return run_branches(
+        packed, np.full((len(starts), 1), frequency), starts, n_transient=n_transient, n_keep=n_keep,
+        rtol=rtol, atol=rtol, system=system, **options,
+    )  # fmt: skip
+
+
+def relay_exactly(amplitude, time):
+    """x'' = -sign(x) from rest at `amplitude`: four parabolas."""
+    quarter = math.sqrt(2.0 * amplitude)
+    n, rest = divmod(time, 2.0 * quarter)
+    s = rest - quarter
+    sign = 1.0 if n % 2 == 0 else -1.0
+    if s < 0.0:
+        return sign * (amplitude - 0.5 * rest**2), -sign * rest
+    return sign * (-quarter * s + 0.5 * s**2), sign * (-quarter + s)
+
+
+def test_switch__of_a_relay_gives_parabolas():
+    amplitudes = np.linspace(0.3, 2.0, 21)
+    found = run_cells(RELAY, [1.0], 1.0, np.c_[amplitudes, 0.0 * amplitudes], n_keep=6, rtol=1e-6)
+    for a, sections in zip(amplitudes, found.section[:, 0], strict=True):
+        exact = [relay_exactly(a, i + 1.0) for i in range(6)]
+        assert sections == pytest.approx(np.array(exact), abs=3e-12)
+    # one attempt passes the switch, one or two aim at it
+    n_crossings = sum(int((6.0 + q) / (2.0 * q)) for q in np.sqrt(2.0 * amplitudes))
+    assert found.n_rejected.sum() < 3 * n_crossings
+
+
+@inline
+def _low_pass(y, u, c):
+    return (u - c[0] * y[0],)
+
+
+@inline
+def _levels(t, c):
+    # 0 before the first edge, 1 up to the second, 0 again
+    return c[1] * (2.0 - c[1])
+
+
+@inline
+def _two_edges(frequency, p, times, half_widths, jumps):
+    times[0], times[1] = 0.25 / frequency, 0.7 / frequency
+    for i in range(2):
+        half_widths[i] = math.inf
+        jumps[i] = 1.0
+
+
+LOW_PASS = flow(
+    "low_pass", ("x",), ("k",), _low_pass, forcing=_levels, n_edges=2, edges=_two_edges, n_modes=1,
+    has_segments=True,
+)  # fmt: skip
+
+
+def test_segments__of_a_square_drive_give_exponentials():
+    k, frequency = 1.7, 0.8
+    found = run_cells(LOW_PASS, [k], frequency, [[0.3], [-2.0]], n_keep=5, rtol=1e-11)
+    for start, sections in zip([0.3, -2.0], found.section[:, 0, :, 0], strict=True):
+        x = start
+        for value in sections:
+            for share, level in ((0.25, 0.0), (0.45, 1.0), (0.3, 0.0)):
+                x = level / k + (x - level / k) * math.exp(-k * share / frequency)
+            assert value == pytest.approx(x, abs=1e-10)
+    # no attempt has an edge within it, which would cost a dozen rejections
+    assert found.n_rejected.max() <= 3 * 5
+
+
+# --- dry friction ---------------------------------------------------------------------------------------
+
+
+@inline
+def _dry_constants(frequency, p, out):
+    out[0], out[1] = p[0], p[1]
+    out[2] = 2.0 * math.pi * frequency
+
+
+@inline
+def _dry_forcing(t, c):
+    return c[0] * sincos(c[2] * t)[1]
+
+
+@inline
+def _dry_rhs(y, u, c):
+    # x'' = force - x - mu sign(v); in mode 0 the mass sticks
+    slipping = absolute(c[3])
+    return y[1], slipping * (u - y[0]) - c[1] * c[3]
+
+
+@inline
+def _dry_switches(t, y, dy, c):
+    sine, cosine = sincos(c[2] * t)
+    sigma = (c[0] * cosine - y[0]) / c[1]
+    change = (-c[0] * c[2] * sine - dy[0]) / c[1]
+    slipping = absolute(c[3])
+    return (
+        (
+            slipping * y[1] + (1.0 - slipping) * (1.0 - sigma * sigma),
+            slipping * dy[1] - (1.0 - slipping) * (2.0 * sigma * change),
+        ),
+    )
+
+
+@inline
+def _dry_jacobian(y, u, c):
+    zero = 0.0 * y[0]
+    return zero, zero + 1.0, zero - absolute(c[3]), zero
+
+
+DRY = System(
+    name="dry_friction", state_names=("x", "v"), parameter_names=("force", "mu"), n_constants=3,
+    constants=_dry_constants, forcing=_dry_forcing, rhs=_dry_rhs, jacobian=_dry_jacobian, n_modes=1,
+    n_switches=1, switches=_dry_switches, slides=(True,),
+)  # fmt: skip
+
+
+class DryFriction:
+    """x'' = force cos(w t) - x - mu sign(x'), slip by slip and stick by stick in closed form."""
+
+    def __init__(self, force, mu, frequency):
+        self.force, self.mu, self.w = force, mu, 2.0 * np.pi * frequency
+        self.forced = force / (1.0 - self.w**2)
+        self.stuck = 0.0
+
+    def slip(self, t0, x0, v0, sign):
+        """Position and velocity as functions of time while the velocity has one sign."""
+        a = x0 + self.mu * sign - self.forced * np.cos(self.w * t0)
+        b = v0 + self.forced * self.w * np.sin(self.w * t0)
+
+        def at(t):
+            c, s = np.cos(t - t0), np.sin(t - t0)
+            x = -self.mu * sign + self.forced * np.cos(self.w * t) + a * c + b * s
+            return x, -self.forced * self.w * np.sin(self.w * t) - a * s + b * c
+
+        return at
+
+    def state(self, x, times):
+        """States at rising times, from rest at `x` at time 0; the time that it sticks goes to `stuck`."""
+        t, out = 0.0, []
+        while len(out) < len(times):
+            end = self._first(lambda s, x=x: abs(self.force * np.cos(self.w * s) - x) - self.mu, t)
+            while len(out) < len(times) and times[len(out)] <= end:
+                out.append((x, 0.0))
+            self.stuck += end - t
+            t, v, sign = end, 0.0, np.sign(self.force * np.cos(self.w * end) - x)
+            while len(out) < len(times) and sign != 0.0:
+                at = self.slip(t, x, v, sign)
+                end = self._first(lambda s, at=at, sign=sign: -sign * at(s)[1], t + 1e-6)
+                while len(out) < len(times) and times[len(out)] <= end:
+                    out.append(at(times[len(out)]))
+                t, (x, v) = end, at(end)
+                pull = self.force * np.cos(self.w * t) - x
+                sign = 0.0 if abs(pull) < self.mu else -sign
+        return np.array(out)
+
+    @staticmethod
+    def _first(function, t):
+        """First zero after `t` of a function that is negative there."""
+        if function(t) >= 0.0:
+            return t
+        step = 1e-3
+        while function(t + step) < 0.0:
+            t += step
+        return brentq(function, t, t + step, xtol=1e-15, rtol=1e-14)
+
+
+@pytest.mark.parametrize(("force", "mu", "frequency"), [(1.0, 0.6, 0.05), (1.0, 0.3, 0.07), (2.0, 0.4, 0.11)])
+def test_switch__of_dry_friction_sticks_and_slips_as_in_closed_form(force, mu, frequency):
+    times = np.arange(1, 13) / frequency
+    exact = DryFriction(force, mu, frequency)
+    states = [exact.state(x, times) for x in (0.3, 0.9)]
+    # it does stick, or never does
+    assert exact.stuck > 0.2 * times[-1] or (exact.stuck == 0.0 and force == 2.0)
+    found = run_cells(DRY, [force, mu], frequency, [[0.3, 0.0], [0.9, 0.0]], n_keep=12, rtol=1e-12)
+    assert (found.status != Status.STEP_LIMIT).all()
+    for sections, state in zip(found.section[:, 0], states, strict=True):
+        assert sections == pytest.approx(state, abs=2e-10)
+
+
+def test_switch__sticks_for_ever_under_a_weak_force():
+    found = run_cells(DRY, [0.2, 0.5], 0.1, [[0.1, 0.0], [0.0, 1.0]], n_keep=3, n_transient=3)
+    assert found.section[0, 0] == pytest.approx(np.tile([0.1, 0.0], (3, 1)), abs=1e-13)
+    assert abs(found.section[1, 0, :, 1]).max() < 1e-13
+    assert found.orbit_period.tolist() == [[1], [1]]
+
+
+@inline
+def _pushed_forcing(t, c):
+    # pushes between the two edges
+    return c[0] * c[4] * (2.0 - c[4])
+
+
+@inline
+def _pushed_switches(t, y, dy, c):
+    sigma = (c[0] * c[4] * (2.0 - c[4]) - y[0]) / c[1]
+    change = -dy[0] / c[1]
+    slipping = absolute(c[3])
+    return (
+        (
+            slipping * y[1] + (1.0 - slipping) * (1.0 - sigma * sigma),
+            slipping * dy[1] - (1.0 - slipping) * (2.0 * sigma * change),
+        ),
+    )
+
+
+PUSHED = System(
+    name="pushed_friction", state_names=("x", "v"), parameter_names=("force", "mu"), n_constants=3,
+    constants=_dry_constants, forcing=_pushed_forcing, rhs=_dry_rhs, n_modes=2, has_segments=True, n_edges=2,
+    edges=_two_edges, n_switches=1, switches=_pushed_switches, slides=(True,),
+)  # fmt: skip
+
+
+def test_switch__that_sticks_is_torn_off_by_an_edge():
+    # at rest, pushed to 2 (F - mu) in half a swing, let go and back in another; edges at 5 s and 14 s
+    times = np.arange(1, 60) * 0.97
+    found = trajectory(given(PUSHED, 1.0, 0.5), 0.05, [0.0, 0.0], times, rtol=1e-10, atol=1e-10)
+    for t, state in zip(np.mod(times, 20.0), found, strict=True):
+        there = 0.5 - 0.5 * np.cos(np.clip(t - 5.0, 0.0, np.pi))
+        back = 0.5 - 0.5 * np.cos(np.clip(t - 14.0, 0.0, np.pi))
+        speed = 0.5 * np.sin(np.clip(t - 5.0, 0.0, np.pi)) - 0.5 * np.sin(np.clip(t - 14.0, 0.0, np.pi))
+        assert state == pytest.approx([there - back, speed], abs=1e-8)
+
+
+# --- impacts ----------------------------------------------------------------------------------------------
+
+
+@inline
+def _fall(y, u, c):
+    return y[1], 0.0 * y[0] - c[0]
+
+
+@inline
+def _fall_jacobian(y, u, c):
+    zero = 0.0 * y[0]
+    return zero, zero + 1.0, zero, zero
+
+
+@inline
+def _bounce(k, t, y, c):
+    return y[0], -c[1] * y[1]
+
+
+BALL = flow(
+    "ball", ("y", "v"), ("g", "r"), _fall, jacobian=_fall_jacobian, n_impacts=1, impacts=_of_position,
+    impact_directions=(-1,), reset=_bounce,
+)  # fmt: skip
+
+
+def ball_exactly(height, g, r, time):
+    """Height and velocity of a ball dropped from rest, and how often it has bounced."""
+    v, t, n = math.sqrt(2.0 * g * height), math.sqrt(2.0 * height / g), 0
+    if time < t:
+        return height - 0.5 * g * time**2, -g * time, 0
+    while True:
+        v, n = r * v, n + 1
+        if time < t + 2.0 * v / g:
+            s = time - t
+            return v * s - 0.5 * g * s**2, v - g * s, n
+        t += 2.0 * v / g
+
+
+def test_impact__of_a_bouncing_ball_is_the_closed_form():
+    g, r, heights = 9.81, 0.9, np.linspace(0.4, 2.0, 17)
+    found = run_cells(BALL, [g, r], 2.0, np.c_[heights, 0.0 * heights], n_keep=8, rtol=1e-9)
+    for h, sections in zip(heights, found.section[:, 0], strict=True):
+        exact = [ball_exactly(h, g, r, 0.5 * (i + 1))[:2] for i in range(8)]
+        assert sections == pytest.approx(np.array(exact), abs=1e-11)
+    assert {ball_exactly(h, g, r, 4.0)[2] for h in heights} >= {6, 8, 10}
+
+
+def test_impact__without_loss_keeps_the_energy():
+    found = run_cells(BALL, [1.0, 1.0], 1.0, [[0.5, 0.0], [1.3, 0.4]], n_keep=200, rtol=1e-9)
+    energy = found.section[..., 0] + 0.5 * found.section[..., 1] ** 2
+    assert energy == pytest.approx(np.broadcast_to(energy[..., :1], energy.shape), abs=1e-11)
+
+
+def test_section__of_a_flow_with_switches_or_impacts():
+    a, g, height = 0.7, 2.0, 0.9
+    relay = returns(RELAY, [1.0], [[a, 0.0]], Crossing("v", 0.0, "down"), n_keep=4, rtol=1e-8)
+    assert relay.return_time[0, 0] == pytest.approx(4.0 * math.sqrt(2.0 * a), abs=1e-11)
+    flight = 2.0 * math.sqrt(2.0 * height / g)
+    # at the top, where it falls; and on the floor itself, where the section is taken after the impact
+    top = returns(BALL, [g, 1.0], [[height, 0.0]], Crossing("v", 0.0, "down"), n_keep=4, rtol=1e-8)
+    assert top.return_time[0, 0] == pytest.approx(flight, abs=1e-11)
+    floor = returns(BALL, [g, 1.0], [[height, 0.0]], Crossing("y", 0.0, "down"), n_keep=4, rtol=1e-8)
+    assert floor.return_time[0, 0] == pytest.approx([0.5 * flight, *[flight] * 3], abs=1e-11)
+    assert floor.section[0, 0, :, 1] == pytest.approx(math.sqrt(2.0 * g * height), abs=1e-11)
+    # a jump over the level is no crossing of it
+    over = returns(BALL, [g, 1.0], [[height, 0.0]], Crossing("v", 0.0, "up", 20.0), rtol=1e-8)
+    assert over.status[0, 0] == Status.NO_RETURN
+
+
+@pytest.mark.parametrize("r", [0.5, 0.0])
+def test_impact__endless_ones_end_in_a_status(r):
+    # bounces add up in finite time; without rebound the next is at once
+    found = run_cells(BALL, [9.81, r], 0.5, [[1.0, 0.0]], n_keep=3, max_steps_per_period=3000)
+    assert found.status[0, 0] == Status.STEP_LIMIT
+
+
+# --- tangents through events --------------------------------------------------------------------------------
+
+
+@inline
+def _struck_constants(frequency, p, out):
+    for i in range(4):
+        out[i] = p[i]
+    out[4] = 2.0 * math.pi * frequency
+
+
+@inline
+def _struck_forcing(t, c):
+    return c[1] * sincos(c[4] * t)[1]
+
+
+@inline
+def _struck_rhs(y, u, c):
+    return y[1], u - 2.0 * c[0] * y[1] - y[0]
+
+
+@inline
+def _struck_jacobian(y, u, c):
+    zero = 0.0 * y[0]
+    return zero, zero + 1.0, zero - 1.0, zero - 2.0 * c[0]
+
+
+@inline
+def _wall(t, y, dy, c):
+    return ((y[0] - c[2], dy[0]),)
+
+
+@inline
+def _strike(k, t, y, c):
+    return y[0], -c[3] * y[1]
+
+
+STRUCK = System(
+    name="impact_oscillator", state_names=("x", "v"), parameter_names=("zeta", "force", "gap", "r"),
+    n_constants=5, constants=_struck_constants, forcing=_struck_forcing, rhs=_struck_rhs,
+    jacobian=_struck_jacobian, n_impacts=1, impacts=_wall, impact_directions=(1,), reset=_strike,
+)  # fmt: skip
+
+
+class ImpactOscillator:
+    """x'' + 2 zeta x' + x = force cos(w t) left of a wall, from impact to impact in closed form."""
+
+    def __init__(self, zeta, force, gap, r, frequency):
+        self.gap, self.r, self.w = gap, r, 2.0 * np.pi * frequency
+        self.force, self.zeta = force, zeta
+        self.matrix = np.array([[0.0, 1.0], [-1.0, -2.0 * zeta]])
+        response = force / (1.0 - self.w**2 + 2j * zeta * self.w)
+        self.response = response * np.array([1.0, 1j * self.w])
+
+    def flight(self, t0, y0):
+        """State at a time, or position at several."""
+        forced = (self.response * np.exp(1j * self.w * t0)).real
+        x, v = y0 - forced
+        decay, turning = self.zeta, math.sqrt(1.0 - self.zeta**2)
+
+        def at(t):
+            s = turning * (t - t0)
+            fading = np.exp(-decay * (t - t0))
+            free = fading * (x * np.cos(s) + (v + decay * x) / turning * np.sin(s))
+            rate = fading * (v * np.cos(s) - (x + decay * v) / turning * np.sin(s))
+            drive = np.exp(1j * self.w * t)
+            return np.array([free + (self.response[0] * drive).real, rate + (self.response[1] * drive).real])
+
+        return at
+
+    def after(self, y, time):
+        """State and derivative by the start after `time`, and the number of impacts."""
+        t, y, derivative, n = 0.0, np.array(y, float), np.eye(2), 0
+        while True:
+            at = self.flight(t, y)
+            grid = np.arange(t + 1e-6, time + 5e-3, 5e-3)
+            beyond = np.flatnonzero(at(grid)[0] > self.gap)
+            hit = time
+            if len(beyond):
+                i = int(beyond[0])
+                low = t + 1e-9 if i == 0 else grid[i - 1]
+                hit = brentq(lambda s, at=at: at(s)[0] - self.gap, low, grid[i], xtol=1e-15, rtol=1e-14)
+            if hit >= time:
+                return at(time), expm(self.matrix * (time - t)) @ derivative, n
+            x, v = at(hit)
+            push = self.force * np.cos(self.w * hit) - self.gap
+            before = push - 2.0 * self.zeta * v
+            after = push + 2.0 * self.zeta * self.r * v
+            # R' + (f+ - R' f-) grad g / (grad g . f-)
+            jump = np.array([[-self.r, 0.0], [(after + self.r * before) / v, -self.r]])
+            derivative = jump @ expm(self.matrix * (hit - t)) @ derivative
+            t, y, n = hit, np.array([x, -self.r * v]), n + 1
+
+
+def test_impact__oscillator_follows_its_exact_map_and_its_derivative():
+    zeta, force, gap, r, frequency, n_periods = 0.05, 1.0, 0.4, 0.8, 0.13, 3
+    exact = ImpactOscillator(zeta, force, gap, r, frequency)
+    starts = np.array([[0.1, 0.0], [-0.7, 0.5], [-2.0, 1.0], [0.2, -1.5]])
+    images, derivatives = stroboscopic_map(
+        np.tile([zeta, force, gap, r], (4, 1)), np.full(4, frequency), starts, n_periods, system=STRUCK
+    )
+    counts = []
+    for start, image, derivative in zip(starts, images[:, -1], derivatives, strict=True):
+        state, matrix, count = exact.after(start, n_periods / frequency)
+        assert image == pytest.approx(state, abs=1e-9)
+        assert derivative == pytest.approx(matrix, abs=1e-8 * abs(matrix).max())
+        counts.append(count)
+    assert min(counts) >= 3
+
+
+def test_impact__multipliers_of_an_orbit_are_those_of_the_exact_map():
+    zeta, force, gap, r, frequency = 0.05, 1.0, 0.4, 0.8, 0.13
+    packed = np.array([[zeta, force, gap, r]])
+    settled = run_cells(STRUCK, packed, frequency, [[-0.7, 0.5]], n_transient=60, rtol=1e-10)
+    assert settled.orbit_period[0, 0] in (0, 1)
+    orbit = polish_orbits(
+        packed, np.array([frequency]), settled.section[0, :, 0], np.array([1]), system=STRUCK
+    )
+    assert orbit.converged[0]
+    image, matrix, count = ImpactOscillator(zeta, force, gap, r, frequency).after(
+        orbit.section[0], 1 / frequency
+    )
+    assert count >= 1
+    assert image == pytest.approx(orbit.section[0], abs=1e-9)
+    exact = np.linalg.eigvals(matrix)
+    assert np.sort_complex(orbit.multipliers[0]) == pytest.approx(np.sort_complex(exact), abs=1e-9)
+    # each impact shrinks areas by r^2, the flow by exp(-2 zeta T)
+    area = r ** (2 * count) * math.exp(-2.0 * zeta / frequency)
+    assert orbit.multipliers[0].prod() == pytest.approx(area, rel=1e-8)
+
+
+def test_switch__derivative_of_a_relay_is_that_of_its_period():
+    # from rest at a: after time T the derivative by a follows from the closed form
+    a, time, step = 0.7, 3.0, 1e-5
+    packed = np.ones((1, 1))
+    _, derivative = stroboscopic_map(packed, np.array([1.0 / time]), np.array([[a, 0.0]]), 1, system=RELAY)
+    above, below = (np.array(relay_exactly(a + s, time)) for s in (step, -step))
+    assert derivative[0, :, 0] == pytest.approx((above - below) / (2.0 * step), abs=1e-8)
+    # a Hamiltonian flow keeps areas, across the switch as well
+    assert np.linalg.det(derivative[0]) == pytest.approx(1.0, abs=1e-10)
+
+
+def test_switch__sliding_forgets_the_velocity():
+    # once it has stuck, the section depends on where it stuck alone: one multiplier is 0
+    force, mu, frequency = 1.0, 0.6, 0.05
+    starts = np.array([[0.3, 0.2], [0.5, -0.1]])
+    packed = np.tile([force, mu], (2, 1))
+    _, derivatives = stroboscopic_map(packed, np.full(2, frequency), starts, 1, system=DRY)
+    step = 1e-5
+    for i in range(2):
+        shifted = starts[:, None, :] + step * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        found = run_cells(DRY, packed[0], frequency, shifted[i], rtol=1e-13).section[:, 0, 0]
+        differences = np.array([found[0] - found[1], found[2] - found[3]]).T / (2.0 * step)
+        assert derivatives[i] == pytest.approx(differences, abs=1e-6)
+        assert abs(np.linalg.det(derivatives[i])) < 1e-10
+
+
+def test_lyapunov__exponents_through_impacts_add_up_to_the_loss_of_area():
+    zeta, force, gap, r, frequency = 0.05, 1.0, 0.4, 0.8, 0.13
+    packed = np.tile([zeta, force, gap, r], (2, 1))
+    found = lyapunov_exponents(
+        packed, np.full(2, frequency), np.array([[-0.7, 0.5], [0.2, 0.1]]), n_transient=40, n_periods=64,
+        system=STRUCK, rtol=1e-9, atol=1e-9,
+    )  # fmt: skip
+    assert found.exponents.sum(axis=1) == pytest.approx(found.divergence, abs=1e-6)
+    # volumes shrink by exp(-2 zeta T) in the flow, by r^2 at each impact
+    settled = run_cells(STRUCK, packed[:1], frequency, [[-0.7, 0.5]], n_transient=40, rtol=1e-10)
+    exact = ImpactOscillator(zeta, force, gap, r, frequency)
+    _, _, count = exact.after(settled.section[0, 0, 0], 64 / frequency)
+    area = -2.0 * zeta + 2.0 * count * math.log(r) * frequency / 64
+    assert found.divergence[0] == pytest.approx(area, abs=0.05 * frequency)
+    assert count >= 64
+
+
+def test_lyapunov__through_sticking_has_a_largest_exponent():
+    # sticking forgets the velocity: the second exponent is none, the first is that of where it stuck
+    force, mu, frequency = 1.0, 0.6, 0.05
+    found = lyapunov_exponents(
+        np.array([[force, mu]]), np.array([frequency]), np.array([[0.3, 0.2]]), n_exponents=2, n_transient=8,
+        n_periods=32, system=DRY, rtol=1e-9, atol=1e-9,
+    )  # fmt: skip
+    assert found.status[0] == Status.BOUNDED
+    assert found.loss[0] > 1e14
+    assert found.exponents[0, 1] < -1.0
+    _, derivative = stroboscopic_map(
+        np.array([[force, mu]]), np.array([frequency]),
+        run_cells(DRY, [force, mu], frequency, [[0.3, 0.2]], n_transient=8).section[0, 0], 1, system=DRY,
+    )  # fmt: skip
+    largest = abs(np.linalg.eigvals(derivative[0])).max()
+    expected = math.log(largest) * frequency if largest > 1e-9 else -1.0
+    assert found.exponents[0, 0] == pytest.approx(expected, abs=1e-6) or found.exponents[0, 0] < expected
+
+
+# --- the other doors ----------------------------------------------------------------------------------------
+
+
+def given(system, *values):
+    """What doors for parameters of a model ask of them."""
+    return SimpleNamespace(model=SimpleNamespace(system=system), pack=lambda: np.array(values, float))
+
+
+def test_trajectory__of_dry_friction_and_impacts_is_the_closed_form():
+    force, mu, frequency = 1.0, 0.3, 0.07
+    times = np.linspace(0.05, 60.0, 240)
+    states = DryFriction(force, mu, frequency).state(0.3, times)
+    found = trajectory(given(DRY, force, mu), frequency, [0.3, 0.0], times, rtol=1e-11, atol=1e-11)
+    assert found == pytest.approx(states, abs=1e-8)
+    g, r, times = 9.81, 0.8, np.linspace(0.01, 2.4, 100)
+    found = trajectory(given(BALL, g, r), 0.4, [1.0, 0.0], times)
+    assert found == pytest.approx(np.array([ball_exactly(1.0, g, r, t)[:2] for t in times]), abs=1e-10)
+
+
+def test_sample__of_many_goes_through_impacts():
+    g, r, heights, times = 9.81, 0.8, np.linspace(0.5, 1.5, 20), np.linspace(0.01, 2.0, 40)
+    starts = np.c_[heights, 0.0 * heights]
+    found = sample(BALL, np.tile([g, r], (20, 1)), starts, [times], piece=np.zeros(20, int))
+    for h, states in zip(heights, found.states, strict=True):
+        exact = [ball_exactly(h, g, r, t)[:2] for t in times]
+        assert states[: len(times)] == pytest.approx(np.array(exact), abs=1e-10)
+
+
+def test_rates__take_switches_by_their_signs_and_segments_by_time():
+    states = np.array([[0.5, 1.0], [0.5, -2.0], [-0.5, 0.0]])
+    found = rates(0.0, states, given(DRY, 1.0, 0.3), 0.1)
+    assert found[:, 1] == pytest.approx([1.0 - 0.5 - 0.3, 1.0 - 0.5 + 0.3, 1.0 + 0.5 - 0.3])
+    frequency = 0.8
+    at = np.array([0.1, 0.25, 0.5, 0.69, 0.71, 0.99, 1.1]) / frequency
+    found = rates(at, np.zeros((7, 1)), given(LOW_PASS, 1.0), frequency)
+    assert found[:, 0].tolist() == [0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+
+
+# --- checks -------------------------------------------------------------------------------------------------
+
+
+@inline
+def _wrong_rate(t, y, dy, c):
+    return ((y[0], 2.0 * dy[0]),)
+
+
+@inline
+def _no_pair(t, y, dy, c):
+    return (y[0], dy[0])
+
+
+@inline
+def _half_a_state(k, t, y, c):
+    return (y[0],)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"n_modes": 0}, "n_modes = 0; it must be 1: one for each of the 1 switches"),
+        ({"switches": None}, "switches is missing"),
+        ({"slides": (True, False)}, "slides has 2 entries; it must have one for each of the 1 switches"),
+        ({"switches": _wrong_rate}, "switches: the rate of number 0"),
+        ({"switches": _no_pair}, "switches must return a tuple of 1 pairs"),
+        ({"has_segments": True, "n_modes": 2}, "there is no edge"),
+        ({"n_impacts": 1, "impact_directions": (-1,), "impacts": _of_position}, "reset is missing"),
+        (
+            {"n_impacts": 1, "impact_directions": (0,), "impacts": _of_position, "reset": _bounce},
+            "impact_directions: 0 must be 1",
+        ),
+        (
+            {"n_impacts": 1, "impact_directions": (-1,), "impacts": _of_position, "reset": _half_a_state},
+            "reset returns 1 numbers; it must return a tuple of 2",
+        ),
+    ],
+)
+def test_check_system__names_what_is_wrong_with_events(fields, message):
+    system = dataclasses.replace(RELAY, **fields)
+    with pytest.raises(SystemCheckError) as error:
+        check_system(system, np.ones((1, 1)), np.ones(1), np.ones((1, 2)))
+    assert message in str(error.value)
+
+
+def test_events__bits_depend_on_the_lane_alone():
+    rng = np.random.default_rng(5)
+    n = 45
+    options = {"n_transient": 4, "n_keep": 2, "rtol": 1e-7}
+    for system, parameters in ((DRY, [1.0, 0.4]), (STRUCK, [0.05, 1.0, 0.4, 0.8])):
+        starts = rng.uniform(-0.4, 0.4, (n, 2))
+        whole = run_cells(system, parameters, 0.1, starts, **options)
+        order = rng.permutation(n)
+        for rows, n_lanes in ((order, 24), (np.arange(5), 1000), (np.array([40]), 64)):
+            part = run_cells(system, parameters, 0.1, starts[rows], n_lanes=n_lanes, **options)
+            for name in ("section", "n_steps", "n_rejected", "final_state", "step_size"):
+                assert getattr(part, name).tobytes() == getattr(whole, name)[rows].tobytes(), name

@@ -1,0 +1,347 @@
+"""What is derived from a text, each against something that shares no code with it."""
+
+import contextlib
+import itertools
+import math
+import time
+
+import mpmath
+import numpy as np
+import pytest
+import sympy
+from hypothesis import given
+from hypothesis import strategies as st
+
+from magpend_core import evaluate, jacobian, load_model, rates, sections
+from magpend_core.engine.plain import plain
+from magpend_core.models import ModelError
+from magpend_core.models.text import graph, read_model
+from magpend_core.models.text.grammar import FUNCTIONS, parse
+from magpend_core.models.text.numeric import value_of
+
+FREQUENCY = 0.7
+
+
+def model_of(equations, parameters=None, **more):
+    states = {name: "1" for name in equations}
+    return read_model(
+        {"name": "a", "states": states, "parameters": parameters or {}, "equations": equations, **more}
+    )
+
+
+def at(model, state, t=0.3, **values):
+    """Constants, modes behind them, and forcing of a model at a state, all as plain numbers."""
+    system, p = model.system, model.load(**values).pack()
+    with np.errstate(all="ignore"):
+        c = np.zeros(system.n_constants)
+        plain(system.constants)(FREQUENCY, p, c)
+        table = np.zeros((3, system.n_edges))
+        plain(system.edges)(FREQUENCY, p, *table)
+        modes = np.ones(system.n_modes)
+        if system.has_segments:
+            modes[-1] = np.count_nonzero(table[0] <= t)
+        c = np.concatenate([c, modes])
+        if system.n_switches:
+            still = (0.0,) * len(state)
+            for k, (value, _) in enumerate(plain(system.switches)(t, tuple(state), still, tuple(c))):
+                c[system.n_constants + k] = -1.0 if value < 0.0 else 1.0
+        return tuple(c), plain(system.forcing)(t, tuple(c))
+
+
+def plain_rates(model, state, t=0.3, **values):
+    c, u = at(model, state, t, **values)
+    with np.errstate(all="ignore"):
+        return np.array(plain(model.system.rhs)(tuple(map(np.float64, state)), u, c))
+
+
+def plain_jacobian(model, state, t=0.3, **values):
+    c, u = at(model, state, t, **values)
+    n = len(state)
+    with np.errstate(all="ignore"):
+        return np.reshape(plain(model.system.jacobian)(tuple(map(np.float64, state)), u, c), (n, n))
+
+
+PARAMETERS = {"a": 0.6, "b": -1.7}
+LEAVES = ["x", "v", "a", "b", "t", "phase", "f", "2", "0.5", "1", "0"]
+
+
+def joined(inner):
+    return st.one_of(
+        st.tuples(inner, st.sampled_from(["+", "-", "*", "/"]), inner).map(lambda p: f"({' '.join(p)})"),
+        st.tuples(inner, st.sampled_from(["2", "3", "5", "-1", "0.5", "-2", "1.5"])).map(
+            lambda p: f"({p[0]})**({p[1]})"
+        ),
+        st.tuples(
+            st.sampled_from(["sin", "cos", "atan", "tanh", "exp", "sqrt", "log", "sinh", "cosh"]), inner
+        ).map(lambda p: f"{p[0]}({p[1]})"),
+        inner.map(lambda text: f"(-{text})"),
+    )
+
+
+SMOOTH = st.recursive(st.sampled_from(LEAVES), joined, max_leaves=10)
+CORNERED = st.recursive(
+    st.sampled_from(LEAVES),
+    lambda inner: st.one_of(
+        joined(inner),
+        st.tuples(st.sampled_from(["abs", "sign"]), inner).map(lambda p: f"{p[0]}({p[1]})"),
+        st.tuples(st.sampled_from(["min", "max"]), inner, inner).map(lambda p: f"{p[0]}({p[1]}, {p[2]})"),
+        st.tuples(inner, st.sampled_from(["<", "<=", ">", ">="]), inner, inner, inner).map(
+            lambda p: f"where({p[0]} {p[1]} {p[2]}, {p[3]}, {p[4]})"
+        ),
+        inner.map(lambda text: f"square(2*t*f + {text}, 0.3)"),
+    ),
+    max_leaves=8,
+)
+
+
+@given(SMOOTH, st.floats(0.1, 2.0), st.floats(-2.0, 2.0))
+def test_rates__are_what_the_text_says(text, x, v):
+    model = model_of({"x": "v", "v": text}, PARAMETERS)
+    names = {"x": x, "v": v, "t": 0.3, "f": FREQUENCY, "phase": 0.3 * FREQUENCY, "pi": math.pi, **PARAMETERS}
+    wanted = float(value_of(parse(text), names))
+    found = plain_rates(model, (x, v))
+    # parts that cancel leave rounding errors of their own size
+    if math.isfinite(wanted) and abs(wanted) < 1e10 and np.isfinite(found).all():
+        assert found[0] == v
+        assert found[1] == pytest.approx(wanted, rel=1e-9, abs=1e-6) or abs(wanted) > 1e5
+
+
+@given(CORNERED, st.floats(0.11, 2.0), st.floats(-2.0, 2.0))
+def test_rates__are_what_the_text_says_on_each_side_of_its_corners(text, x, v):
+    model = model_of({"x": "v", "v": text}, PARAMETERS)
+    names = {"x": x, "v": v, "t": 0.3, "f": FREQUENCY, "phase": 0.3 * FREQUENCY, "pi": math.pi, **PARAMETERS}
+    wanted = float(value_of(parse(text), names))
+    nearby = [float(value_of(parse(text), {**names, "x": x + d, "v": v - 0.7 * d})) for d in (-1e-7, 1e-7)]
+    close = [abs(n - wanted) < 1e-4 * (1.0 + abs(wanted)) for n in nearby]
+    if not (math.isfinite(wanted) and all(close)) or abs(wanted) > 1e5:
+        return  # on a corner, or where numpy has no value
+    found = plain_rates(model, (x, v))[1]
+    assert found == pytest.approx(wanted, rel=1e-6, abs=1e-6) or not math.isfinite(found)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "abs(x)", "sign(x)", "abs(-2*x) + v*sign(-x)", "max(x, v)", "min(x, v)", "max(x, v, a)",
+        "min(x, v, b, 0.1)", "sign(x - sign(v))*x", "where(square(t*f, 0.3) > 0, x, v)",
+        "abs(x - abs(v)) + sign(-v)",
+        "where(t*f + 0.1*square(t*f, 0.5) < 0.33, x, v)", "sign(max(x, v) - min(a, v) - 0.01)",
+        "where(x < v, 1, 2)", "where(x <= v, x, v)", "where(x > v, 1, 2)", "where(x >= v, x, v)",
+        "where(not x < v, 1, 2)", "where(x < 0 and v < 0, 1, 2)", "where(x < 0 or v < 0, 1, 2)",
+        "where(x > 0, sqrt(x), v)", "abs(x)*sign(x - v)", "square(t*f + a, 0.3)", "where(phase < 0.2, x, v)",
+        "where(t < 0.2, x, v)", "sign(sin(2*pi*f*t) - 0.2)", "abs(cos(6*pi*f*t))*x",
+    ],
+)  # fmt: skip
+def test_rates__on_either_side_of_a_corner(text):
+    model = model_of({"x": "v", "v": text}, PARAMETERS)
+    for x, v, t in itertools.product((-0.9, -0.2, 0.3, 1.1), (-1.0, -0.15, 0.25, 0.8), (0.05, 0.3, 0.9)):
+        names = {"x": x, "v": v, "t": t, "f": FREQUENCY, "phase": t * FREQUENCY, "pi": math.pi, **PARAMETERS}
+        wanted = float(value_of(parse(text), names))
+        assert plain_rates(model, (x, v), t)[1] == pytest.approx(wanted, rel=1e-14, abs=1e-14), (x, v, t)
+
+
+@given(SMOOTH)
+def test_jacobian__is_sympys_derivative(text):
+    x, v = 0.83, -0.57
+    model = model_of({"x": text, "v": "x*v"}, PARAMETERS)
+    symbols = sympy.symbols("x v")
+    scope = {
+        name: getattr(sympy, name)
+        for name in ("sin", "cos", "atan", "tanh", "exp", "sqrt", "log", "sinh", "cosh")
+    }
+    known = {"t": 0.3, "f": FREQUENCY, "phase": 0.3 * FREQUENCY, **PARAMETERS}
+    expression = sympy.sympify(text, locals={**scope, "x": symbols[0], "v": symbols[1], **known})
+    wanted = []
+    for symbol in symbols:
+        slope = sympy.diff(expression, symbol).subs(dict(zip(symbols, (x, v), strict=True)))
+        number = (
+            complex(slope.evalf(30)) if slope.is_number and not slope.has(sympy.zoo, sympy.nan) else math.nan
+        )
+        wanted.append(number)
+    try:
+        found = plain_jacobian(model, (x, v))
+    except ZeroDivisionError:  # Python's own, of numbers in the text
+        return
+    for a, b in zip(found[0], wanted, strict=True):
+        if np.isfinite(b) and b.imag == 0.0 and abs(b) < 1e8 and np.isfinite(a):
+            assert a == pytest.approx(b.real, rel=1e-8, abs=1e-7)
+    np.testing.assert_allclose(found[1], [v, x])
+
+
+def test_duffing__is_the_hand_written_one():
+    hand = load_model("duffing")
+    text = model_of(
+        {"x": "v", "v": "amplitude*cos(2*pi*f*t) - damping*v - linear*x - cubic*x**3"},
+        dict(hand.load("hardening")),
+        quantities={
+            "energy": "0.5*v**2 + 0.5*linear*x**2 + 0.25*cubic*x**4", "power_in": "amplitude*cos(2*pi*f*t)*v",
+            "power_dissipated": "damping*v**2", "drive": "amplitude*cos(2*pi*phase)",
+        },
+    )  # fmt: skip
+    y = np.random.default_rng(3).normal(size=(50, 2)) * 3.0
+    t = np.linspace(0.0, 1.0 / FREQUENCY, 50)
+    names = [q.name for q in hand.quantities]
+    for function in (rates, jacobian, lambda *a: evaluate(names, *a)):
+        wanted = function(t, y, hand.load("hardening"), FREQUENCY)
+        found = function(t, y, text.load(), FREQUENCY)
+        np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
+
+
+def test_pendulum__is_the_hand_written_one():
+    """Friction that depends on loads that depend on accelerations; angles, edges and layers besides."""
+    text, hand = load_model("pendulum-text"), load_model("pendulum-free")
+    own = hand.load(**{n: v for n, v in text.load().items() if n in hand.parameter_names})
+    y = np.random.default_rng(4).uniform(-1.0, 1.0, (60, 4)) * [3.0, 3.0, 15.0, 15.0]
+    wanted = rates(0.2, y, own, 1.7)
+    np.testing.assert_allclose(
+        rates(0.2, y, text.load(), 1.7), wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max()
+    )
+    wanted = jacobian(0.2, y, own, 1.7)
+    scale = np.abs(wanted).max(axis=0)
+    # the hand-written one leaves out what the friction of the loads changes at second order
+    assert (np.abs(jacobian(0.2, y, text.load(), 1.7) - wanted) <= 1e-3 * scale + 1e-9).all()
+
+
+VALUES = {"sin": 0.8, "tan": 0.8, "acos": -0.3, "asin": 0.9, "log": 3.7, "sqrt": 2.0}
+
+
+@pytest.fixture(scope="module")
+def functions():
+    """A model with a quantity for each function, powers besides."""
+    texts = {
+        "f_" + name: f"{name}({', '.join(['x', 'a', '2.5'][:least])})"
+        for name, (least, _) in FUNCTIONS.items()
+        if name not in ("where", "square")
+    }
+    texts |= {
+        "where1": "where(x < a, x, v)", "where2": "where(x > a or v > 1, x, v)",
+        "where3": "where(x >= a, 1, 2)", "square1": "square(v, 0.3)", "power1": "x**a", "power2": "x**7",
+        "power3": "x**-3",
+        "power4": "x**2.5", "power5": "x**-0.5", "power6": "x**0.3",
+    }  # fmt: skip
+    return model_of({"x": "v", "v": "-x"}, {"a": 0.4}, quantities=texts)
+
+
+def exact(name, x, v, a):
+    m = mpmath
+    powers = {"power1": a, "power2": 7, "power3": -3, "power4": 2.5, "power5": -0.5, "power6": 0.3}
+    if name in powers:
+        return m.power(x, m.mpf(powers[name]))
+    if name.startswith("where"):
+        holds = {"where1": x < a, "where2": x > a or v > 1, "where3": x >= a}[name]
+        yes, no = (1, 2) if name == "where3" else (x, v)
+        return yes if holds else no
+    own = {
+        "square1": lambda: 1 if v - math.floor(v) < 0.3 else -1, "f_abs": lambda: abs(x),
+        "f_min": lambda: min(x, a), "f_max": lambda: max(x, a), "f_sign": lambda: (x > 0) - (x < 0),
+        "f_atan2": lambda: m.atan2(x, a),
+    }  # fmt: skip
+    return own[name]() if name in own else getattr(m, name.removeprefix("f_"))(x)
+
+
+@pytest.mark.parametrize("x", [0.7, 0.013, -0.4, 0.999, 1e-9, 0.4])
+def test_functions__agree_with_mpmath(functions, x):
+    """Compiled, to a few units in the last place."""
+    names = [q.name for q in functions.quantities]
+    found = evaluate(names, 0.0, [[x, 1.3]], functions.load(), FREQUENCY)[0]
+    with mpmath.workdps(40):
+        for name, number in zip(names, found, strict=True):
+            try:
+                wanted = exact(name, mpmath.mpf(x), mpmath.mpf(1.3), mpmath.mpf(0.4))
+            except ValueError:
+                continue
+            if isinstance(wanted, mpmath.mpc):  # numpy has no value there, either
+                assert math.isnan(number), name
+            else:
+                assert abs(number - wanted) <= 3e-15 * abs(wanted), name
+
+
+def test_forcing__is_the_largest_part_that_is_one_number():
+    one = model_of({"x": "v", "v": "a + b*cos(2*pi*f*t) - x"}, PARAMETERS).derived.forcing
+    assert one.op == "add"
+    scaled = model_of({"x": "v + a*cos(2*pi*f*t)", "v": "b*x*cos(2*pi*f*t)"}, PARAMETERS).derived.forcing
+    assert scaled.op == "cos"
+    assert model_of({"x": "v", "v": "cos(2*pi*f*t) + x*sin(2*pi*f*t)"}).derived.forcing.op == "time"
+    assert model_of({"x": "v", "v": "-x*f"}).derived.forcing is None
+    preferred = model_of(
+        {"x": "v", "v": "a + b*drive - x"}, PARAMETERS, define={"drive": "2*cos(2*pi*f*t)"}
+    ).derived.forcing  # a recording takes the place of what is called the drive
+    assert preferred.op == "held"
+    assert preferred.args[0].args[0].is_number(2.0)
+
+
+def test_system__with_time_in_two_numbers_runs():
+    """x' = -x + cos(wt) + x sin(wt) by an exact integrating factor on a fine grid."""
+    model = model_of({"x": "-x + cos(2*pi*f*t) + x*sin(2*pi*f*t)"})
+    found = sections(model.load(), [1.0], [[0.5]], n_transient=0, n_keep=1, rtol=1e-11, atol=1e-11)
+    with mpmath.workdps(20):
+        w = 2 * mpmath.pi
+
+        def factor(t):
+            return mpmath.exp(t + (mpmath.cos(w * t) - 1) / w)
+
+        wanted = (0.5 + mpmath.quad(lambda t: factor(t) * mpmath.cos(w * t), [0, 0.5, 1])) / factor(1)
+    assert found.section[0, 0, 0] == pytest.approx(float(wanted), abs=1e-10)
+
+
+def test_system__refuses_a_drive_without_the_period():
+    model = model_of({"x": "cos(2*t) - x*sin(3*t)"})
+    with pytest.raises(ValueError, match="differs between time 0 and 1/frequency"):
+        sections(model.load(), [1.0], [[0.5]], n_transient=0, n_keep=1)
+
+
+def test_graph__refuses_what_grows_without_end(monkeypatch):
+    define = {"a0": "sin(x*v)"} | {f"a{i}": f"sin(a{i - 1}*x)*cos(a{i - 1}*v)" for i in range(1, 120)}
+    states = "".join(chr(ord("A") + i) for i in range(20))
+    equations = {"x": "a119", "v": "a119", **{s: f"a119*{s}" for s in states}}
+    model = model_of(equations, define=define)
+    monkeypatch.setattr(graph, "MAX_NODES", 2000)
+    with pytest.raises(ModelError, match="more than 2000 parts; simplify them"):
+        _ = model.derived
+
+
+MANY = {
+    "steep places": "+".join(f"atan({i}*x + 1)" for i in range(1, 500)),
+    "surfaces": "+".join(f"abs(x + {i})" for i in range(500)),
+    "instants": "+".join(f"square({i}*t*f, 0.3)" for i in range(1, 15)),
+    "": "*".join(f"(x**63 + {i}*v**61)" for i in range(400)),
+    " ": "+".join(f"sin({i}*t)*cos({i}.5*t*x)" for i in range(300)),
+}
+
+
+@pytest.mark.parametrize("what", MANY)
+def test_derived__takes_seconds_at_most(what):
+    """The largest expression of each sort is worked off, or refused."""
+    table = {f"a{i}": f"({MANY[what]})*{i} + x*v" for i in range(40)}
+    text = "+".join(table)
+    begin = time.process_time()
+    model = model_of({"x": "v", "v": text}, define=table)
+    with contextlib.ExitStack() as stack:
+        if what.strip():
+            stack.enter_context(pytest.raises(ModelError, match=f"more than .* {what}"))
+        _ = model.digest
+    assert time.process_time() - begin < 20.0
+
+
+ALL_AT_ONCE = {
+    "x": "v",
+    "v": "a*cos(2*pi*f*t) + 0.3*tanh(20*v)*(x - v) - x**3 - 0.1*atan(30*x)*v + exp(-x**2)*sin(v)*cos(v)"
+    " - 0.2*sign(v) + 0.1*max(x, 0) + 0.2*square(t*f, 0.4) - power*log(2 + x**2)/(1 + v**2)"
+    " + atan2(x, 2 + v**2)",
+}
+
+
+@pytest.mark.slow
+def test_sections__of_a_text_are_the_same_bits_alone_and_among_others():
+    model = model_of(ALL_AT_ONCE, {"a": 0.9, "power": 0.05})
+    y0 = np.random.default_rng(8).normal(size=(41, 2))
+    frequency = np.linspace(0.1, 0.4, 41)
+    keywords = {"n_transient": 5, "n_keep": 3, "rtol": 1e-8, "atol": 1e-8}
+    together = sections(model.load(), frequency, y0, **keywords)
+    assert np.isfinite(together.section).all()
+    for i in (0, 7, 40):
+        alone = sections(model.load(), frequency[[i]], y0[[i]], n_lanes=1, **keywords)
+        np.testing.assert_array_equal(alone.section[0], together.section[i])
+        assert alone.n_steps[0] == together.n_steps[i]
+    watched = sections(model.load(), frequency, y0, quantities=["x"], **keywords)
+    np.testing.assert_array_equal(watched.section, together.section)

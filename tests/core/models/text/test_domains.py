@@ -1,0 +1,84 @@
+"""Where a text has no value: the innermost part, why, and at which numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magpend_core.models import load_model
+from magpend_core.models.text.domains import domain_faults, readable
+from magpend_core.models.text.grammar import parse, parse_condition
+from magpend_core.models.text.numeric import value_of
+
+
+def faults(rate, define=None, **values):
+    table = {
+        "name": "probe", "states": {"x": "1", "v": "1"}, "parameters": {"k": 1.0, "g": 2.0},
+        "define": define or {}, "equations": {"x": "v", "v": rate},
+    }  # fmt: skip
+    given = {"x": 0.0, "v": 0.0, "k": 1.0, "g": 2.0, "t": 0.0, "f": 1.0, "phase": 0.0, **values}
+    n = max(np.size(v) for v in given.values())
+    columns = {name: np.broadcast_to(np.asarray(v, float), n) for name, v in given.items()}
+    return domain_faults(load_model(table).definition, columns)
+
+
+@pytest.mark.parametrize(
+    ("rate", "part", "why"),
+    [
+        ("k + 1/x", "1/x", "division by 0"),
+        ("log(x)", "log(x)", "logarithm of 0"),
+        ("sin(log(x - 1))", "log(x - 1)", "logarithm of -1"),
+        ("sqrt(x - g)", "sqrt(x - g)", "square root of -2"),
+        ("asin(g)", "asin(g)", "asin of 2, which is not between -1 and 1"),
+        ("(x - 1)**0.5", "(x - 1)**0.5", "-1 to the power 0.5, which is no whole number"),
+        ("x**(-2)", "x**(-2)", "0 to the power -2"),
+        ("exp(1000*k)", "exp(1000*k)", "too large a number"),
+        ("k*(g/(x + v))", "g/(x + v)", "division by 0"),
+    ],
+)
+def test_domain_faults__names_the_innermost_part(rate, part, why):
+    (fault,) = faults(rate)
+    assert fault.place == "equations.v"
+    assert fault.why == why
+    assert fault.part == part
+
+
+@pytest.mark.parametrize("rate", ["k + x", "where(x > 0, 1/x, 0)", "where(x > 0, log(x), -x)", "atan2(v, x)"])
+def test_domain_faults__none_where_every_part_that_counts_has_a_value(rate):
+    assert faults(rate, x=[0.0, -1.0, 2.0]) == []
+
+
+def test_domain_faults__branch_that_is_taken_counts():
+    (fault,) = faults("where(x > 0, 1/(x - 1), 0)", x=[-1.0, 0.0, 1.0, 2.0])
+    assert (fault.row, fault.count) == (2, 1)
+
+
+def test_domain_faults__branch_that_is_not_taken_does_not_count_beside_a_fault():
+    (fault,) = faults("1/x + where(x > 0, log(x), 0)")
+    assert fault.why == "division by 0"
+
+
+def test_domain_faults__definition_is_told_once_and_at_its_place():
+    (fault,) = faults("r*k + r", {"r": "1/x", "unused": "log(-1)"}, x=[1.0, 0.0, 0.0])
+    assert fault.place == "define.r"
+    assert (fault.row, fault.count, fault.values) == (1, 2, {"x": 0.0})
+
+
+def test_domain_faults__all_at_once():
+    found = faults("1/x + log(v - 1)")
+    assert [f.why for f in found] == ["division by 0", "logarithm of -1"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a + b - c", "a - (b - c)", "a*(b + c)/d", "a/(b*c)", "a/b/c", "-a*b", "(-x)**2", "-x**2", "2**(-x)",
+     "a - (-b)", "where(x > 0 and not (y <= 1 or x < 2), -x, 1/y)", "(a + b)**(c*d)", "min(a, b + 1)*3",
+     "0.001*log(x)/v",
+     "-a*b*c", "a - (-b*c)", "a*(-b)*c", "(-a*b)**2", "-(a + b)*c", "a*(b/c)", "(a < b) and (b < c)"],
+)  # fmt: skip
+def test_readable__means_the_same(text):
+    numbers = {"a": 1.3, "b": -0.7, "c": 2.1, "d": 0.4, "x": 0.9, "y": -1.7, "v": 3.0}
+    tree = parse_condition(text) if " and " in text and "where" not in text else parse(text)
+    again = parse_condition(readable(tree)) if tree.is_condition else parse(readable(tree))
+    assert value_of(again, numbers) == value_of(tree, numbers)
+    assert len(readable(tree)) <= len(text) + 2

@@ -1,0 +1,323 @@
+"""Steep places, corners and jumps: what is found, and what the engine then does with it."""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from magpend_core import jacobian, load_model, rates, sections
+from magpend_core.engine.plain import plain
+from magpend_core.engine.variational import with_tangents
+from magpend_core.models.text import read_model
+from magpend_core.sections import run_branches
+
+KEPT = {"n_transient": 0, "n_keep": 1, "rtol": 1e-10, "atol": 1e-10}
+
+
+def model_of(equations, parameters=None, **more):
+    states = {name: "1" for name in equations}
+    return read_model(
+        {"name": "a", "states": states, "parameters": parameters or {}, "equations": equations, **more}
+    )
+
+
+def declared(model, y, frequency=1.7, **values):
+    """Edges and layers of a system, as plain numbers."""
+    system, p = model.system, model.load(**values).pack()
+    c, edges = np.zeros(system.n_constants), np.zeros((3, system.n_edges))
+    plain(system.constants)(frequency, p, c)
+    plain(system.edges)(frequency, p, *edges)
+    u = plain(system.forcing)(0.13, tuple(c))
+    dy = plain(system.rhs)(tuple(y), u, tuple(c))
+    return edges, np.array(plain(system.layers)(tuple(y), dy, tuple(c)), float)
+
+
+def test_pendulum__has_the_edges_and_layers_that_were_declared_by_hand():
+    """Half-widths and jumps of friction and drive, from the text alone."""
+    text, hand = load_model("pendulum-text"), load_model("pendulum-free")
+    y = np.array([0.4, -0.3, 0.7, -0.2])
+    for values in ({}, {"mu": 0.0, "T2": 0.1, "eps": 200.0, "duty_cycle": 0.3, "eps_drive": 20.0}):
+        own = {n: v for n, v in text.load(**values).items() if n in hand.parameter_names}
+        for found, wanted in zip(declared(text, y, **values), declared(hand, y, **own), strict=True):
+            np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "half_width", "jump"),
+    [
+        ("-a*atan(50*v)", 0.2, 1 / 50, 0.6 * math.pi),
+        ("-a*2/pi*atan(b*(v - 1))", 0.8, 1 / 200, 1.2),
+        ("-a*tanh(v/0.01)", 0.2, 0.01 * math.pi / 2, 1.2),
+        ("a/(1 + exp(-b*x))", 0.3, math.pi / 200, 0.6),
+        ("a/(exp(b*x) + 1)", 0.3, math.pi / 200, 0.6),
+        ("a*v/sqrt(v**2 + 1e-4)", 0.2, 0.01, 1.2),
+        ("a*v/sqrt(1/b**2 + v**2)", 0.2, 1 / 200, 1.2),
+        ("-(a + x**2)*atan(50*v)", 0.2, 1 / 50, (0.6 + 0.09) * math.pi),
+        ("-a*atan(-50*(v + 2*x))", 0.8, 1 / 50, 0.6 * math.pi),
+    ],
+)
+def test_layers__have_the_width_and_the_jump_of_their_form(text, value, half_width, jump):
+    model = model_of({"x": "v", "v": f"{text} - x"}, {"a": 0.6, "b": 200.0})
+    (layer,) = model.derived.layers
+    _, found = declared(model, [0.3, 0.2])
+    (row,) = found
+    assert abs(row[0]) == pytest.approx(value)
+    assert row[2] == pytest.approx(half_width)
+    assert row[3] == pytest.approx(1.0 / (half_width * jump))
+    assert layer.steep.form
+    # the rate of the value along the motion
+    h = 1e-6
+    x, v = 0.3, 0.2
+    acceleration = rates(0.13, [[x, v]], model.load(), 1.7)[0, 1]
+    _, ahead = declared(model, [x + h * v, v + h * acceleration])
+    assert (ahead[0, 0] - row[0]) / h == pytest.approx(row[1], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "text", ["atan(1 + x**2)", "tanh(exp(x))", "atan(a)", "tanh(cosh(v) + a)", "atan(a*sqrt(2 + x**2)/a)"]
+)
+def test_layers__are_not_where_the_argument_cannot_pass_zero(text):
+    bound = {"a": {"value": 0.5, "bound": "positive"}}
+    derived = model_of({"x": "v", "v": f"{text} - x"}, bound).derived
+    assert (derived.layers, derived.waves, derived.switches) == ((), (), ())
+
+
+def test_layers__may_move_with_time():
+    """Friction on a shaken table: the layer is where the velocities are the same."""
+    equations = {"x": "v", "v": "-0.3*atan(k*(v - cos(2*pi*f*t))) - x"}
+    model = model_of(equations, {"k": 2e3})
+    system = model.system
+    assert (len(model.derived.layers), model.derived.missed, system.timed_layers) == (1, (), True)
+    c = np.zeros(system.n_constants)
+    plain(system.constants)(0.4, model.load().pack(), c)
+    ((value, rate, width, _),) = plain(system.layers)((0.1, 0.5), (0.5, -0.2, 0.7), tuple(c))
+    omega = 2 * math.pi * 0.4
+    assert value == pytest.approx(0.5 - math.cos(omega * 0.7))
+    assert rate == pytest.approx(-0.2 + omega * math.sin(omega * 0.7))
+    assert width == pytest.approx(1 / 2e3)
+    y0 = np.random.default_rng(2).normal(size=(8, 2))
+    packed = np.tile(model.load().pack(), (8, 1, 1))
+    keywords = {"n_transient": 6, "n_keep": 1, "rtol": 1e-8, "atol": 1e-8}
+    found = [
+        run_branches(packed, np.full((8, 1), 0.4), y0, **keywords, system=s)
+        for s in (system, dataclasses.replace(system, name="hidden", has_layers=False))
+    ]
+    np.testing.assert_allclose(found[0].section, found[1].section, atol=1e-5)
+    with_layer, without = (int(f.n_rejected.sum()) for f in found)
+    assert with_layer < 0.2 * without
+
+
+def test_layers__that_move_with_time_carry_tangents():
+    model = model_of({"x": "v", "v": "-0.3*atan(50*(v - cos(2*pi*f*t))) - x"})
+    extended = with_tangents(model.system, 2)
+    start = np.array([[0.3, 0.2]])
+    whole = np.concatenate([start, np.eye(2).reshape(1, 4)], axis=1)
+    keywords = {"n_transient": 0, "n_keep": 1, "rtol": 1e-10, "atol": 1e-10}
+    packed, frequency = model.load().pack()[None, None], np.full((1, 1), 0.4)
+    carried = run_branches(packed, frequency, whole, **keywords, system=extended).section[0, 0, 0, 2:]
+    h = 1e-5
+    for k, direction in enumerate(np.eye(2)):
+        ends = [
+            run_branches(
+                packed, frequency, start + s * h * direction, **keywords, system=model.system
+            ).section
+            for s in (1.0, -1.0)
+        ]
+        slope = (ends[0] - ends[1])[0, 0, 0] / (2.0 * h)
+        np.testing.assert_allclose(carried[2 * k : 2 * k + 2], slope, atol=1e-5)
+
+
+def test_layers__make_a_steep_friction_cheaper():
+    """The same system with and without its layer: the limit saves most of the attempts that are rejected."""
+    model = model_of({"x": "v", "v": "0.5*cos(2*pi*f*t) - x - 0.3*atan(k*v)*2/pi"}, {"k": 3e3})
+    y0 = np.random.default_rng(2).normal(size=(8, 2))
+    packed = np.tile(model.load().pack(), (8, 1, 1))
+    found = [
+        run_branches(
+            packed, np.full((8, 1), 0.2), y0, n_transient=6, n_keep=1, rtol=1e-7, atol=1e-7, system=system
+        )
+        for system in (model.system, dataclasses.replace(model.system, name="hidden", has_layers=False))
+    ]
+    with_layer, without = (int(f.n_rejected.sum()) for f in found)
+    assert with_layer < 0.2 * without
+
+
+def test_edges__of_a_smooth_wave_are_its_zeros():
+    model = model_of({"x": "a*tanh(40*(cos(2*pi*f*t) - 0.3)) - x"}, {"a": 2.0})
+    edges, _ = declared(model, [0.1], frequency=0.5)
+    first = math.acos(0.3) / (2 * math.pi * 0.5)
+    np.testing.assert_allclose(edges[0], [first, 2.0 - first], rtol=1e-12)
+    slope = 40 * math.sin(math.acos(0.3)) * math.pi
+    np.testing.assert_allclose(edges[1], math.pi / 2 / slope, rtol=1e-9)
+    np.testing.assert_allclose(edges[2], 4.0)
+
+
+# ---- jumps in time -------------------------------------------------------------------------------
+
+
+def piecewise(levels, x):
+    """Exact end of x' = level - x over stretches (length, level)."""
+    for length, level in levels:
+        x = level + (x - level) * math.exp(-length)
+    return x
+
+
+@pytest.mark.parametrize("duty", [0.3, 0.5, 0.9])
+def test_square__is_followed_exactly(duty):
+    model = model_of({"x": "square(t*f, d) - x"}, {"d": 0.3})
+    assert model.derived.missed == ()
+    found = sections(model.load(d=duty), [0.7], [[0.2]], **KEPT)
+    wanted = piecewise([(duty / 0.7, 1.0), ((1 - duty) / 0.7, -1.0)], 0.2)
+    assert found.section[0, 0, 0] == pytest.approx(wanted, abs=1e-9)
+    assert found.n_rejected[0] <= 2
+
+
+@pytest.mark.parametrize(
+    ("d", "e", "s"), [(0.3, 0.6, 0.37), (0.7, 0.2, -0.9), (0.5, 0.5, 2.6), (0.1, 0.95, 0.0)]
+)
+def test_jumps_in_time__are_followed_in_whatever_order_the_parameters_put_them(d, e, s):
+    text = (
+        "2*square(3*t*f + s, d) - square(t*f - s, e)*(1 + k)"
+        " + where(phase < d, 0.5, where(phase <= e and phase > 0.1, -1, 4)) - k*x"
+    )
+    model = model_of({"x": text}, {"d": 0.3, "e": 0.6, "s": 0.37, "k": 1.0})
+    assert model.derived.n_edges == 12
+    frequency = 0.7
+
+    def level(share):
+        def square(phase, duty):
+            return 1.0 if phase % 1.0 < duty else -1.0
+
+        third = 0.5 if share < d else (-1.0 if 0.1 < share <= e else 4.0)
+        return 2 * square(3 * share + s, d) - 2 * square(share - s, e) + third
+
+    turns = np.arange(-4, 8)
+    breaks = np.concatenate([
+        (turns - s) / 3, (turns + d - s) / 3, turns + s, turns + e + s, [0.0, 1.0, d, e, 0.1]
+    ])  # fmt: skip
+    breaks = np.unique(breaks[(breaks >= 0.0) & (breaks <= 1.0)])
+    levels = [((b - a) / frequency, level(0.5 * (a + b))) for a, b in itertools.pairwise(breaks)]
+    found = sections(model.load(d=d, e=e, s=s), [frequency], [[0.2]], **KEPT)
+    assert found.section[0, 0, 0] == pytest.approx(piecewise(levels, 0.2), abs=2e-9)
+
+
+def test_sawtooth__jumps_where_the_period_begins():
+    """x' = phase - x: at time t exactly f (t - 1) + (x0 + f) exp(-t), anew in each period."""
+    model = model_of({"x": "phase - x"})
+    found = sections(model.load(), [0.5], [[0.2]], **{**KEPT, "n_transient": 2})
+    wanted = 0.2
+    for _ in range(3):
+        wanted = 0.5 * (2.0 - 1.0) + (wanted + 0.5) * math.exp(-2.0)
+    assert found.section[0, 0, 0] == pytest.approx(wanted, abs=1e-9)
+
+
+def test_square__of_what_has_no_known_edges_is_told_as_missed():
+    assert model_of({"x": "square(a*t*f, 0.5) - x"}, {"a": 2.0}).derived.missed == ("square",)
+
+
+# ---- corners and jumps on the state ----------------------------------------------------------------
+
+
+def by_scipy(function, y0, end):
+    """Independent: short stretches of DOP853, which finds the corners by its step control."""
+    found = solve_ivp(function, (0.0, end), y0, method="DOP853", rtol=1e-12, atol=1e-13, max_step=2e-3)
+    return found.y[:, -1]
+
+
+CORNERS = {
+    "abs(x)": abs, "max(x, 0.2)": lambda x: max(x, 0.2), "min(x, 0.2, -0.1)": lambda x: min(x, -0.1),
+    "where(x > 0.3, 3*(x - 0.3), 0)": lambda x: max(3 * (x - 0.3), 0.0),
+    "where(x > 0.3, x**1.5, 0.3**1.5)": lambda x: max(x, 0.3) ** 1.5,
+    "where(x < -0.1 or x > 0.5, 1 + x, -2)": lambda x: 1 + x if x < -0.1 or x > 0.5 else -2.0,
+    "sign(x)*x**2": lambda x: abs(x) * x,
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", CORNERS)
+def test_corners__are_stepped_on(text):
+    model = model_of({"x": "v", "v": f"cos(2*pi*f*t) - 0.1*v - x - {text}"})
+    assert model.derived.switches
+    found = sections(model.load(), [0.2], [[0.5, -0.3]], **KEPT)
+    omega = 2 * math.pi * 0.2
+    wanted = by_scipy(
+        lambda t, y: [y[1], math.cos(omega * t) - 0.1 * y[1] - y[0] - CORNERS[text](y[0])], [0.5, -0.3], 5.0
+    )
+    np.testing.assert_allclose(found.section[0, 0], wanted, atol=3e-5 if "or" in text else 2e-7)
+    # no corner is found by trial: hardly a step is rejected but to land
+    assert found.n_rejected[0] < 60
+
+
+def test_corner__in_a_narrow_layer_of_the_same_argument_is_left_to_the_layer():
+    narrow = model_of({"x": "v", "v": "-atan(1000*v)*exp(-abs(v)) - x"}).derived
+    assert (len(narrow.layers), len(narrow.switches)) == (1, 0)
+    wide = model_of({"x": "v", "v": "-atan(v)*exp(-abs(v)) - x"}).derived
+    assert (len(wide.layers), len(wide.switches)) == (1, 1)
+
+
+def test_switch__is_one_for_all_that_turns_at_the_same_place():
+    derived = model_of({"x": "v", "v": "-sign(v) - abs(-v) - max(2*v, 0) + where(v < 0, 1, 2)"}).derived
+    assert len(derived.switches) == 1
+    assert derived.sliding.slides == (True,)
+
+
+def test_switch__whose_surface_jumps_with_time_is_on_the_right_side_of_it():
+    """A body rubbed by a belt that runs forth and back: v' = mu towards the belt's velocity."""
+    model = model_of({"v": "-mu*sign(v - where(phase < 0.5, 1, -1))"}, {"mu": 0.5})
+    found = sections(model.load(), [0.5, 0.5], [[0.0], [-0.3]], **KEPT)
+    np.testing.assert_allclose(found.section[:, 0, 0], [0.0, -0.3], atol=1e-10)
+    # with more friction it gets to the belt's velocity and sticks to it, both times
+    stuck = sections(model.load(mu=3.0), [0.5], [[0.1]], **KEPT)
+    np.testing.assert_allclose(stuck.section[0, 0], [-1.0], atol=1e-10)
+
+
+def test_sticking__is_exact():
+    """A mass on a belt, stuck until the spring pulls as hard as friction: x = x0 + belt t, then slipping."""
+    model = model_of({"x": "v", "v": "-x - mu*sign(v - belt)"}, {"mu": 0.4, "belt": 0.1})
+    assert model.derived.sliding.slides == (True,)
+    stuck = sections(model.load(), [1 / 3.0], [[-0.1, 0.1]], **KEPT)
+    np.testing.assert_allclose(stuck.section[0, 0], [-0.1 + 0.3, 0.1], atol=1e-12)
+    # it lets go at x = mu, after 5 s, with velocity belt; then x = mu + belt sin(t - 5)
+    slipped = sections(model.load(), [1 / 6.0], [[-0.1, 0.1]], **KEPT)
+    np.testing.assert_allclose(
+        slipped.section[0, 0], [0.4 + 0.1 * math.sin(1.0), 0.1 * math.cos(1.0)], atol=1e-9
+    )
+
+
+def test_sticking__of_two_bodies_on_one_another_is_exact():
+    """Two masses pulled apart with less than friction can hold move as one: a = (p + q)/(m1 + m2).
+
+    Both surfaces at once, each acting on the other: the lower one stands on the ground.
+    """
+    text = {"v1": "p - mu1*sign(v1 - v2)", "v2": "(q + mu1*sign(v1 - v2) - mu2*sign(v2))/2"}
+    model = model_of(text, {"p": 0.3, "q": 0.0, "mu1": 0.5, "mu2": 0.6})
+    assert model.derived.sliding.slides == (True, True)
+    at_rest = sections(model.load(), [1.0], [[0.0, 0.0]], **KEPT)
+    np.testing.assert_allclose(at_rest.section[0, 0], 0.0, atol=1e-12)
+    # pulled harder the two slide on the ground together
+    together = sections(model.load(q=0.6), [1.0], [[0.2, 0.2]], **KEPT)
+    np.testing.assert_allclose(together.section[0, 0], 0.2 + (0.3 + 0.6 - 0.6) / 3.0, atol=1e-12)
+
+
+def test_impacts__set_what_the_text_sets():
+    """A ball on the floor: the time of flight after each bounce is r times that before."""
+    model = model_of(
+        {"h": "v", "v": "-g", "n": "0"}, {"g": 9.81, "r": 0.5},
+        impacts=[{"of": "h", "direction": "down", "set": {"v": "-r*v", "n": "n + 1"}}],
+    )  # fmt: skip
+    assert len(model.derived.impacts) == 1
+    first = math.sqrt(2.0 / 9.81)
+    speed = 9.81 * first
+    end = first + 2 * 0.5 * speed / 9.81 + 0.1  # after two bounces
+    found = sections(model.load(), [1.0 / end], [[1.0, 0.0, 0.0]], **KEPT)
+    v = 0.25 * speed
+    np.testing.assert_allclose(found.section[0, 0], [v * 0.1 - 0.5 * 9.81 * 0.01, v - 0.981, 2.0], atol=1e-9)
+
+
+def test_jacobian__beside_a_corner_is_that_of_its_side():
+    model = model_of({"x": "v", "v": "-x*abs(x) - v*where(v > 0, 2, 3) - 0.1*sign(v)"})
+    found = jacobian(0.0, [[0.5, 0.2], [-0.5, -0.2]], model.load(), 1.0)
+    np.testing.assert_allclose(found[:, 1], [[-1.0, -2.0], [-1.0, -3.0]])

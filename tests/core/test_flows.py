@@ -1,0 +1,170 @@
+"""Limit cycles of flows: the return map, its derivative, periods and multipliers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from magpend_core import lyapunov_exponents, run_branches
+from magpend_core.crossing import Crossing
+from magpend_core.models.sectioned import of_flow, sectioned
+from magpend_core.multipliers import orbit_exponents
+from magpend_core.orbits import polish_orbits, section_map
+from tests.core.flows import HOPF, LORENZ, PAIR, ROSSLER, VAN_DER_POL, flow
+
+VAN_DER_POL_PERIOD = 6.663286859323130
+"""At mu = 1, to 30 digits 6.66328685932313018969968203053 (Amore, Boyd and Fernandez, arXiv:1707.02890)."""
+
+
+def seen(table, of, **changes):
+    """The parameters of a flow seen where a state crosses 0 upwards."""
+    crossing = Crossing(of, longest=changes.pop("longest", 50.0), direction=changes.pop("direction", "up"))
+    return sectioned(flow(table), crossing).load(**changes)
+
+
+def polish(parameters, points, period=1, **options):
+    system = parameters.model.system
+    n = len(points)
+    packed = np.tile(parameters.pack(), (n, 1))
+    longest = np.full(n, parameters.model.crossing.frequency_hz)
+    return polish_orbits(packed, longest, np.asarray(points), np.full(n, period), system=system, **options)
+
+
+@pytest.mark.parametrize("mu", [0.01, 0.25, 1.0])
+def test_polish_orbits__hopf_normal_form(mu):
+    parameters = seen(HOPF, "y", mu=mu)
+    found = polish(parameters, [[1.3 * np.sqrt(mu), 0.1 * mu]])
+    assert found.converged.all()
+    assert found.seconds[0] == pytest.approx(np.pi, rel=1e-11)  # 2 pi/omega
+    np.testing.assert_allclose(found.section[0], [np.sqrt(mu), 0.0], atol=1e-11)
+    # the other is 0 by construction: it stands for the flow's own
+    np.testing.assert_allclose(found.multipliers[0], [np.exp(-2.0 * mu * np.pi), 0.0], atol=1e-10)
+    assert found.is_stable[0]
+
+
+def test_polish_orbits__least_number_of_returns():
+    found = polish(seen(HOPF, "y"), [[0.6, 0.0]], period=6)
+    assert found.orbit_period[0] == 1
+    assert found.seconds[0] == pytest.approx(np.pi, rel=1e-11)
+
+
+def test_polish_orbits__van_der_pol():
+    found = polish(seen(VAN_DER_POL, "v", direction="down"), [[1.9, 0.0]])
+    assert found.seconds[0] == pytest.approx(VAN_DER_POL_PERIOD, abs=1e-10)
+    start = found.section[0]
+
+    def rates(t, y):
+        x, v, _ = y
+        return [v, (1.0 - x**2) * v - x, 1.0 - x**2]
+
+    # the product of all multipliers is the exponential of the divergence's integral (Liouville)
+    end = solve_ivp(rates, (0.0, found.seconds[0]), [*start, 0.0], method="DOP853", rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(end.y[:2, -1], start, atol=1e-9)
+    assert found.multipliers[0, 0].real == pytest.approx(np.exp(end.y[2, -1]), rel=1e-8)
+    assert found.multipliers[0, 0].imag == 0.0
+
+
+def test_polish_orbits__complex_multipliers():
+    parameters = seen(PAIR, "y", mu=-0.1)
+    found = polish(parameters, [[1.1, 0.0, 0.05, -0.02]])
+    period = 2.0 * np.pi / 2.0
+    pair = np.exp((-0.1 + 0.7j) * period)
+    expected = [pair, pair.conj(), np.exp(-2.0 * period), 0.0]
+    assert np.abs(found.multipliers[0][:, None] - expected).min(axis=1).max() < 1e-9
+
+
+def test_section_map__differences():
+    """On the section the derivative is that of the map, which differences of its images give."""
+    parameters = seen(ROSSLER, "x", c=3.0)
+    point = np.array([0.0, -4.0, 0.05])
+    system, packed = parameters.model.system, parameters.pack()[None]
+    rate = np.array([parameters.model.crossing.frequency_hz])
+    found = section_map(packed, rate, point[None], 2, system=system)
+    step = 1e-5
+    for k in (1, 2):
+        shift = step * np.eye(3)[k]
+        ends = section_map(
+            np.tile(packed, (2, 1)), np.tile(rate, 2), np.array([point + shift, point - shift]), 2,
+            system=system,
+        )  # fmt: skip
+        slope = (ends.images[0, -1] - ends.images[1, -1]) / (2.0 * step)
+        np.testing.assert_allclose(found.derivatives[0, :, k], slope, atol=2e-7)
+    assert (found.derivatives[0, 0] == 0.0).all()
+    assert (found.derivatives[0, :, 0] == 0.0).all()
+    np.testing.assert_allclose(found.images[0, :, 0], 0.0, atol=1e-12)
+
+
+def test_section_map__no_return():
+    """Where a trajectory does not come back there is no image."""
+    parameters = seen(HOPF, "y", mu=-2.0, longest=0.5)
+    found = section_map(
+        parameters.pack()[None], np.array([2.0]), np.array([[0.5, 0.0]]), 1, system=parameters.model.system
+    )
+    assert np.isnan(found.images).all()
+    assert np.isnan(found.derivatives).all()
+
+
+def test_sectioned__same_object():
+    model = flow(HOPF)
+    one, other = sectioned(model, Crossing("y")), sectioned(model, Crossing("y"))
+    assert one is other
+    assert one.flow is model
+    assert sectioned(model, Crossing("x")).digest != one.digest
+    assert sectioned(model, Crossing("y", value=0.3)).load()["section_value"] == 0.3
+    assert of_flow(one.load(mu=0.5)) == model.load(mu=0.5)
+
+
+def test_sectioned__forced():
+    from magpend_core import load_model
+
+    with pytest.raises(ValueError, match="is forced"):
+        sectioned(load_model("duffing"), Crossing("x"))
+
+
+def exponents(parameters, starts, n_periods, tolerance=1e-8):
+    n, system = len(starts), parameters.model.system
+    packed = np.tile(parameters.pack(), (n, 1))
+    longest = np.full(n, parameters.model.crossing.frequency_hz)
+    settled = run_branches(
+        packed[:, None], longest[:, None], np.asarray(starts), n_transient=100, n_keep=1, rtol=tolerance,
+        atol=tolerance, system=system,
+    )  # fmt: skip
+    return lyapunov_exponents(
+        packed, longest, settled.section[:, 0, -1], n_transient=50, n_periods=n_periods, rtol=tolerance,
+        atol=tolerance, system=system,
+    )  # fmt: skip
+
+
+def test_lyapunov_exponents__limit_cycle():
+    """Per second, though returns count the periods: 0 along the flow, and the logarithm of the multiplier."""
+    parameters = seen(VAN_DER_POL, "v", direction="down")
+    orbit = polish(parameters, [[1.9, 0.0]])
+    found = exponents(parameters, [[1.0, 0.5]], 160)
+    expected = np.log(orbit.multipliers[0, 0].real) / orbit.seconds[0]
+    np.testing.assert_allclose(found.weighted[0], [0.0, expected], atol=2e-6)
+    np.testing.assert_allclose(found.divergence[0], expected, atol=2e-6)
+    own = orbit_exponents(orbit.multipliers[0], orbit.seconds[0], is_flow=True)
+    np.testing.assert_allclose(own, [0.0, expected], atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("table", "of", "value", "start", "known", "error"),
+    [
+        # Sprott, Chaos and Time-Series Analysis, Oxford 2003, Sect. 4.8: 0.9056, 0, -14.5723
+        (LORENZ, "z", 27.0, [1.0, 1.0, 20.0], [0.9056, 0.0, -14.5723], 0.004),
+        # the same, for a = b = 0.2, c = 5.7: 0.0714, 0, -5.3943
+        (ROSSLER, "x", 0.0, [0.0, -5.0, 0.05], [0.0714, 0.0, -5.3943], 0.002),
+    ],
+)
+def test_lyapunov_exponents__published(table, of, value, start, known, error):
+    parameters = sectioned(flow(table), Crossing(of, value, longest=50.0)).load()
+    starts = np.array(start) + 0.1 * np.random.default_rng(0).normal(size=(16, 3))
+    found = exponents(parameters, starts, 1600, 1e-10)
+    mean = found.exponents.mean(axis=0)
+    np.testing.assert_allclose(mean, known, atol=error)
+    assert abs(mean[1]) < 5e-4
+    np.testing.assert_allclose(found.exponents.sum(axis=1), found.divergence, atol=1e-4)
+    if table is LORENZ:  # its divergence is the same everywhere
+        np.testing.assert_allclose(found.divergence, -(10.0 + 1.0 + 8.0 / 3.0), rtol=1e-12)

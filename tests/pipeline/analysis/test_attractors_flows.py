@@ -1,0 +1,101 @@
+"""Attractors of flows: limit cycles and equilibria at crossings and at even times."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magpend_core import run_branches
+from magpend_core.crossing import Crossing
+from magpend_core.models.sectioned import sectioned
+from pipeline.analysis.attractors.attractors import identify
+from pipeline.compute.task import rest_states
+from pipeline.layout.vocabulary import BOUNDED_SET, CLOSED_ORBIT, EQUILIBRIUM, section_attributes
+from tests.core.flows import BAUTIN, HOPF, flow
+
+GRID = [[x, y] for x in np.linspace(-1.2, 1.2, 7) for y in np.linspace(-1.1, 1.1, 7)]
+
+
+def cube(table, states, *, crossing=None, frequency_hz=1.0, n_transient=200, n_keep=20, **values):
+    """Cells of one parameter point, as a run stores them."""
+    model = flow(table)
+    model = model if crossing is None else sectioned(model, crossing)
+    parameters, n = model.load(**values), len(states)
+    rate = frequency_hz if crossing is None else crossing.frequency_hz
+    found = run_branches(
+        np.tile(parameters.pack(), (n, 1, 1)), np.full((n, 1), rate), np.array(states),
+        n_transient=n_transient, n_keep=n_keep, rtol=1e-9, atol=1e-9, system=model.system,
+    )  # fmt: skip
+    cells = "initial_condition"
+    variables = {
+        "section": ((cells, "period_index", "state"), found.section[:, 0]),
+        "status": (cells, found.status[:, 0], {"flag_values": [], "flag_meanings": ""}),
+        "orbit_period": (cells, found.orbit_period[:, 0]),
+    }
+    coords = {"state": list(model.state_names)}
+    if crossing is None:
+        coords["frequency"] = float(frequency_hz)
+    else:
+        variables["rest_state"] = ((cells, "state"), rest_states(found)[:, 0])
+    attrs = {
+        "model": json.dumps(model.reference), "closure_tolerance": 1e-6, **section_attributes(model.crossing),
+        "parameters": "\n".join(f"{k} = {v!r}" for k, v in parameters.as_dict().items()),
+    }  # fmt: skip
+    return xr.Dataset(variables, coords=coords, attrs=attrs)
+
+
+def kinds(found):
+    return found["kind"].values.tolist()
+
+
+@pytest.mark.parametrize("value", [0.0, 0.6])
+def test_identify__cycle_beside_equilibrium(value):
+    """At mu = -0.1 the origin and the cycle attract, whether the section runs through the origin or not.
+
+    With s the squared radius, s' = 2 s (mu + s - s**2): the boundary is s = (1 - sqrt(1 + 4 mu))/2.
+    """
+    ds = cube(BAUTIN, GRID, crossing=Crossing("y", value, longest=20.0), mu=-0.1)
+    found = identify(ds)
+    assert sorted(kinds(found)) == [CLOSED_ORBIT, EQUILIBRIUM]
+    rest, orbit = kinds(found).index(EQUILIBRIUM), kinds(found).index(CLOSED_ORBIT)
+    squared = (np.array(GRID) ** 2).sum(axis=1)
+    own = np.where(squared < 0.5 * (1.0 - np.sqrt(0.6)), rest, orbit)
+    assert found["attractor_id"].values.tolist() == own.tolist()
+    assert float(found["period_s"][orbit]) == pytest.approx(np.pi, rel=1e-9)
+    assert np.isnan(found["period_s"][rest])
+    radius = np.sqrt(0.5 * (1.0 + np.sqrt(0.6)))
+    assert float(found["state_max"].sel(state="y")[orbit]) == pytest.approx(
+        radius, rel=1e-3
+    )  # of 256 samples
+    np.testing.assert_allclose(found["attractor_points"].values[rest, 0], 0.0, atol=1e-10)
+    np.testing.assert_allclose(found["eigenvalue_real"].values[rest], -0.1, atol=1e-10)
+    np.testing.assert_allclose(np.sort(found["eigenvalue_imag"].values[rest]), [-2.0, 2.0], atol=1e-10)
+    assert found["is_stable"].values.tolist() == [1, 1]
+    assert float(found["lyapunov_max"][orbit]) == 0.0
+    assert float(found["lyapunov_max"][rest]) == pytest.approx(-0.1, abs=1e-10)
+
+
+@pytest.mark.parametrize("frequency_hz", [1.0 / np.pi, 2.0 / np.pi, 0.41])
+def test_identify__strobed_cycle_is_one(frequency_hz):
+    """A strobe of the cycle's period, of half of it and of another one: one limit cycle, not one per cell."""
+    found = identify(cube(HOPF, GRID, frequency_hz=frequency_hz))
+    assert sorted(kinds(found)) == [CLOSED_ORBIT, EQUILIBRIUM]
+    orbit = kinds(found).index(CLOSED_ORBIT)
+    assert int(found["n_cells"][orbit]) == len(GRID) - 1
+    assert float(found["period_s"][orbit]) == pytest.approx(np.pi, rel=1e-9)
+    expected = [1.0, np.exp(-0.5 * np.pi)]
+    np.testing.assert_allclose(found["multiplier_real"].values[orbit], expected, atol=1e-8)
+    assert BOUNDED_SET not in kinds(found)
+
+
+def test_identify__order_of_cells():
+    """Neither at crossings nor at even times does it matter which cell comes first."""
+    for options in ({"crossing": Crossing("y", 0.0, longest=20.0), "mu": -0.1}, {"mu": -0.1}):
+        ds = cube(BAUTIN, GRID, **options)
+        order = np.random.default_rng(1).permutation(len(GRID))
+        one, other = identify(ds), identify(ds.isel(initial_condition=order))
+        np.testing.assert_array_equal(one["attractor_id"].values[order], other["attractor_id"].values)
+        np.testing.assert_allclose(one["period_s"], other["period_s"], rtol=1e-9)

@@ -1,0 +1,186 @@
+"""``magpend model show`` and ``magpend model new``."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+
+import pytest
+
+from pipeline.runs.modelling import TEMPLATE
+from pipeline.spec.parsing import load_spec
+
+
+def test_new__runs_as_it_is(main, tmp_path):
+    code, out, _ = main("model", "new", "mine.toml")
+    assert (code, out) == (0, "specification: mine.toml\n")
+    code, _, said = main("run", "mine.toml", "--smoke", "--workers", 0)
+    assert code == 0, said
+    assert (tmp_path / "runs" / "mine-smoke" / "run.json").is_file()
+
+
+def test_new__overwrites_nothing(main, tmp_path):
+    (tmp_path / "mine.toml").write_text("kept")
+    code, _, said = main("model", "new", "mine.toml")
+    assert code == 2
+    assert "exists already" in said
+    assert (tmp_path / "mine.toml").read_text() == "kept"
+    assert main("model", "new", "mine.txt")[0] == 2
+    assert main("model", "new", "nowhere/mine.toml")[0] == 2
+
+
+def test_new__without_a_file_writes_to_the_output(main):
+    code, out, _ = main("model", "new")
+    assert code == 0
+    assert tomllib.loads(out)["model"]["name"] == "oscillator"
+
+
+def test_template__every_line_that_is_offered_can_be_taken(tmp_path):
+    """Each block of lines behind # by itself, and all at once."""
+    lines = TEMPLATE.read_text("utf-8").splitlines()
+    offered = [i for i, line in enumerate(lines) if re.match(r"#(?! |$)", line)]
+    assert len(offered) > 15
+    whole = [line[1:] if i in offered else line for i, line in enumerate(lines)]
+    path = tmp_path / "whole.toml"
+    # a state more has an equation more: those two come together
+    path.write_text("\n".join(whole))
+    spec = load_spec(path)
+    assert spec.model.state_names == ("x", "v", "th")
+    assert spec.model.drawing is not None
+    assert spec.model.classifier is not None
+    assert len(spec.model.definition.impacts) == 1
+
+
+def test_show__text_of_a_specification(main, tmp_path, own):
+    (tmp_path / "spec.toml").write_text(own.spec(own.text))
+    code, out, said = main("model", "show", "spec.toml")
+    assert code == 0, said
+    for line in (
+        "  drive = A*cos(2*pi*f*t)",
+        "  dx/dt = v",
+        "  dv/dt = drive - d*v - x**3",
+        "  A  N  amplitude",
+    ):
+        assert line in out.splitlines()
+    assert "checks: passed" in out
+    found = json.loads(main("model", "show", "spec.toml", "--json")[1])
+    assert found["equations"] == {"x": "v", "v": "drive - d*v - x**3"}
+    assert found["autonomous"] is False
+    code, out, _ = main("model", "show", "spec.toml", "--latex")
+    assert out.startswith("\\begin{align}\n")
+    assert r"\frac{\mathrm{d}v}{\mathrm{d}t} &= \mathrm{drive} - d \, v - x^{3}" in out
+
+
+def test_show__file_of_a_model_and_one_that_ships(main, tmp_path, own):
+    (tmp_path / "shared.toml").write_text(own.text.replace("[model]", "").replace('name = "duffing5"', ""))
+    code, out, _ = main("model", "show", "shared.toml")
+    assert code == 0
+    assert out.startswith("shared: ")
+    code, out, _ = main("model", "show", "duffing")
+    assert code == 0
+    assert "checks: passed" in out
+    code, _, said = main("model", "show", "duffing", "--latex")
+    assert code == 2
+    assert "is no text" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("- d*v", "- dd*v"), "did you mean d?"),
+        (("x**3", "x**3/(x - x)"), "division by 0"),
+        (('v = "drive', 'w = "drive'), "there is no such state"),
+    ],
+)
+def test_show__what_is_wrong_has_its_place(main, tmp_path, own, change, words):
+    (tmp_path / "shared.toml").write_text(own.text.replace(*change))
+    code, _, said = main("model", "show", "shared.toml")
+    assert code == 2
+    assert words in said
+    assert "equations.v" in said or "equations.w" in said
+
+
+def test_show__square_wave_tells_its_edges(main, tmp_path, own):
+    text = own.text.replace("A*cos(2*pi*f*t)", "A*square(t*f, 0.25)")
+    (tmp_path / "shared.toml").write_text(text)
+    code, out, _ = main("model", "show", "shared.toml")
+    assert code == 0
+    assert re.search(r"edges: 2 per period of the drive, at 0, 0\.25 of it", out)
+
+
+def test_run__start_without_a_value_is_refused_before_anything_is_made(main, tmp_path, own):
+    (tmp_path / "spec.toml").write_text(own.spec(own.text.replace("x**3", "log(x + 0.5)")))
+    code, _, said = main("run", "spec.toml", "--workers", 0)
+    assert code == 2
+    assert "model.equations.v: log(x + 0.5): logarithm of -0.5 at the start x = -1" in said
+    assert not (tmp_path / "runs").exists()
+    assert main("run", "spec.toml", "--dry-run")[0] == 2
+
+
+def test_simulate__text_of_a_file(main, tmp_path, own):
+    (tmp_path / "shared.toml").write_text(own.text)
+    code, _, said = main(
+        "simulate", "--model", "shared.toml", "--x", "0.5", "--set", "A=0.3", "--frequency", "0.16",
+        "--periods", "2", "--out", "series.csv", "--no-figure",
+    )  # fmt: skip
+    assert code == 0, said
+    head, first = (tmp_path / "series.csv").read_text().splitlines()[:2]
+    assert head == "time_s,x_m,v_m_per_s"
+    assert first.split(",")[1] == "0.5"
+    code, _, said = main("simulate", "--model", "shared.toml", "--y", "0.5", "--no-figure")
+    assert code == 2
+    assert "unknown state of duffing5" in said
+
+
+@pytest.mark.parametrize(
+    ("force", "words"),
+    [
+        ("-0.3*tanh(v/0.01)", r"layer: tanh where v passes 0; half-width 0\.0157, jump 0\.6"),
+        (
+            "-0.3*atan(100*(v - 0.2))*2/pi",
+            r"layer: atan where v - 0\.2 passes 0; half-width 0\.01, jump 0\.6",
+        ),
+        (
+            "-0.3*sign(v - 0.2)",
+            r"switch: a jump where v - 0\.2 passes 0; a step ends there, and motion may slide",
+        ),
+        ("-abs(x)", r"switch: a corner where x passes 0; a step ends there$"),
+    ],
+)
+def test_show__steep_places_with_their_numbers(main, tmp_path, own, force, words):
+    """Half-widths are the poles of the functions: pi/2 of tanh, 1 of the arctangent, over the slope."""
+    (tmp_path / "shared.toml").write_text(own.text.replace("- x**3", f"- x**3 + ({force})"))
+    code, out, said = main("model", "show", "shared.toml")
+    assert code == 0, said
+    assert re.search(words, out, re.MULTILINE), out
+
+
+def test_show__impacts_and_no_drive(main, tmp_path, own):
+    impact = '\n[[model.impacts]]\nof = "x - d"\ndirection = "up"\nset = { v = "-0.5*v" }\n'
+    (tmp_path / "shared.toml").write_text(own.text.replace("drive - d*v", "-d*v") + impact)
+    code, out, said = main("model", "show", "shared.toml")
+    assert code == 0, said
+    assert "impact: where x - d rises through 0, v becomes -0.5*v" in out
+    assert "no drive" in out
+
+
+def test_show__flow_seen_at_crossings_is_shown_as_it_is_written(main, tmp_path, own):
+    text = own.spec(own.text.replace("drive - d*v", "-d*v"), '[section]\nof = "v"').replace(
+        "frequency_hz =", "# "
+    )
+    (tmp_path / "spec.toml").write_text(text)
+    code, out, said = main("model", "show", "spec.toml")
+    assert code == 0, said
+    assert "  dv/dt = -d*v - x**3" in out
+    assert "section_value" not in out
+    assert "checks: passed (finite at the starts; Jacobian equal to differences)" in out
+
+
+def test_run__what_is_said_of_states_is_checked_where_equations_are_wrong(main, tmp_path, own):
+    text = own.spec(own.text, "[axes]\nB = { values = [1.0, 2.0] }").replace("- d*v", "- dd*v")
+    (tmp_path / "spec.toml").write_text(text.replace("\nx = { start", "\ny = { start"))
+    said = main("run", "spec.toml")[2]
+    for words in ("did you mean d?", "axes.B: 'B' is not a parameter", "initial_conditions.y: unknown key"):
+        assert words in said
+    assert "section" not in said

@@ -1,0 +1,227 @@
+"""Runs of systems of one's own, from the specification to the figure; and runs of strangers."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from magpend_core.engine import jit
+from pipeline import open_run
+from pipeline.layout.identity import digest_of
+from pipeline.layout.vocabulary import model_of
+from pipeline.runs.run import run
+from pipeline.store.runfile import read_run
+
+MANY = '[smoke]\n"initial_conditions.x.num" = 80\n"integration.n_transient" = 400\n'
+
+
+@pytest.fixture
+def text_spec(own, write_spec, tmp_path):
+    """A specification whose model is a file beside it."""
+    (tmp_path / "shared.toml").write_text(own.text)
+    return write_spec(own.spec('model = "shared.toml"', MANY))
+
+
+@pytest.fixture
+def command(environment):
+    """Run the command line in a folder of one's choice."""
+
+    def call(folder: Path, *arguments):
+        return subprocess.run(
+            [sys.executable, "-m", "pipeline.cli.main", *map(str, arguments)],
+            cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+
+    return call
+
+
+def rewritten(directory: Path, change) -> None:
+    """Change run.json as a stranger can who makes its digest fit."""
+    path = directory / "run.json"
+    data = json.loads(path.read_text())
+    change(data["spec"])
+    change(data["identity"]["spec"])
+    data["digest"] = digest_of(data["identity"])
+    path.write_text(json.dumps(data))
+
+
+@pytest.mark.slow
+def test_run__text_from_the_specification_to_the_figure(text_spec, tmp_path, command):
+    """Elsewhere, in other processes, with the shared file gone: the run explains itself."""
+    directory, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    done = command(tmp_path, "run", text_spec, "--out", directory, "--workers", 2)
+    assert done.returncode == 0, done.stderr
+    (tmp_path / "shared.toml").unlink()
+    assert "complete" in command(elsewhere, "status", directory).stdout
+    assert "intact" in command(elsewhere, "verify", directory).stdout
+    table = json.loads(command(elsewhere, "analyse", "attractors", directory, "--json").stdout)
+    assert "closed_orbit" in {row["kind"] for row in table}
+    found = command(elsewhere, "analyse", "basins", directory, "--json")
+    assert found.returncode == 0, found.stderr
+    drawn = command(elsewhere, "plot", "basins", directory)
+    assert drawn.returncode == 0, drawn.stderr
+    assert (directory / "figures" / "basins.png").is_file()
+    zoomed = command(elsewhere, "zoom", directory, "--x", "-0.5", "0.5", "--out", "closer.toml")
+    assert zoomed.returncode == 0, zoomed.stderr
+    again = command(elsewhere, "run", "closer.toml", "--workers", 0)
+    assert again.returncode == 0, again.stderr
+    assert open_run(elsewhere / "runs" / "closer").x_0.values.max() == 0.5
+
+
+def test_run__text_is_integrated_as_it_is_written(text_spec, tmp_path):
+    """Against scipy's DOP853 of the same equations, from another hand."""
+    run(text_spec, tmp_path / "run", workers=0, echo=lambda line: None)
+    ds = open_run(tmp_path / "run")
+    f, d, amplitude = float(ds.frequency), 0.08, 0.2
+
+    def rhs(t, y):
+        return [y[1], amplitude * np.cos(2 * np.pi * f * t) - d * y[1] - y[0] ** 3]
+
+    cell = ds.isel(x_0=1, v_0=2)
+    start = [float(cell.x_0), float(cell.v_0)]
+    times = (20 + 1 + np.arange(4)) / f
+    found = solve_ivp(rhs, (0, times[-1]), start, "DOP853", times, rtol=1e-12, atol=1e-12).y.T
+    assert cell.section.values == pytest.approx(found, abs=2e-5)
+
+
+def test_run__workers_take_text_from_the_compile_cache(text_spec, tmp_path, bytes_of):
+    run(text_spec, tmp_path / "one", workers=0, echo=lambda line: None)
+    before = {p for p in jit.CACHE_FOLDER.rglob("*") if p.suffix in (".nbc", ".py")}
+    run(text_spec, tmp_path / "two", workers=2, echo=lambda line: None)
+    assert {p for p in jit.CACHE_FOLDER.rglob("*") if p.suffix in (".nbc", ".py")} == before
+    assert bytes_of(tmp_path / "one") == bytes_of(tmp_path / "two")
+
+
+@pytest.mark.slow
+def test_run__text_killed_and_resumed(text_spec, tmp_path, start, bytes_of):
+    directory = tmp_path / "run"
+    process = start("run", text_spec, "--smoke", "--out", directory, "--workers", 2)
+    limit = time.monotonic() + 200
+    while not list((directory / "commits").glob("*.json")) if (directory / "commits").is_dir() else True:
+        assert time.monotonic() < limit
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    left = len(list((directory / "commits").glob("*.json")))
+    assert not run(text_spec, directory, smoke=True, workers=0, echo=lambda line: None).cells.get("pending")
+    run(text_spec, tmp_path / "whole", smoke=True, workers=0, echo=lambda line: None)
+    assert 0 < left < 40
+    assert bytes_of(directory) == bytes_of(tmp_path / "whole")
+
+
+def test_open_run__cube_names_its_model_in_words(text_spec, tmp_path):
+    run(text_spec, tmp_path / "run", workers=0, echo=lambda line: None)
+    ds = open_run(tmp_path / "run")
+    assert json.loads(ds.attrs["model"])["equations"]["v"] == "drive - d*v - x**3"
+    assert model_of(ds).name == "shared" or model_of(ds).name == "duffing5"
+    ds.to_netcdf(tmp_path / "cube.nc", engine="scipy")  # attributes that any format takes
+    assert read_run(tmp_path / "run").spec["model"]["states"] == {"x": {"unit": "m"}, "v": {"unit": "m/s"}}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('pathlib').Path('pwned').write_text('x')",
+        "().__class__.__bases__[0].__subclasses__()",
+        "(lambda: x)()",
+        "(" * 5000 + "x" + ")" * 5000,
+        "x[0]",
+        "v; import os",
+    ],
+)
+def test_open_run__stranger_s_text_is_one_error(text_spec, tmp_path, main, text):
+    run(text_spec, tmp_path / "run", workers=0, echo=lambda line: None)
+
+    def change(spec):
+        spec["model"]["equations"]["v"] = text
+
+    rewritten(tmp_path / "run", change)
+    for call in (("status",), ("plot", "basins"), ("analyse", "attractors"), ("verify",)):
+        started = time.perf_counter()
+        code, _, said = main(*call, tmp_path / "run")
+        assert time.perf_counter() - started < 5
+        assert code == 2
+        assert "model.equations.v" in said
+        assert "Traceback" not in said
+    assert not (tmp_path / "pwned").exists()
+
+
+def test_open_run__stranger_s_object_is_never_imported(own, text_spec, tmp_path, main, monkeypatch):
+    """The module lies in the current folder and on the path; opening and drawing leave it alone."""
+    trace = own.write_module(tmp_path, "trap")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    run(text_spec, tmp_path / "run", workers=0, echo=lambda line: None)
+    table = read_run(tmp_path / "run").spec["model"]
+    described = {
+        "python": "trap:MINE", "digest": "0123456789abcdef", "name": "mine", "title": "", "section": "",
+        "angle_dim": "angle", "autonomous": False,
+        "states": {n: {"unit": "m", "meaning": n} for n in table["states"]},
+        "parameters": {"d": {"unit": "1", "meaning": "d"}, "A": {"unit": "1", "meaning": "A"}},
+        "quantities": {}, "presets": {"default": {"values": {"d": 0.08, "A": 0.2}}},
+    }  # fmt: skip
+
+    def change(spec):
+        spec["model"] = described
+
+    rewritten(tmp_path / "run", change)
+    assert main("status", tmp_path / "run")[0] == 0
+    assert main("verify", tmp_path / "run")[0] == 5  # the commits are another run's
+    code, out, said = main("plot", "section", tmp_path / "run")
+    assert code == 0, said
+    assert "section" in out
+    code, _, said = main("analyse", "attractors", tmp_path / "run")
+    assert code == 2
+    assert "--import-model trap:MINE" in said
+    for form in ("trap:MINE", "shared.toml"):  # a name where a run keeps a whole
+        rewritten(tmp_path / "run", lambda spec, form=form: spec.update(model=form))
+        assert main("status", tmp_path / "run")[0] == 2
+    assert not trace.exists()
+    assert "trap" not in sys.modules
+    code, _, said = main("status", tmp_path / "run", "--import-model", "trap:MINE")
+    assert trace.exists()  # a person has named it
+    sys.modules.pop("trap", None)
+
+
+@pytest.mark.slow
+def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, command):
+    """The module lies beside the specification alone; the run is made from elsewhere."""
+    project, elsewhere = tmp_path / "project", tmp_path / "elsewhere"
+    trace = own.write_module(project, "mine")
+    elsewhere.mkdir()
+    (project / "spec.toml").write_text(own.spec('model = "mine:MINE"'))
+    done = command(elsewhere, "run", project / "spec.toml", "--out", "run", "--workers", 2)
+    assert done.returncode == 0, done.stderr
+    ds = open_run(elsewhere / "run")
+    cell, f = ds.isel(x_0=1, v_0=2), float(ds.frequency)
+    found = solve_ivp(
+        lambda t, y: [y[1], np.cos(2 * np.pi * f * t) - 0.1 * y[1] - y[0]], (0, 24 / f),
+        [float(cell.x_0), float(cell.v_0)], "DOP853", (21 + np.arange(4)) / f, rtol=1e-12, atol=1e-12,
+    ).y.T  # fmt: skip
+    assert cell.section.values == pytest.approx(found, abs=2e-5)
+    named = "--import-model", "mine:MINE"
+    trace.unlink()
+    assert command(elsewhere, "analyse", "attractors", "run").returncode == 2
+    assert not trace.exists()
+    found = command(project, "analyse", "attractors", elsewhere / "run", *named, "--json")
+    assert [row["orbit_period"] for row in json.loads(found.stdout)] == [1]
+    module = project / "mine.py"
+    module.write_text(module.read_text().replace("- y[0]", "- 1.1 * y[0]"))
+    again = command(elsewhere, "run", project / "spec.toml", "--out", "run")
+    assert again.returncode == 2
+    assert "model_digest" in again.stderr
+    found = command(project, "analyse", "attractors", elsewhere / "run", *named, "--json")
+    assert found.returncode == 0  # what was kept needs no object
+    found = command(project, "analyse", "settling", elsewhere / "run", *named)
+    assert found.returncode == 2
+    assert "restore the code" in found.stderr

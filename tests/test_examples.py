@@ -1,0 +1,163 @@
+"""The shipped examples as a user runs them: their pages, and their numbers at full size."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magpend_core.models import LIBRARY, load_model
+from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.workflows import shipped_workflows
+
+ROOT = Path(__file__).parents[1]
+PAGES = ROOT / "docs" / "examples"
+REFERENCE = json.loads((ROOT / "tests" / "core" / "data" / "library.json").read_text("utf-8"))
+NAMES = sorted(path.stem for path in LIBRARY.glob("*.toml"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("examples")
+
+
+@pytest.fixture
+def magpend(command, folder):
+    """Call a command in the folder; returns what it prints."""
+    return lambda *words: command(folder, *words)[0]
+
+
+@pytest.fixture
+def example(magpend, folder):
+    """The full run of an example, made once."""
+
+    def run(name):
+        if not (folder / name).exists():
+            magpend("run", name, "--out", name, "--workers", "0")
+        return AnalysedRun.of(folder / name)
+
+    return run
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_page__tells_of_each_text(name):
+    """Its lines, its page with picture and file, and a workflow with a small size."""
+    rows = re.findall(
+        r"^\| \[([\w-]+)\]\(([\w-]+)\.md\) \| (\d+) \|", (PAGES / "README.md").read_text("utf-8"), re.M
+    )
+    (row,) = (row for row in rows if row[0] == name)
+    text = (LIBRARY / f"{name}.toml").read_text("utf-8")
+    assert int(row[2]) == len(text.splitlines())
+    page = (PAGES / f"{row[1]}.md").read_text("utf-8")
+    assert f"({row[1]}.png)" in page
+    assert f"library/{name}.toml" in page
+    assert "[smoke]" in shipped_workflows()[row[1]].read_text("utf-8")
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "belt-stick"])
+def test_page__shows_lines_of_the_text(name):
+    """What a page shows stands in the model or its workflow; entries may be cut short."""
+    page = (PAGES / f"{name}.md").read_text("utf-8")
+    files = [LIBRARY / f"{name}.toml", shipped_workflows()[name]]
+    whole = re.sub(r"\s+", " ", " ".join(path.read_text("utf-8") for path in files))
+    for block in re.findall(r"```toml\n(.*?)```", page, re.DOTALL):
+        for line in block.splitlines():
+            shown = re.sub(r"\s+", " ", line.partition(" #")[0]).strip()
+            assert shown.removesuffix(" }").removesuffix(", on_circle = true") in whole
+
+
+@pytest.mark.slow
+def test_three_magnets__cells_of_each_magnet(example):
+    """13309, 13309, 13382 of 40000, as in a comment of Attractors.jl's tests and by RK4."""
+    attractors = example("three-magnets").derive("attractors")
+    ids, counts = np.unique(attractors.attractor_id.values, return_counts=True)
+    assert ids.min() == 0
+    expected = REFERENCE["three-magnets"][0]["counts"]
+    assert sorted(expected) == [13309, 13309, 13382]
+    # a cell on a boundary may turn with the last bits of the integration
+    assert sorted(counts.tolist()) == pytest.approx(sorted(expected), abs=4)
+
+
+@pytest.mark.slow
+def test_duffing5__shares_of_five_attractors(example):
+    attractors = example("duffing5").derive("attractors")
+    ids, counts = np.unique(attractors.attractor_id.values, return_counts=True)
+    assert ids.tolist() == [0, 1, 2, 3, 4]
+    # RK4 at 128 and 96 steps a period differ in 24 cells
+    assert sorted(counts.tolist()) == pytest.approx(sorted(REFERENCE["duffing5"]["counts"]), abs=40)
+    # bSTAB's sample of 4000 states, three standard errors
+    for share, (theirs, error) in zip(
+        sorted(counts / 40000.0),
+        sorted([(0.1955, 0.0063), (0.4945, 0.0079), (0.0275, 0.0026), (0.02625, 0.0025), (0.25625, 0.0069)]),
+        strict=True,
+    ):
+        assert share == pytest.approx(theirs, abs=3.0 * error)
+
+
+@pytest.mark.slow
+def test_driven_pendulum__shares_of_three_attractors(example):
+    attractors = example("driven-pendulum").derive("attractors")
+    ids, counts = np.unique(attractors.attractor_id.values, return_counts=True)
+    assert ids.tolist() == [0, 1, 2]
+    expected = np.array(REFERENCE["driven-pendulum"]["counts"]) / 40000.0
+    assert sorted(counts / counts.sum()) == pytest.approx(sorted(expected), abs=0.01)
+
+
+@pytest.mark.slow
+def test_belt__where_rest_and_stick_slip_are_found(example):
+    """Rest from the Hopf point on, stick-slip until the unstable cycle meets it, shares in between."""
+    attractors = example("belt").derive("attractors")
+    reference = REFERENCE["belt"]
+    share = attractors.share
+    rests = attractors.attractor.values[(attractors["kind"] == 3).any("belt")]
+    at_rest = share.sel(attractor=rests).fillna(0.0).sum("attractor")
+    belts = attractors.belt.values
+    assert (at_rest.values[belts < reference["hopf"]] == 0.0).all()
+    assert (at_rest.values[belts > reference["hopf"]] > 0.0).all()
+    assert (at_rest.values[belts < reference["cycle_ends"]] < 1.0).all()
+    assert (at_rest.values[belts > reference["cycle_ends"]] == 1.0).all()
+    for known in reference["rest"]:
+        found = float(at_rest.sel(belt=known["belt"], method="nearest"))
+        assert found == pytest.approx(known["rest_share"], abs=0.03)  # of 21 x 21 states
+
+
+@pytest.mark.slow
+def test_rossler__first_doublings(example, magpend):
+    """Located along c, each to seven digits."""
+    example("rossler")
+    rows = json.loads(magpend("analyse", "branches", "rossler", "--period", "4", "--json"))
+    found = {
+        row["period"]: row["c"] for row in rows if row["type"] == "period_doubling" and row["period"] != 3
+    }
+    for known in REFERENCE["rossler"]["doublings"]:
+        assert found[known["returns"]] == pytest.approx(known["c"], abs=2e-7)
+
+
+@pytest.mark.slow
+def test_impact__doublings_and_touches(example, magpend):
+    """Against closed forms: where periods 1, 2 and 3 double, and where branches end at a touch."""
+    example("impact")
+    rows = json.loads(magpend("analyse", "branches", "impact", "--period", "3", "--json"))
+    found = {row["period"]: row["A"] for row in rows if row["type"] == "period_doubling"}
+    for period, known in zip((1, 2, 3), REFERENCE["impact"]["doublings"], strict=True):
+        assert found[period] == pytest.approx(known, abs=2e-7)
+
+
+@pytest.mark.slow
+def test_lorenz__exponents(example):
+    """.9056, 0, -14.5723 (Sprott 2003) within three standard errors of 16 x 4000 returns; their exact sum."""
+    cube = example("lorenz").cube()
+    mean = cube.lyapunov.mean([d for d in cube.lyapunov.dims if d != "exponent"]).values
+    assert mean == pytest.approx([0.9056, 0.0, -14.5723], abs=0.003)
+    assert mean.sum() == pytest.approx(-41.0 / 3.0, abs=1e-4)
+
+
+def test_model_show__finds_what_is_steep(magpend):
+    """A layer in the belt's friction, a switch where it is a sign, an impact at the stop."""
+    assert "layer: tanh where belt - v passes 0" in magpend("model", "show", "belt")
+    assert load_model("belt-stick").system.n_switches == 1
+    assert load_model("impact").system.n_impacts == 1
+    assert load_model("pendulum-text").system.n_edges == 2
