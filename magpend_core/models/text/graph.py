@@ -255,6 +255,8 @@ class Graph:
         """`yes` where ``a < b``, else `no`."""
         if yes is no:
             return yes
+        if a is b:
+            return no
         if a.op == "number" and b.op == "number":
             return yes if a.value < b.value else no
         return self.node("less", a, b, yes, no)
