@@ -1,4 +1,4 @@
-"""Run tasks: in this process, on a local cluster, or on an existing scheduler. Only here is dask known.
+"""Run tasks: in this process, or on the workers of a dask scheduler.
 
 Tasks are submitted as futures in a window, so that a scheduler holds few of them however long the run
 is; their results are small dicts. Nothing here knows what a task computes.
@@ -6,18 +6,13 @@ is; their results are small dicts. Nothing here knows what a task computes.
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import os
-import signal
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-Task = Callable[[int], dict[str, Any]]
+from pipeline.compute.clients import connected
 
-ALLOWED_FAILURES = 3
-"""Worker deaths that a task may be blamed for: one would blame innocent tasks."""
+Task = Callable[[int], dict[str, Any]]
 
 WINDOW = 3
 """Tasks in flight per worker thread."""
@@ -66,7 +61,7 @@ def run_tasks(
         yield from _in_process(task, indices)
         return
     n_workers = min(workers or default_workers(), len(indices))
-    with _client(address, n_workers) as client:
+    with connected(address, n_workers) as client:
         yield from _window(client, task, indices)
 
 
@@ -77,61 +72,6 @@ def _in_process(task: Task, indices: Sequence[int]) -> Iterator[dict[str, Any]]:
         except Exception as error:
             raise TaskFailedError(f"task {index}: {type(error).__name__}: {error}") from error
         yield result
-
-
-@contextlib.contextmanager
-def _client(address: str | None, n_workers: int) -> Iterator[Any]:
-    """Yield a client of the scheduler at `address`, or of a new local cluster."""
-    import dask
-    from distributed import Client
-
-    settings = {"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(settings))
-        if address is None:
-            address = stack.enter_context(_local_cluster(n_workers))
-        yield stack.enter_context(Client(address, set_as_default=False))  # type: ignore[no-untyped-call]
-
-
-@contextlib.contextmanager
-def _local_cluster(n_workers: int) -> Iterator[Any]:
-    """Yield a cluster of single-threaded processes, reachable from this machine alone."""
-    from distributed import LocalCluster
-
-    with (
-        tempfile.TemporaryDirectory(prefix="magpend-", ignore_cleanup_errors=True) as scratch,
-        LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=n_workers,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            # The scheduler serves HTTP even without a dashboard: by default at port 8787, with a
-            # warning if another run is there.
-            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-            local_directory=scratch,
-            silence_logs=50,
-        ) as cluster,
-    ):
-        try:
-            yield cluster
-        except BaseException:
-            _kill(cluster)
-            raise
-
-
-def _kill(cluster: Any) -> None:
-    """End the workers at once: what they are computing is given up, and may take long.
-
-    dask then logs each connection that it misses, some after the cluster has closed; the exception that
-    led here says what happened.
-    """
-    for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    for nanny in cluster.workers.values():
-        nanny.auto_restart = False
-        if nanny.pid:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(nanny.pid, signal.SIGKILL)
 
 
 def _window(client: Any, task: Task, indices: Sequence[int]) -> Iterator[dict[str, Any]]:

@@ -262,9 +262,9 @@ def test_scheduler__existing_one(write_spec, sweep_text, tmp_path, bytes_of, mon
 def test_local_cluster__listens_on_loopback_only():
     import psutil
 
-    from pipeline.compute import execute
+    from pipeline.compute import clients
 
-    with execute._client(None, 1) as client:
+    with clients.connected(None, 1) as client:
         assert len(client.nthreads()) == 1
         processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
         listening = {

@@ -63,8 +63,8 @@ def at(model, state, t=0.3, **values):
             modes[-1] = np.count_nonzero(table[0] <= t)
         c = np.concatenate([c, modes])
         if system.n_switches:
-            still = (0.0,) * len(state)
-            for k, (value, _) in enumerate(plain(system.switches)(t, tuple(state), still, tuple(c))):
+            state, still = tuple(map(np.float64, state)), (np.float64(0.0),) * len(state)
+            for k, (value, _) in enumerate(plain(system.switches)(t, state, still, tuple(c))):
                 c[system.n_constants + k] = -1.0 if value < 0.0 else 1.0
         return tuple(c), plain(system.forcing)(t, tuple(c))
 
