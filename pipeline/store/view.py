@@ -6,7 +6,7 @@ from collections.abc import AsyncGenerator, Iterable, Mapping
 
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import LocalStore, WrapperStore
+from zarr.storage import WrapperStore
 
 from pipeline.store.commits import Commit
 from pipeline.store.files import CUBE
@@ -55,4 +55,4 @@ class CommittedStore(WrapperStore[Store]):
 def committed_view(info: RunInfo, commits: Mapping[int, Commit]) -> CommittedStore:
     """Return the store to read from; it shows the skeleton and what `commits` vouch for."""
     visible = frozenset({*info.skeleton, *(key for commit in commits.values() for key in commit.objects)})
-    return CommittedStore(LocalStore(info.directory / CUBE, read_only=True), visible)
+    return CommittedStore(info.files.below(CUBE).zarr(read_only=True), visible)
