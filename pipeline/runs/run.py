@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import origin
 from pipeline.layout.domains import check_starts
@@ -25,6 +25,9 @@ from pipeline.store.errors import IncompleteError
 from pipeline.store.files import open_files
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
+
+if TYPE_CHECKING:
+    from pipeline.compute.clients import Where
 
 Echo = Callable[[str], None]
 
@@ -52,6 +55,8 @@ def run(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
+    cluster: str | Path | None = None,
+    dashboard: bool = False,
     smoke: bool = False,
     echo: Echo = print,
 ) -> State:
@@ -66,8 +71,10 @@ def run(
         Path of a TOML file, or the name of a shipped workflow.
     out
         Run directory; by default ``runs/<name>``.
-    workers, scheduler
+    workers
         See `execute.run_tasks`.
+    scheduler, cluster, dashboard
+        See `clients.Where`.
     smoke
         Take the small size of the specification's ``[smoke]`` table.
     echo
@@ -82,6 +89,8 @@ def run(
     ------
     SpecError, RefusedError, LockedError
         Before anything is created or changed.
+    addresses.SchedulerError
+        If a scheduler or its workers cannot be used; nothing was computed.
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
@@ -91,9 +100,13 @@ def run(
     InterruptedRunError
         After Ctrl-C or SIGTERM. What was committed stays.
     """
+    from pipeline.compute.clients import Where
+
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     files = open_files(out if out is not None else default_directory(path, smoke))
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.local)
+    where.resolved()
     check_starts(parsed)
     plan = make_plan(parsed)
     identity = identity_here(parsed, plan)
@@ -101,7 +114,7 @@ def run(
     with files.lock():
         info = establish(files, parsed, plan, identity, path.read_text("utf-8"), echo)
         with stoppable(files.name):
-            _complete(info, parsed, plan, workers, scheduler, echo)
+            _complete(info, parsed, plan, workers, where, echo)
     return state(files)
 
 
@@ -112,11 +125,9 @@ def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
     return identity_of(spec, plan, kernel_version())
 
 
-def _complete(
-    info: RunInfo, spec: Spec, plan: Plan, workers: int | None, scheduler: str | None, echo: Echo
-) -> None:
+def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where: Where, echo: Echo) -> None:
     """Compute all tasks without a valid commit record."""
-    from pipeline.compute import execute, task
+    from pipeline.compute import clients, execute, task
 
     commits = read_commits(info, plan, echo)
     sweep(info, commits, echo)
@@ -128,6 +139,7 @@ def _complete(
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )
+    clients.reach(where)
     report("compiling the kernel", 0, 0)
     seconds = task.warm_up(spec)
     if seconds > 1:
@@ -138,7 +150,7 @@ def _complete(
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
     terminal = sys.stdout.isatty()
     with Progress(plan.n_cells, before, terminal=terminal, echo=echo, expected_s=expected_s) as progress:
-        for result in execute.run_tasks(job, missing, workers=workers, scheduler=scheduler):
+        for result in execute.run_tasks(job, missing, workers=workers, scheduler=where, echo=echo):
             log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
             progress.add(result["cells"])
     _require_all(info, plan)

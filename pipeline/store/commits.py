@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 import zarr
 
-from pipeline.layout.identity import canonical, digest_of
+from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import Plan
 from pipeline.store.files import COMMITS, CUBE, TIMINGS, Files, LinkError, entry_of, problems_of
 from pipeline.store.runfile import RunInfo
+from pipeline.store.seal import seal, unseal
 
 Echo = Callable[[str], None]
 
@@ -73,7 +74,7 @@ def write_task(
         "status": dict(counts),
         "objects": {key: entry_of(cube.read(key)) for key in objects},
     }
-    info.files.write_once(marker_key(index), canonical(record).encode())
+    info.files.write_once(marker_key(index), record_text(record).encode())
 
 
 def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
@@ -106,6 +107,11 @@ def chunk_keys(
         return [f"{name}/c"]
     grid = np.stack(np.meshgrid(*places, indexing="ij"), axis=-1).reshape(-1, len(places))
     return [f"{name}/c." + ".".join(map(str, place)) for place in grid]
+
+
+def record_text(record: Mapping[str, Any]) -> str:
+    """A commit record as it is stored: one line, the same for equal records, under its own checksum."""
+    return seal(json.dumps(record, sort_keys=True, allow_nan=False, ensure_ascii=False))
 
 
 def marker_key(index: int) -> str:
@@ -177,19 +183,16 @@ def _read_record(name: str, content: bytes | FileNotFoundError, info: RunInfo, p
     if isinstance(content, FileNotFoundError):
         return "is a link" if isinstance(content, LinkError) else ""
     try:
-        data = json.loads(content)
+        data = unseal(content)
         commit = Commit(int(data["task"]), dict(data["status"]), dict(data["objects"]))
-        complete = bool(commit.objects) and all(
-            isinstance(e["size"], int) and isinstance(e["sha256"], str) for e in commit.objects.values()
-        )
         digest = data["digest"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return "torn or damaged"
     if digest != info.digest:
         return "of another run"
     named = 0 <= commit.task < plan.n_tasks and f"{COMMITS}/{name}" == marker_key(commit.task)
     inside = all(key.partition("/")[0] in {v.name for v in plan.variables} for key in commit.objects)
-    return commit if complete and named and inside and not _climbs(commit) else "torn or damaged"
+    return commit if named and inside and not _climbs(commit) else "torn or damaged"
 
 
 def _climbs(commit: Commit) -> bool:

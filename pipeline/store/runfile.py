@@ -15,6 +15,7 @@ from pipeline.spec.recorded import is_whole
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, Files, open_files
 from pipeline.store.provenance import provenance, versions
+from pipeline.store.seal import CHECKSUM, fits, has_seal, seal
 
 
 @dataclass(frozen=True)
@@ -87,20 +88,28 @@ def read_run(place: str | Path | Files) -> RunInfo:
     content = files.read(RUN_FILE)
     try:
         data = json.loads(content)
-        found = data["identity"]["format"]
-        if isinstance(found, (int, float)) and found != FORMAT:
-            raise RefusedError(
-                f"{path}: format {found:g}, and this magpend reads {FORMAT}; read it with the version that "
-                f"made it ({data['versions'].get('magpend', 'not named')}), or run its specification "
-                "into another directory."
-            )
-        info = RunInfo(files=files, **data)
-        fits = digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
+        _refuse_format(path, data, content)
+        whole = fits(content) and data.pop(CHECKSUM) is not None
+        info = RunInfo(files=files, **data) if whole else None
+        whole = (
+            info is not None and digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
+        )
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DamagedError(f"{path}: damaged ({error}); {_remedy(directory)}") from None
-    if not fits:
-        raise DamagedError(f"{path}: damaged (its digest does not fit); {_remedy(directory)}")
+    if info is None or not whole:
+        raise DamagedError(f"{path}: damaged (its checksum does not fit); {_remedy(directory)}")
     return info
+
+
+def _refuse_format(path: str, data: Mapping[str, Any], content: bytes) -> None:
+    """Refuse another format, unless the number is what is damaged: the file then contradicts its checksum."""
+    found = data["identity"]["format"]
+    if isinstance(found, (int, float)) and found != FORMAT and (fits(content) or not has_seal(content)):
+        raise RefusedError(
+            f"{path}: format {found:g}, and this magpend reads {FORMAT}; read it with the version that "
+            f"made it ({data['versions'].get('magpend', 'not named')}), or run its specification "
+            "into another directory."
+        )
 
 
 def _remedy(directory: str) -> str:
@@ -129,6 +138,6 @@ def write_run(
         "skeleton": skeleton,
     }
     # not sorted: the order of the axes is that of the cube's dims
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    files.write(RUN_FILE, text.encode())
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+    files.write(RUN_FILE, seal(text).encode())
     return read_run(files)
