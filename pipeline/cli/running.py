@@ -46,7 +46,9 @@ ClusterFile = Annotated[
 
 def run(
     spec: Spec,
-    out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
+    out: Annotated[
+        str | None, typer.Option(help="Run directory, or s3://BUCKET/PREFIX; by default runs/NAME.")
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores."),
@@ -85,14 +87,14 @@ def run(
         spec, out, workers=workers, scheduler=scheduler, cluster=cluster, dashboard=dashboard, smoke=smoke,
         echo=console.note,
     )  # fmt: skip
-    console.result(f"cube: {state.directory / 'cube.zarr'}")
+    console.result(f"cube: {state.files.below('cube.zarr').name}")
     if plot:
-        _diagram(state.directory)
+        _diagram(state.name)
     else:
-        console.result(f"plot it with: {preview.figure_command(state.plan, state.directory)}")
+        console.result(f"plot it with: {preview.figure_command(state.plan, state.name)}")
 
 
-def _diagram(directory: Path) -> None:
+def _diagram(directory: str) -> None:
     from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES
 
@@ -108,7 +110,7 @@ def status(directory: Directory, json: Json = False) -> None:
 
     found = state(directory)
     row = {
-        "directory": str(found.directory), "title": found.title, "complete": found.complete,
+        "directory": found.name, "title": found.title, "complete": found.complete,
         "cells": found.plan.n_cells, "committed_cells": found.n_committed, "tasks": found.plan.n_tasks,
         "committed_tasks": len(found.done), "status": dict(found.cells),
     }  # fmt: skip

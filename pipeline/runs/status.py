@@ -18,7 +18,8 @@ class State:
 
     Attributes
     ----------
-    directory : Path
+    files : Files
+        Of the run directory.
     title : str
     plan : Plan
     done : frozenset of int
@@ -27,11 +28,16 @@ class State:
         Committed cells by status name.
     """
 
-    directory: Path
+    files: Files
     title: str
     plan: Plan
     done: frozenset[int]
     cells: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """What people call the directory."""
+        return self.files.name
 
     @property
     def n_committed(self) -> int:
@@ -56,7 +62,7 @@ def state(source: str | Path | Files | Run) -> State:
     cells: Counter[str] = Counter()
     for commit in run.commits.values():
         cells.update(commit.status)
-    return State(run.directory, run.info.title, run.plan, frozenset(run.commits), dict(cells))
+    return State(run.info.files, run.info.title, run.plan, frozenset(run.commits), dict(cells))
 
 
 def describe_state(found: State) -> list[str]:
@@ -65,7 +71,7 @@ def describe_state(found: State) -> list[str]:
     share = 100 * found.n_committed / plan.n_cells
     lines = [found.title] if found.title else []
     lines += [
-        f"{found.directory}: {'complete' if found.complete else 'incomplete'}",
+        f"{found.name}: {'complete' if found.complete else 'incomplete'}",
         f"committed: {found.n_committed} of {plan.n_cells} cells ({share:.1f} %), "
         f"{len(found.done)} of {plan.n_tasks} tasks",
     ]

@@ -118,7 +118,9 @@ WAYS = {f.__name__: f for f in (flip, truncate, extend, zero, delete, garble)}
 
 def chunks(directory):
     """Chunks of cells, which the records vouch for."""
-    keys = [key for f in sorted(directory.glob("commits/*.json")) for key in unseal(f.read_bytes())["objects"]]
+    keys = [
+        key for f in sorted(directory.glob("commits/*.json")) for key in unseal(f.read_bytes())["objects"]
+    ]
     return [directory / "cube.zarr" / key for key in keys]
 
 
