@@ -11,7 +11,7 @@ import typer
 
 from pipeline.cli.analyse import analyse_app
 from pipeline.cli.common import EXIT_HELP, CommandError
-from pipeline.cli.console import EnoughError
+from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
 from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.identify import identify_app
@@ -102,7 +102,7 @@ def _complain(error: BaseException) -> None:
         LOG.error(text)
         LOG.debug("where it came from", exc_info=error)
     else:
-        print(text, file=sys.stderr)
+        print(visible(text), file=sys.stderr)
 
 
 def main() -> None:
@@ -137,7 +137,7 @@ def _usage(error: Any) -> None:
     if context is not None and not message.strip():  # a group without a command shows its help
         message = context.get_help()
     hint = f"\nhelp: {context.command_path} --help" if context is not None else ""
-    print(f"magpend: {message}{hint}", file=sys.stderr)
+    print(visible(f"magpend: {message}{hint}"), file=sys.stderr)
 
 
 def _leave_quietly() -> None:
