@@ -97,7 +97,9 @@ def run(
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
-        If a task failed. What was committed stays.
+        If tasks failed twice. All others are committed.
+    ConnectionError
+        If the scheduler is gone. What was committed stays.
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
@@ -153,7 +155,15 @@ def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where:
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
     terminal = sys.stdout.isatty()
     with Progress(plan.n_cells, before, terminal=terminal, echo=echo, expected_s=expected_s) as progress:
-        for result in execute.run_tasks(job, missing, workers=workers, scheduler=where, echo=echo):
+        results = execute.run_tasks(
+            job,
+            missing,
+            seconds=lambda i: plan.cells_in(i) * plan.seconds_per_cell,
+            workers=workers,
+            scheduler=where,
+            echo=echo,
+        )
+        for result in results:
             log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
             packer.add(result["task"])
             progress.add(result["cells"])
