@@ -24,6 +24,7 @@ from pipeline.cli.plot import plot_app
 from pipeline.cli.recordings import recordings_app
 from pipeline.cli.running import run, status, verify
 from pipeline.cli.simulate import EXTRA, simulate
+from pipeline.cli.submit import submit
 from pipeline.cli.zoom import zoom
 
 app = typer.Typer(
@@ -56,8 +57,8 @@ def _main(
 
 
 for _command, _settings in (
-    (run, {}), (status, {}), (verify, {}), (zoom, EXTRA), (simulate, EXTRA), (models, {}), (presets, {}),
-    (fit_magnet, {}),
+    (run, {}), (submit, {}), (status, {}), (verify, {}), (zoom, EXTRA), (simulate, EXTRA), (models, {}),
+    (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
 app.add_typer(analyse_app, name="analyse")
@@ -73,6 +74,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     from magpend_core.models.parameters import ParameterError
     from pipeline.compute.addresses import SchedulerError
     from pipeline.compute.execute import TaskFailedError
+    from pipeline.runs.submit import SubmitError
     from pipeline.spec.problems import SpecError
     from pipeline.store.errors import (
         DamagedError,
@@ -87,7 +89,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
         ((DamagedError,), Exit.DAMAGED),
         ((IncompleteError, UnreadableError), Exit.FAILED),
         ((SpecError, ParameterError, StoreError), Exit.REFUSED),
-        ((TaskFailedError, SchedulerError, ArithmeticError, OSError), Exit.FAILED),
+        ((TaskFailedError, SchedulerError, SubmitError, ArithmeticError, OSError), Exit.FAILED),
     ]
 
 
