@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import origin
 from pipeline.layout.domains import check_starts
@@ -22,9 +22,12 @@ from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
 from pipeline.store.commits import log_timing, read_commits, sweep
 from pipeline.store.errors import IncompleteError
-from pipeline.store.files import local_path, writer_lock
+from pipeline.store.files import open_files
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
+
+if TYPE_CHECKING:
+    from pipeline.compute.clients import Where
 
 Echo = Callable[[str], None]
 
@@ -52,6 +55,8 @@ def run(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
+    cluster: str | Path | None = None,
+    dashboard: bool = False,
     smoke: bool = False,
     echo: Echo = print,
 ) -> State:
@@ -66,8 +71,10 @@ def run(
         Path of a TOML file, or the name of a shipped workflow.
     out
         Run directory; by default ``runs/<name>``.
-    workers, scheduler
+    workers
         See `execute.run_tasks`.
+    scheduler, cluster, dashboard
+        See `clients.Where`.
     smoke
         Take the small size of the specification's ``[smoke]`` table.
     echo
@@ -82,27 +89,35 @@ def run(
     ------
     SpecError, RefusedError, LockedError
         Before anything is created or changed.
+    addresses.SchedulerError
+        If a scheduler or its workers cannot be used; nothing was computed.
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
-        If a task failed. What was committed stays.
+        If tasks failed twice. All others are committed.
+    ConnectionError
+        If the scheduler is gone. What was committed stays.
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
         After Ctrl-C or SIGTERM. What was committed stays.
     """
+    from pipeline.compute.clients import Where
+
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
-    directory = local_path(out) if out is not None else default_directory(path, smoke)
+    files = open_files(out if out is not None else default_directory(path, smoke))
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.local)
+    where.resolved()
     check_starts(parsed)
     plan = make_plan(parsed)
     identity = identity_here(parsed, plan)
-    check(directory, identity)
-    with writer_lock(directory):
-        info = establish(directory, parsed, plan, identity, path.read_text("utf-8"), echo)
-        with stoppable(directory):
-            _complete(info, parsed, plan, workers, scheduler, echo)
-    return state(directory)
+    check(files, identity)
+    with files.lock():
+        info = establish(files, parsed, plan, identity, path.read_text("utf-8"), echo)
+        with stoppable(files.name):
+            _complete(info, parsed, plan, workers, where, echo)
+    return state(files)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
@@ -112,36 +127,42 @@ def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
     return identity_of(spec, plan, kernel_version())
 
 
-def _complete(
-    info: RunInfo, spec: Spec, plan: Plan, workers: int | None, scheduler: str | None, echo: Echo
-) -> None:
+def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where: Where, echo: Echo) -> None:
     """Compute all tasks without a valid commit record."""
-    from pipeline.compute import execute, task
+    from pipeline.compute import clients, execute, task
 
     commits = read_commits(info, plan, echo)
     sweep(info, commits, echo)
     # walks in step, so that none is left to one worker at the end
     missing = sorted((i for i in range(plan.n_tasks) if i not in commits), key=plan.depth)
     if not missing:
-        echo(f"{info.directory} is complete; nothing to do.")
+        echo(f"{info.name} is complete; nothing to do.")
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )
+    clients.reach(where)
     report("compiling the kernel", 0, 0)
     seconds = task.warm_up(spec)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
-    place = str(info.directory.absolute())
-    job = partial(task.run_task, place, info.digest, origin=origin(spec.model))
+    job = partial(task.run_task, info.files.place, info.digest, origin=origin(spec.model))
     started = time.perf_counter()
     cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(missing)))
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
     terminal = sys.stdout.isatty()
     with Progress(plan.n_cells, before, terminal=terminal, echo=echo, expected_s=expected_s) as progress:
-        for result in execute.run_tasks(job, missing, workers=workers, scheduler=scheduler):
-            log_timing(info.directory, {**result, "at_s": round(time.perf_counter() - started, 4)})
+        results = execute.run_tasks(
+            job,
+            missing,
+            seconds=lambda i: plan.cells_in(i) * plan.seconds_per_cell,
+            workers=workers,
+            scheduler=where,
+            echo=echo,
+        )
+        for result in results:
+            log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
             progress.add(result["cells"])
     _require_all(info, plan)
 
@@ -154,14 +175,14 @@ def _require_all(info: RunInfo, plan: Plan) -> None:
     if absent:
         why = f" {problems[0]}." if problems else ""
         raise IncompleteError(
-            f"{info.directory}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
+            f"{info.name}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
             "and have room to write; then give the same command again: it computes these tasks alone."
         )
 
 
 @contextlib.contextmanager
-def stoppable(directory: Path) -> Iterator[None]:
+def stoppable(directory: str | Path) -> Iterator[None]:
     """Turn Ctrl-C and SIGTERM into `InterruptedRunError`, after everything inside has been closed.
 
     Parameters

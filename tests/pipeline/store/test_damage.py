@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 from pathlib import Path
@@ -20,10 +21,12 @@ from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
 from pipeline.runs.zoom import read_source
-from pipeline.store.commits import marker_path, read_commits, sweep
+from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import DamagedError, IncompleteError, RefusedError, UnreadableError
 from pipeline.store.files import local_path
+from pipeline.store.local import LocalFiles
 from pipeline.store.run import Run
+from pipeline.store.seal import seal, unseal
 from pipeline.store.setup import check, create, establish
 from pipeline.store.skeleton import skeleton_files
 
@@ -106,7 +109,7 @@ def test_run__unreadable_record_removes_nothing(write_spec, sweep_text, tmp_path
 
 
 def test_sweep__says_what_it_removes(whole):
-    marker_path(whole.info.directory, 1).write_text("{")
+    (whole.info.directory / marker_key(1)).write_text("{")
     said = []
     commits = read_commits(whole.info, whole.plan, said.append)
     assert said == ["commits/000001.json: torn or damaged; it does not count"]
@@ -303,15 +306,11 @@ def test_rebuild__keeps_only_what_fits_its_record(whole):
 
 def test_rebuild__files_worded_by_another_version(whole):
     """Where the metadata come out otherwise, repair leaves them; a run writes them and their digests anew."""
-    import json
-
-    from pipeline.layout.identity import canonical
-
     directory = whole.info.directory
-    data = json.loads((directory / "run.json").read_text())
+    data = unseal((directory / "run.json").read_bytes())
     metadata = directory / "cube.zarr/q/zarr.json"
     data["skeleton"]["q/zarr.json"] = {"size": 1, "sha256": "0" * 64}
-    (directory / "run.json").write_text(canonical(data))
+    (directory / "run.json").write_text(seal(json.dumps(data)))
     found = verify_run(directory, repair=True)
     assert found.skeleton == ["q/zarr.json: its content has changed"]
     assert "another version" in describe(found, directory, repaired=True)[-1]
@@ -341,21 +340,19 @@ def test_skeleton_files__same_bytes_again(made):
 
 
 def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
-    from pipeline.store import skeleton
-
     n_files = len(made.info.skeleton)
     for n in (0, 1, n_files // 2, n_files - 1):
         directory, calls = tmp_path / f"again{n}", []
-        original = skeleton.write_atomically
+        original = LocalFiles.write
 
-        def crash(path, content, calls=calls, n=n, original=original):
+        def crash(self, key, content, calls=calls, n=n, original=original):
             if len(calls) == n:
                 raise KeyboardInterrupt
-            calls.append(path)
-            original(path, content)
+            calls.append(key)
+            original(self, key, content)
 
         with monkeypatch.context() as patch:
-            patch.setattr(skeleton, "write_atomically", crash)
+            patch.setattr(LocalFiles, "write", crash)
             with pytest.raises(KeyboardInterrupt):
                 create(directory, made.spec, made.plan, made.identity, "text")
         (directory / "cube.zarr/.zarr.json.abc.tmp").write_text("{")  # what a power cut leaves
@@ -369,10 +366,12 @@ def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
 
 def test_read_run__another_format(whole):
     path = whole.info.directory / "run.json"
-    path.write_text(path.read_text().replace('"format": 2', '"format": 1'))
+    older = json.loads(path.read_text().replace('"format": 3', '"format": 2'))
+    del older["checksum"]  # format 2 had none
+    path.write_text(json.dumps(older))
     before = everything(whole.info.directory)
     for use in (lambda: open_run(whole.info.directory), lambda: check(whole.info.directory, whole.identity)):
-        with pytest.raises(RefusedError, match=r"format 1, and this magpend reads 2"):
+        with pytest.raises(RefusedError, match=r"format 2, and this magpend reads 3"):
             use()
     assert everything(whole.info.directory) == before
 
@@ -394,7 +393,7 @@ def test_run__a_record_that_vanished(write_spec, sweep_text, tmp_path, monkeypat
 
     def losing(job, indices, **options):
         yield from original(job, indices, **options)
-        marker_path(tmp_path / "run", 2).unlink()
+        (tmp_path / "run" / marker_key(2)).unlink()
 
     with monkeypatch.context() as patch:
         patch.setattr(execute, "run_tasks", losing)
