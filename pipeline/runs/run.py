@@ -158,7 +158,8 @@ def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where:
         results = execute.run_tasks(
             job,
             missing,
-            seconds=lambda i: plan.cells_in(i) * plan.seconds_per_cell,
+            after=None if plan.path is None else plan.predecessor,
+            seconds=plan.seconds,
             workers=workers,
             scheduler=where,
             echo=echo,
