@@ -28,6 +28,22 @@ Spec = Annotated[
 ]  # fmt: skip
 
 
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="WHERE",
+        help="local; none (this process); a dask scheduler's tcp:// or tls:// address or FILE.json; or jobs "
+        "of slurm, pbs, sge, lsf. Default: $DASK_SCHEDULER_ADDRESS, or local.",
+    ),
+]
+ClusterFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="TOML file whose [cluster] says what a job is. Default: $MAGPEND_CLUSTER."
+    ),
+]
+
+
 def run(
     spec: Spec,
     out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
@@ -35,12 +51,11 @@ def run(
         int | None,
         typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores."),
     ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            help="Address of a dask scheduler, or 'none'. Default: $DASK_SCHEDULER_ADDRESS, or own workers."
-        ),
-    ] = None,
+    scheduler: Scheduler = None,
+    cluster: ClusterFile = None,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and say where.")
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")
     ] = False,
@@ -66,7 +81,10 @@ def run(
         return
     if plot:
         preview.check_diagram(spec, smoke=smoke)
-    state = runs.run(spec, out, workers=workers, scheduler=scheduler, smoke=smoke, echo=console.note)
+    state = runs.run(
+        spec, out, workers=workers, scheduler=scheduler, cluster=cluster, dashboard=dashboard, smoke=smoke,
+        echo=console.note,
+    )  # fmt: skip
     console.result(f"cube: {state.directory / 'cube.zarr'}")
     if plot:
         _diagram(state.directory)

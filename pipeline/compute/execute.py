@@ -10,25 +10,18 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from pipeline.compute.clients import connected
+from pipeline.compute.clients import IN_PROCESS, Where, connected
 from pipeline.compute.order import Order, Predecessor, TaskFailedError, why
 
-__all__ = ["IN_PROCESS", "TaskFailedError", "default_workers", "run_tasks", "scheduler_address"]
+__all__ = ["TaskFailedError", "default_workers", "run_tasks"]
 
 Task = Callable[[int], dict[str, Any]]
 Echo = Callable[[str], None]
-
-IN_PROCESS = "none"
 
 
 def default_workers() -> int:
     """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def scheduler_address(scheduler: str | None) -> str | None:
-    """Return the scheduler to connect to: the given one, or that of the environment."""
-    return scheduler or os.environ.get("DASK_SCHEDULER_ADDRESS") or None
 
 
 def run_tasks(
@@ -38,7 +31,7 @@ def run_tasks(
     after: Predecessor | None = None,
     seconds: Callable[[int], float] | None = None,
     workers: int | None = None,
-    scheduler: str | None = None,
+    scheduler: Where | str | None = None,
     echo: Echo = print,
 ) -> Iterator[dict[str, Any]]:
     """Run `task` for every index and yield the results as they come.
@@ -61,27 +54,26 @@ def run_tasks(
     workers
         Processes of the local cluster; 0 runs in this process.
     scheduler
-        ``"none"`` runs in this process; an address such as ``tcp://host:8786`` uses that scheduler;
-        None looks at ``DASK_SCHEDULER_ADDRESS``, then starts a local cluster.
+        Where; a text stands for ``Where(text)``.
     echo
         Takes a line when something goes wrong and is dealt with.
 
     Raises
     ------
+    SpecError, SchedulerError
+        Before anything is computed, if there are no such workers; and when the scheduler is lost.
     TaskFailedError
         At the end, if tasks failed twice; at once, if so many fail that it is not the tasks.
-    ConnectionError
-        If the scheduler is gone.
     """
     order = Order(indices, after)
-    address = scheduler_address(scheduler)
-    if address == IN_PROCESS or workers == 0:
+    where = Where.of(scheduler)
+    if where.resolved() == IN_PROCESS or workers == 0:
         yield from _in_process(task, order)
         return
     from pipeline.compute.window import Window
 
     n_workers = min(workers or default_workers(), len(indices))
-    with connected(address, n_workers) as client:
+    with connected(where, n_workers, echo) as client:
         yield from Window(client, task, order, seconds=seconds, echo=echo).results()
     order.close()
 

@@ -21,15 +21,16 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
+from pipeline.compute.addresses import SchedulerError
+
 PREFIX = "magpend-workers-"
 
 START_S = 180.0
 """A worker that does not start within this time has failed [s]."""
 
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     # a profile of every task would grow with their number
     "distributed.worker.profile.enabled": False,
-    "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
     # results are small: there is nothing to write to disk
     "distributed.worker.memory.target": False,
@@ -38,18 +39,21 @@ SETTINGS = {
     "distributed.deploy.lost-worker-timeout": "1 hour",
 }
 
+NO_PAGES: dict[str, Any] = {"distributed.scheduler.http.routes": []}
+
 _scratch_folders: set[Path] = set()
 
 
 @contextlib.contextmanager
-def local_cluster(n_workers: int) -> Iterator[Any]:
+def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
     """Yield a cluster of single-threaded processes, reachable with its own keys alone.
 
-    Workers may still be starting when it comes.
+    Some workers may still be starting when it comes. The dashboard shows what is computed to everyone on
+    this machine.
 
     Raises
     ------
-    ConnectionError
+    SchedulerError
         If none starts.
     """
     import dask
@@ -57,7 +61,7 @@ def local_cluster(n_workers: int) -> Iterator[Any]:
 
     _quiet_tracker()
     with (
-        dask.config.set(SETTINGS),
+        dask.config.set(SETTINGS if dashboard else SETTINGS | NO_PAGES),
         _scratch() as scratch,
         _loop() as loop,
         LocalCluster(  # type: ignore[no-untyped-call]
@@ -70,7 +74,7 @@ def local_cluster(n_workers: int) -> Iterator[Any]:
             security=_security(scratch),
             # The scheduler serves HTTP even without a dashboard: by default at port 8787, with a
             # warning if another run is there.
-            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+            scheduler_kwargs={"dashboard": dashboard, "dashboard_address": "127.0.0.1:0"},
             local_directory=str(scratch),
             silence_logs=50,
             loop=loop,
@@ -93,7 +97,7 @@ def _await_one(cluster: Any) -> None:
     end = time.monotonic() + START_S
     while not cluster.scheduler.workers:
         if time.monotonic() > end:
-            raise ConnectionError(f"no worker process has started within {START_S:.0f} s.")
+            raise SchedulerError(f"no worker process has started within {START_S:.0f} s.")
         time.sleep(0.02)
 
 

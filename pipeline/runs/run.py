@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import origin
 from pipeline.layout.domains import check_starts
@@ -25,6 +25,9 @@ from pipeline.store.errors import IncompleteError
 from pipeline.store.files import local_path, writer_lock
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
+
+if TYPE_CHECKING:
+    from pipeline.compute.clients import Where
 
 Echo = Callable[[str], None]
 
@@ -52,6 +55,8 @@ def run(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
+    cluster: str | Path | None = None,
+    dashboard: bool = False,
     smoke: bool = False,
     echo: Echo = print,
 ) -> State:
@@ -66,8 +71,10 @@ def run(
         Path of a TOML file, or the name of a shipped workflow.
     out
         Run directory; by default ``runs/<name>``.
-    workers, scheduler
+    workers
         See `execute.run_tasks`.
+    scheduler, cluster, dashboard
+        See `clients.Where`.
     smoke
         Take the small size of the specification's ``[smoke]`` table.
     echo
@@ -82,20 +89,24 @@ def run(
     ------
     SpecError, RefusedError, LockedError
         Before anything is created or changed.
+    addresses.SchedulerError
+        If a scheduler or its workers cannot be used, or are lost; what was committed stays.
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
         If tasks failed twice. All others are committed.
-    ConnectionError
-        If the scheduler is gone. What was committed stays.
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
         After Ctrl-C or SIGTERM. What was committed stays.
     """
+    from pipeline.compute.clients import Where
+
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     directory = local_path(out) if out is not None else default_directory(path, smoke)
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, directory)
+    where.resolved()
     check_starts(parsed)
     plan = make_plan(parsed)
     identity = identity_here(parsed, plan)
@@ -103,7 +114,7 @@ def run(
     with writer_lock(directory):
         info = establish(directory, parsed, plan, identity, path.read_text("utf-8"), echo)
         with stoppable(directory):
-            _complete(info, parsed, plan, workers, scheduler, echo)
+            _complete(info, parsed, plan, workers, where, echo)
     return state(directory)
 
 
@@ -114,11 +125,9 @@ def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
     return identity_of(spec, plan, kernel_version())
 
 
-def _complete(
-    info: RunInfo, spec: Spec, plan: Plan, workers: int | None, scheduler: str | None, echo: Echo
-) -> None:
+def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where: Where, echo: Echo) -> None:
     """Compute all tasks without a valid commit record."""
-    from pipeline.compute import execute, task
+    from pipeline.compute import clients, execute, task
 
     commits = read_commits(info, plan, echo)
     sweep(info, commits, echo)
@@ -130,6 +139,7 @@ def _complete(
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )
+    clients.reach(where)
     report("compiling the kernel", 0, 0)
     seconds = task.warm_up(spec)
     if seconds > 1:
@@ -146,7 +156,7 @@ def _complete(
             missing,
             seconds=lambda i: plan.cells_in(i) * plan.seconds_per_cell,
             workers=workers,
-            scheduler=scheduler,
+            scheduler=where,
             echo=echo,
         )
         for result in results:
