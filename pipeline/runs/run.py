@@ -93,13 +93,11 @@ def run(
     SpecError, RefusedError, LockedError
         Before anything is created or changed.
     addresses.SchedulerError
-        If a scheduler or its workers cannot be used; nothing was computed.
+        If a scheduler or its workers cannot be used, or are lost; what was committed stays.
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
         If tasks failed twice. All others are committed.
-    ConnectionError
-        If the scheduler is gone. What was committed stays.
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
