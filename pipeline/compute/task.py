@@ -7,8 +7,9 @@ A task is named by the run directory, the run's digest and its index; it reads t
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +111,13 @@ def rest_states(cells: Sections) -> np.ndarray:
     return np.where(is_left[..., None], cells.final_state[:, None], np.nan)
 
 
-def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
+Integrate = Callable[[Spec, Inputs], dict[str, np.ndarray]]
+"""From branches to all their variables, with leading dims (branch, point)."""
+
+
+def compute(
+    spec: Spec, cells: CellMap, block: tuple[slice, ...], integrate: Integrate = integrate
+) -> dict[str, np.ndarray]:
     """Return all variables of a block of cells, in the block's shape."""
     inputs = cells.inputs(block)
     if spec.refine is None:
@@ -129,7 +136,12 @@ def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, n
 
 
 def run_task(
-    directory: str, digest: str, index: int, *, origin: tuple[str, str] | None = None
+    directory: str,
+    digest: str,
+    index: int,
+    *,
+    origin: tuple[str, str] | None = None,
+    sources: tuple[tuple[str, str], ...] = (),
 ) -> dict[str, Any]:
     """Compute a task and commit it.
 
@@ -139,15 +151,19 @@ def run_task(
         Which one.
     origin
         Where the model is a Python object: its place and folder, as the person who began the run named them.
+    sources
+        Directories and digests of runs from which cells that they hold are taken; see `compute.reuse`.
 
     Returns
     -------
     dict
-        Task, cells, cells by status, and the seconds taken by the kernel and by writing.
+        Task, cells, cells by status, and the seconds taken by the kernel and by writing; with `sources` how
+        many cells were taken.
     """
     info, spec, plan, cells = _prepare(directory, digest, origin)
     started = time.perf_counter()
-    values = compute(spec, cells, plan.task(index))
+    taken: list[int] = []
+    values = compute(spec, cells, plan.task(index), **_taking(directory, digest, sources, taken))
     computed = time.perf_counter()
     codes, numbers = np.unique(values["status"], return_counts=True)
     counts = {Status(int(c)).name.lower(): int(n) for c, n in zip(codes, numbers, strict=True)}
@@ -158,7 +174,19 @@ def run_task(
         "status": counts,
         "kernel_s": round(computed - started, 4),
         "write_s": round(time.perf_counter() - computed, 4),
+        **({"reused": sum(taken)} if sources else {}),
     }
+
+
+def _taking(
+    directory: str, digest: str, sources: tuple[tuple[str, str], ...], taken: list[int]
+) -> dict[str, Integrate]:
+    """Say what gives a task's cells where it is not the kernel alone: what other runs hold comes first."""
+    if not sources:
+        return {}
+    from pipeline.compute.reuse import pool_of
+
+    return {"integrate": partial(pool_of(directory, digest, sources).integrate, tally=taken)}
 
 
 def warm_up(spec: Spec) -> float:

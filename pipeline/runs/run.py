@@ -6,7 +6,7 @@ import contextlib
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
 
 Echo = Callable[[str], None]
+Sources = Sequence[tuple[str, str]]
+"""Directories and digests of runs that hold cells of the one at hand."""
 
 
 class InterruptedRunError(Exception):
@@ -95,14 +97,43 @@ def run(
     parsed = load_spec(path, smoke=smoke)
     directory = local_path(out) if out is not None else default_directory(path, smoke)
     check_starts(parsed)
-    plan = make_plan(parsed)
-    identity = identity_here(parsed, plan)
+    carry_out(parsed, path.read_text("utf-8"), directory, workers=workers, scheduler=scheduler, echo=echo)
+    return state(directory)
+
+
+def carry_out(
+    spec: Spec,
+    text: str,
+    directory: Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    echo: Echo = print,
+    sources: Sources = (),
+) -> None:
+    """Run a specification, or what is missing of it, in a directory.
+
+    Parameters
+    ----------
+    spec, text
+        It, and the TOML text that it was read from.
+    directory, workers, scheduler, echo
+        As for `run`.
+    sources
+        Runs from which cells that they hold are taken, see `pipeline.runs.extend`.
+
+    Raises
+    ------
+    Exception
+        As `run`.
+    """
+    plan = make_plan(spec)
+    identity = identity_here(spec, plan)
     check(directory, identity)
     with writer_lock(directory):
-        info = establish(directory, parsed, plan, identity, path.read_text("utf-8"), echo)
+        info = establish(directory, spec, plan, identity, text, echo)
         with stoppable(directory):
-            _complete(info, parsed, plan, workers, scheduler, echo)
-    return state(directory)
+            _complete(info, spec, plan, workers, scheduler, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
@@ -113,7 +144,13 @@ def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
 
 
 def _complete(
-    info: RunInfo, spec: Spec, plan: Plan, workers: int | None, scheduler: str | None, echo: Echo
+    info: RunInfo,
+    spec: Spec,
+    plan: Plan,
+    workers: int | None,
+    scheduler: str | None,
+    echo: Echo,
+    sources: Sources = (),
 ) -> None:
     """Compute all tasks without a valid commit record."""
     from pipeline.compute import execute, task
@@ -134,6 +171,8 @@ def _complete(
         echo(f"kernel compiled in {duration(seconds)}")
     place = str(info.directory.absolute())
     job = partial(task.run_task, place, info.digest, origin=origin(spec.model))
+    if sources:
+        job = partial(job, sources=tuple(sources))
     started = time.perf_counter()
     cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(missing)))
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
