@@ -9,7 +9,7 @@ import typer
 
 from pipeline.cli.common import Directory
 from pipeline.cli.options import completing
-from pipeline.cli.running import DryRun, Scheduler, Workers, workflow_names
+from pipeline.cli.running import ClusterFile, Dashboard, DryRun, Scheduler, Workers, workflow_names
 
 
 def extend(
@@ -47,6 +47,8 @@ def extend(
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
+    cluster: ClusterFile = None,
+    dashboard: Dashboard = False,
     dry_run: DryRun = False,
 ) -> None:
     """Widen a run; every cell that is computed already is taken over, not integrated again.
@@ -68,7 +70,7 @@ def extend(
         return
     state = extending.extend(
         directory, spec, out, also=also or (), **changes, workers=workers, scheduler=scheduler,
-        echo=console.note,
+        cluster=cluster, dashboard=dashboard, echo=console.note,
     )  # fmt: skip
     console.result(f"cube: {state.directory / 'cube.zarr'}")
 

@@ -72,6 +72,7 @@ app.add_typer(identify_app, name="identify")
 def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     """Exceptions that people can act on, and their exit codes."""
     from magpend_core.models.parameters import ParameterError
+    from pipeline.compute.addresses import SchedulerError
     from pipeline.compute.execute import TaskFailedError
     from pipeline.spec.problems import SpecError
     from pipeline.store.errors import (
@@ -87,7 +88,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
         ((DamagedError,), Exit.DAMAGED),
         ((IncompleteError, UnreadableError), Exit.FAILED),
         ((SpecError, ParameterError, StoreError), Exit.REFUSED),
-        ((TaskFailedError, ArithmeticError, OSError), Exit.FAILED),
+        ((TaskFailedError, SchedulerError, ArithmeticError, OSError), Exit.FAILED),
     ]
 
 

@@ -36,8 +36,19 @@ Workers = Annotated[
 Scheduler = Annotated[
     str | None,
     typer.Option(
-        help="Address of a dask scheduler, or 'none'. Default: $DASK_SCHEDULER_ADDRESS, or own workers."
+        metavar="WHERE",
+        help="local; none (this process); a dask scheduler's tcp:// or tls:// address or FILE.json; or jobs "
+        "of slurm, pbs, sge, lsf. Default: $DASK_SCHEDULER_ADDRESS, or local.",
     ),
+]
+ClusterFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="TOML file whose [cluster] says what a job is. Default: $MAGPEND_CLUSTER."
+    ),
+]
+Dashboard = Annotated[
+    bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and say where.")
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")]
 
@@ -47,6 +58,8 @@ def run(
     out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
+    cluster: ClusterFile = None,
+    dashboard: Dashboard = False,
     dry_run: DryRun = False,
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")
@@ -70,7 +83,10 @@ def run(
         return
     if plot:
         preview.check_diagram(spec, smoke=smoke)
-    state = runs.run(spec, out, workers=workers, scheduler=scheduler, smoke=smoke, echo=console.note)
+    state = runs.run(
+        spec, out, workers=workers, scheduler=scheduler, cluster=cluster, dashboard=dashboard, smoke=smoke,
+        echo=console.note,
+    )  # fmt: skip
     console.result(f"cube: {state.directory / 'cube.zarr'}")
     if plot:
         _diagram(state.directory)

@@ -1,26 +1,212 @@
-"""Clients of dask: of a local cluster, or of a scheduler that exists already."""
+"""Clients of dask: of a local cluster, of jobs of a batch system, or of a scheduler that exists already."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
+from pipeline.compute.addresses import OPTION, Address, SchedulerError, ask, read_address, security_of
+from pipeline.compute.jobqueue import check_means, job_cluster
 from pipeline.compute.local import local_cluster
+from pipeline.compute.probe import check_directory, check_versions
+from pipeline.spec.clusters import QUEUES, Cluster, clock, load_cluster, seconds_of
+from pipeline.spec.problems import SpecError
+
+Echo = Callable[[str], None]
 
 ALLOWED_FAILURES = 3
 """Worker deaths that a task may be blamed for: one would blame innocent tasks."""
 
+LOCAL, IN_PROCESS = "local", "none"
+ADDRESS, CLUSTER_FILE, WAIT = "DASK_SCHEDULER_ADDRESS", "MAGPEND_CLUSTER", "MAGPEND_WAIT_FOR_WORKERS"
+WAIT_FOR_WORKERS = "00:10:00"
+_SAY_EVERY_S, _CONNECT_S = 30.0, 10.0
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where tasks are computed, as people say it.
+
+    Attributes
+    ----------
+    scheduler : str, optional
+        ``local`` for processes of this machine, ``none`` for this process, a scheduler's address or JSON
+        file, or the name of a batch system. By default what ``DASK_SCHEDULER_ADDRESS`` says, else ``local``.
+    cluster_file : Path, optional
+        With the ``[cluster]`` table of a batch system; by default what ``MAGPEND_CLUSTER`` says.
+    dashboard : bool
+        Serve dask's dashboard on loopback, and say where.
+    directory : Path, optional
+        Which all workers must see.
+    """
+
+    scheduler: str | None = None
+    cluster_file: Path | None = None
+    dashboard: bool = False
+    directory: Path | None = None
+
+    @classmethod
+    def of(cls, scheduler: Where | str | None) -> Where:
+        """What a scheduler's name alone says."""
+        return scheduler if isinstance(scheduler, Where) else cls(scheduler)
+
+    def resolved(self) -> Address | Cluster | str:
+        """A scheduler's address, a batch system's jobs, ``local``, or ``none``; nothing is asked or started.
+
+        Raises
+        ------
+        SpecError
+            If what is said means nothing, or cannot be had here.
+        """
+        found = self._resolved()
+        if (
+            self.dashboard
+            and found != IN_PROCESS
+            and not isinstance(found, Address)
+            and not find_spec("bokeh")
+        ):
+            raise SpecError(["--dashboard: needs bokeh; install it: pip install 'magpend[dashboard]'."])
+        return found
+
+    def _resolved(self) -> Address | Cluster | str:
+        wanted = (self.scheduler or "").strip()
+        if wanted.lower() in QUEUES or (not wanted and self.cluster_file is not None):
+            return self._cluster(wanted.lower())
+        if self.cluster_file is not None:
+            raise SpecError([
+                f"--cluster {self.cluster_file}: says what a job of a batch system is, and --scheduler "
+                f"{wanted} asks for none; leave one of them out, or give --scheduler {' or '.join(QUEUES)}."
+            ])  # fmt: skip
+        if wanted.lower() in (LOCAL, IN_PROCESS):
+            return wanted.lower()
+        if wanted:
+            return read_address(wanted, OPTION)
+        inherited = os.environ.get(ADDRESS, "").strip()
+        return read_address(inherited, ADDRESS) if inherited else LOCAL
+
+    def _cluster(self, kind: str) -> Cluster:
+        file = self.cluster_file or os.environ.get(CLUSTER_FILE)
+        if not file:
+            raise SpecError([
+                f"--scheduler {kind}: what is a job? Say it in a file with a [cluster] table and give "
+                f"--cluster FILE, or set {CLUSTER_FILE}; docs/clusters.md has an example."
+            ])  # fmt: skip
+        cluster = load_cluster(file)
+        if kind and cluster.kind != kind:
+            raise SpecError([
+                f"--scheduler {kind}: {file} describes jobs of {cluster.kind}; leave --scheduler out, or "
+                "give another file."
+            ])  # fmt: skip
+        check_means(cluster)
+        return cluster
+
+
+def reach(where: Where) -> None:
+    """Make sure, within seconds, that the scheduler answers, if there should be one already.
+
+    Raises
+    ------
+    SpecError, SchedulerError
+        Saying what is wrong, and the remedy.
+    """
+    target = where.resolved()
+    if isinstance(target, Address):
+        ask(target)
+
 
 @contextlib.contextmanager
-def connected(address: str | None, n_workers: int) -> Iterator[Any]:
-    """Yield a client of the scheduler at `address`, or of a new local cluster."""
+def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]:
+    """Yield a client whose workers are there, have the same programs and see the run directory.
+
+    Parameters
+    ----------
+    where
+        Where tasks are computed; not ``none``.
+    n_workers
+        Processes of a local cluster.
+    echo
+        Prints a line.
+
+    Raises
+    ------
+    SpecError, SchedulerError
+        Before anything is computed.
+    """
     import dask
+
+    target = where.resolved()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}))
+        if isinstance(target, Address):
+            ask(target)
+            client = stack.enter_context(_client(target.url, security_of(target)))
+            _wait(client, target.named, _patience(), echo)
+        elif isinstance(target, Cluster):
+            folder = jobs_folder(where.directory or Path.cwd() / "magpend")
+            jobs = stack.enter_context(job_cluster(target, folder, dashboard=where.dashboard, echo=echo))
+            client = stack.enter_context(_client(jobs, None))
+            _wait(client, f"jobs of {target.kind}", target.wait_s, echo)
+        else:
+            cluster = stack.enter_context(local_cluster(n_workers, dashboard=where.dashboard))
+            client = stack.enter_context(_client(cluster, None))
+        if where.dashboard:
+            echo(f"dashboard: {client.dashboard_link}")
+        if target != LOCAL:
+            _check(client, where.directory)
+        yield client
+
+
+def jobs_folder(directory: Path) -> Path:
+    """Where a run's batch scripts, and what its jobs say, are kept: beside its directory."""
+    return directory.absolute().with_name(f"{directory.absolute().name}.jobs")
+
+
+def _client(scheduler: Any, security: Any) -> Any:
     from distributed import Client
 
-    settings = {"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(settings))
-        if address is None:
-            address = stack.enter_context(local_cluster(n_workers))
-        yield stack.enter_context(Client(address, set_as_default=False))  # type: ignore[no-untyped-call]
+    keys = {} if security is None else {"security": security}
+    return Client(scheduler, set_as_default=False, timeout=_CONNECT_S, **keys)  # type: ignore[no-untyped-call]
+
+
+def _patience() -> int:
+    """How long to wait for workers of a scheduler that exists [s]."""
+    text = os.environ.get(WAIT) or WAIT_FOR_WORKERS
+    try:
+        return seconds_of(text)
+    except ValueError as error:
+        raise SpecError([f"{WAIT} = {error}"]) from None
+
+
+def _wait(client: Any, name: str, patience_s: int, echo: Echo) -> None:
+    """Wait for the first worker, and say so."""
+    started = said = time.monotonic()
+    first = True
+    while not _workers(client):
+        now = time.monotonic()
+        if now - started > patience_s:
+            raise SchedulerError(
+                f"{name}: no worker came within {clock(patience_s)}, so nothing was computed; start workers "
+                "(dask worker ADDRESS), look at what the jobs say, or wait longer (docs/clusters.md)."
+            )
+        if first or now - said >= _SAY_EVERY_S:
+            so_far = "" if first else f", {now - started:.0f} s so far"
+            echo(f"{name}: no workers yet; waiting up to {clock(patience_s)}{so_far}")
+            first, said = False, now
+        time.sleep(0.2)
+
+
+def _workers(client: Any) -> list[str]:
+    return list(client.scheduler_info(n_workers=-1)["workers"])
+
+
+def _check(client: Any, directory: Path | None) -> None:
+    workers = _workers(client)
+    check_versions(client, workers)
+    if directory is not None:
+        check_directory(client, workers, directory)

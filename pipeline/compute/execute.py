@@ -10,14 +10,12 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from pipeline.compute.clients import connected
+from pipeline.compute.clients import IN_PROCESS, Where, connected
 
 Task = Callable[[int], dict[str, Any]]
 
 WINDOW = 3
 """Tasks in flight per worker thread."""
-
-IN_PROCESS = "none"
 
 
 class TaskFailedError(Exception):
@@ -29,13 +27,13 @@ def default_workers() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def scheduler_address(scheduler: str | None) -> str | None:
-    """Return the scheduler to connect to: the given one, or that of the environment."""
-    return scheduler or os.environ.get("DASK_SCHEDULER_ADDRESS") or None
-
-
 def run_tasks(
-    task: Task, indices: Sequence[int], *, workers: int | None = None, scheduler: str | None = None
+    task: Task,
+    indices: Sequence[int],
+    *,
+    workers: int | None = None,
+    scheduler: Where | str | None = None,
+    echo: Callable[[str], None] = print,
 ) -> Iterator[dict[str, Any]]:
     """Run `task` for every index and yield the results as they come.
 
@@ -48,20 +46,23 @@ def run_tasks(
     workers
         Processes of the local cluster; 0 runs in this process.
     scheduler
-        ``"none"`` runs in this process; an address such as ``tcp://host:8786`` uses that scheduler;
-        None looks at ``DASK_SCHEDULER_ADDRESS``, then starts a local cluster.
+        Where; a text stands for ``Where(text)``.
+    echo
+        Prints a line.
 
     Raises
     ------
+    SpecError, SchedulerError
+        Before anything is computed, if there are no such workers.
     TaskFailedError
         As soon as a task fails; tasks in flight are given up.
     """
-    address = scheduler_address(scheduler)
-    if address == IN_PROCESS or workers == 0:
+    where = Where.of(scheduler)
+    if where.resolved() == IN_PROCESS or workers == 0:
         yield from _in_process(task, indices)
         return
     n_workers = min(workers or default_workers(), len(indices))
-    with connected(address, n_workers) as client:
+    with connected(where, n_workers, echo) as client:
         yield from _window(client, task, indices)
 
 

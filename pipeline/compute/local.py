@@ -12,7 +12,7 @@ from typing import Any
 
 
 @contextlib.contextmanager
-def local_cluster(n_workers: int) -> Iterator[Any]:
+def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
     """Yield a cluster of single-threaded processes, reachable from this machine alone."""
     from distributed import LocalCluster
 
@@ -25,7 +25,7 @@ def local_cluster(n_workers: int) -> Iterator[Any]:
             host="127.0.0.1",
             # The scheduler serves HTTP even without a dashboard: by default at port 8787, with a
             # warning if another run is there.
-            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+            scheduler_kwargs={"dashboard": dashboard, "dashboard_address": "127.0.0.1:0"},
             local_directory=scratch,
             silence_logs=50,
         ) as cluster,

@@ -17,7 +17,7 @@ from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable, flag_attrs
 
-FORMAT = 2
+FORMAT = 3
 """Version of the run directory's layout."""
 
 REFINEMENT = 1

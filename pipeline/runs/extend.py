@@ -208,6 +208,8 @@ def extend(
     products: Mapping[str, Mapping[str, Any]] | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
+    cluster: str | Path | None = None,
+    dashboard: bool = False,
     echo: Echo = print,
 ) -> State:
     """Widen a run, with every cell that is computed already.
@@ -237,7 +239,7 @@ def extend(
         Kept sections.
     products
         Products to compute besides, with their options: ``{"lyapunov": {}}``.
-    workers, scheduler, echo
+    workers, scheduler, cluster, dashboard, echo
         As for `pipeline.runs.run.run`.
 
     Returns
@@ -252,21 +254,25 @@ def extend(
     Exception
         As `pipeline.runs.run.run`.
     """
+    from pipeline.compute.clients import Where
+
     widening = Widening(axes or {}, starts, keep, products or {})
     directory = local_path(source)
     in_place = out is None or local_path(out).absolute() == directory.absolute()
-    how: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "echo": echo}
+    built = _beside(directory) if in_place else local_path(str(out))
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, built)
+    where.resolved()
+    how: dict[str, Any] = {"workers": workers, "where": where, "echo": echo}
     if in_place:
         _finish_exchange(directory, echo)
     extension = plan_extension((directory, *also), spec, widening)
     if not in_place:
-        return _build(extension, local_path(str(out)), **how)
+        return _build(extension, built, **how)
     first = Run.open(directory)
     if extension.digest == first.info.digest:
         return _as_it_is(first, echo)
     _refuse_loss(first, extension.spec)
     with writer_lock(directory):
-        built = _beside(directory)
         _build(extension, built, **how)
         _exchange(directory, built, echo)
     return state(directory)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import origin
 from pipeline.layout.domains import check_starts
@@ -25,6 +25,9 @@ from pipeline.store.errors import IncompleteError
 from pipeline.store.files import local_path, writer_lock
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
+
+if TYPE_CHECKING:
+    from pipeline.compute.clients import Where
 
 Echo = Callable[[str], None]
 Sources = Sequence[tuple[str, str]]
@@ -54,6 +57,8 @@ def run(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
+    cluster: str | Path | None = None,
+    dashboard: bool = False,
     smoke: bool = False,
     echo: Echo = print,
 ) -> State:
@@ -68,8 +73,10 @@ def run(
         Path of a TOML file, or the name of a shipped workflow.
     out
         Run directory; by default ``runs/<name>``.
-    workers, scheduler
+    workers
         See `execute.run_tasks`.
+    scheduler, cluster, dashboard
+        See `clients.Where`.
     smoke
         Take the small size of the specification's ``[smoke]`` table.
     echo
@@ -84,6 +91,8 @@ def run(
     ------
     SpecError, RefusedError, LockedError
         Before anything is created or changed.
+    addresses.SchedulerError
+        If a scheduler or its workers cannot be used; nothing was computed.
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
@@ -93,11 +102,15 @@ def run(
     InterruptedRunError
         After Ctrl-C or SIGTERM. What was committed stays.
     """
+    from pipeline.compute.clients import Where
+
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     directory = local_path(out) if out is not None else default_directory(path, smoke)
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, directory)
+    where.resolved()
     check_starts(parsed)
-    carry_out(parsed, path.read_text("utf-8"), directory, workers=workers, scheduler=scheduler, echo=echo)
+    carry_out(parsed, path.read_text("utf-8"), directory, workers=workers, where=where, echo=echo)
     return state(directory)
 
 
@@ -106,9 +119,9 @@ def carry_out(
     text: str,
     directory: Path,
     *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    echo: Echo = print,
+    workers: int | None,
+    where: Where,
+    echo: Echo,
     sources: Sources = (),
 ) -> None:
     """Run a specification, or what is missing of it, in a directory.
@@ -117,8 +130,10 @@ def carry_out(
     ----------
     spec, text
         It, and the TOML text that it was read from.
-    directory, workers, scheduler, echo
+    directory, workers, echo
         As for `run`.
+    where
+        Where tasks are computed.
     sources
         Runs from which cells that they hold are taken, see `pipeline.runs.extend`.
 
@@ -133,7 +148,7 @@ def carry_out(
     with writer_lock(directory):
         info = establish(directory, spec, plan, identity, text, echo)
         with stoppable(directory):
-            _complete(info, spec, plan, workers, scheduler, echo, sources)
+            _complete(info, spec, plan, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
@@ -148,12 +163,12 @@ def _complete(
     spec: Spec,
     plan: Plan,
     workers: int | None,
-    scheduler: str | None,
+    where: Where,
     echo: Echo,
     sources: Sources = (),
 ) -> None:
     """Compute all tasks without a valid commit record."""
-    from pipeline.compute import execute, task
+    from pipeline.compute import clients, execute, task
 
     commits = read_commits(info, plan, echo)
     sweep(info, commits, echo)
@@ -165,6 +180,7 @@ def _complete(
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )
+    clients.reach(where)
     report("compiling the kernel", 0, 0)
     seconds = task.warm_up(spec)
     if seconds > 1:
@@ -178,7 +194,7 @@ def _complete(
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
     terminal = sys.stdout.isatty()
     with Progress(plan.n_cells, before, terminal=terminal, echo=echo, expected_s=expected_s) as progress:
-        for result in execute.run_tasks(job, missing, workers=workers, scheduler=scheduler):
+        for result in execute.run_tasks(job, missing, workers=workers, scheduler=where, echo=echo):
             log_timing(info.directory, {**result, "at_s": round(time.perf_counter() - started, 4)})
             progress.add(result["cells"])
     _require_all(info, plan)

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import zarr
 
-from pipeline.store.errors import DamagedError
-from pipeline.store.files import CUBE, problems_of
 from pipeline.store.run import Run
 from pipeline.store.view import committed_view
 
@@ -24,13 +22,5 @@ def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarr
     KeyError
         If the task is not committed.
     """
-    names = list(names)
-    commit = run.commits[index]
-    objects = {key: entry for key, entry in commit.objects.items() if key.partition("/")[0] in names}
-    problems = problems_of(run.directory / CUBE, objects)
-    if problems:
-        raise DamagedError(
-            f"{run.directory}: task {index}: {problems[0]}; look with: magpend verify {run.directory}"
-        )
-    group: Any = zarr.open_group(committed_view(run.info, {index: commit}), mode="r")
+    group: Any = zarr.open_group(committed_view(run.info, {index: run.commits[index]}, check=True), mode="r")
     return {name: np.asarray(group[name][run.plan.task(index)]) for name in names}

@@ -22,7 +22,7 @@ import numpy as np
 import zarr
 from zarr.storage import LocalStore
 
-from pipeline.layout.identity import canonical, digest_of
+from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import Plan
 from pipeline.store.files import (
     COMMITS,
@@ -38,6 +38,7 @@ from pipeline.store.files import (
     write_atomically,
 )
 from pipeline.store.runfile import RunInfo
+from pipeline.store.seal import seal, unseal
 
 Echo = Callable[[str], None]
 
@@ -87,7 +88,7 @@ def write_task(
         "status": dict(counts),
         "objects": {key: object_entry(cube / key) for key in objects},
     }
-    write_atomically(marker_path(info.directory, index), canonical(record))
+    write_atomically(marker_path(info.directory, index), record_text(record))
 
 
 def write_block(cube: Path, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
@@ -120,6 +121,11 @@ def chunk_keys(
         return [f"{name}/c"]
     grid = np.stack(np.meshgrid(*places, indexing="ij"), axis=-1).reshape(-1, len(places))
     return [f"{name}/c." + ".".join(map(str, place)) for place in grid]
+
+
+def record_text(record: Mapping[str, Any]) -> str:
+    """A commit record as it is stored: one line, the same for equal records, under its own checksum."""
+    return seal(json.dumps(record, sort_keys=True, allow_nan=False, ensure_ascii=False))
 
 
 def marker_path(directory: Path, index: int) -> Path:
@@ -198,19 +204,16 @@ def _read_record(path: Path, info: RunInfo, plan: Plan) -> Commit | str:
     except FileNotFoundError:
         return ""
     try:
-        data = json.loads(content)
+        data = unseal(content)
         commit = Commit(int(data["task"]), dict(data["status"]), dict(data["objects"]))
-        complete = bool(commit.objects) and all(
-            isinstance(e["size"], int) and isinstance(e["sha256"], str) for e in commit.objects.values()
-        )
         digest = data["digest"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return "torn or damaged"
     if digest != info.digest:
         return "of another run"
     named = 0 <= commit.task < plan.n_tasks and path.name == marker_path(info.directory, commit.task).name
     inside = all(key.partition("/")[0] in {v.name for v in plan.variables} for key in commit.objects)
-    return commit if complete and named and inside and not _climbs(commit) else "torn or damaged"
+    return commit if named and inside and not _climbs(commit) else "torn or damaged"
 
 
 def _climbs(commit: Commit) -> bool:

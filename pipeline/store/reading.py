@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def open_run(path: str | Path | Run, *, chunks: Any = None) -> xr.Dataset:
+def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
     """Open a run directory; nothing but coordinates is read until it is used.
 
     Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. What is committed
@@ -30,6 +30,9 @@ def open_run(path: str | Path | Run, *, chunks: Any = None) -> xr.Dataset:
     chunks
         As in `xarray.open_zarr`: None indexes lazily and loads what is selected; ``{}`` makes dask
         arrays in the chunks of the store, for cubes larger than the memory.
+    check
+        Whether every chunk is compared with the sha256 in its commit record when it is read. By default it
+        is, unless the environment has ``MAGPEND_VERIFY=0``.
 
     Returns
     -------
@@ -43,21 +46,22 @@ def open_run(path: str | Path | Run, *, chunks: Any = None) -> xr.Dataset:
     RefusedError
         If there is no run in `path`.
     DamagedError
-        If ``run.json``, metadata or coordinates are not what was written.
+        If ``run.json``, metadata or coordinates are not what was written; where a cell is used later, if
+        its chunk is missing or is not what was written.
 
     Examples
     --------
     >>> ds = open_run("runs/quickstart")                                    # doctest: +SKIP
     >>> ds.section.isel(state=0).sel(frequency=2.2, method="nearest")       # doctest: +SKIP
     """
-    return Run.open(path).cube(chunks)
+    return Run.open(path).cube(chunks, check=check)
 
 
-def cube_of(run: Run, *, chunks: Any = None) -> xr.Dataset:
+def cube_of(run: Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
     """The cube of an opened run, showing what its commits vouch for."""
     import xarray as xr
 
-    view: Any = committed_view(run.info, run.commits)
+    view: Any = committed_view(run.info, run.commits, check=check)
     ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
     ds = ds[[v.name for v in run.plan.variables]]
     words = {str(name): _texts(ds[name]) for name in ds.coords if ds[name].dtype.kind not in "biuf"}

@@ -93,8 +93,8 @@ class Run:
         """Digest of the committed cells."""
         return cube_digest(self.info, self.commits)
 
-    def cube(self, chunks: Any = None) -> xr.Dataset:
+    def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
         """Open the cube, as `pipeline.open_run` does."""
         from pipeline.store.reading import cube_of
 
-        return cube_of(self, chunks=chunks)
+        return cube_of(self, chunks=chunks, check=check)

@@ -15,6 +15,7 @@ from pipeline.spec.recorded import is_whole
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, is_there, local_path, unreadable, write_atomically
 from pipeline.store.provenance import provenance, versions
+from pipeline.store.seal import CHECKSUM, fits, has_seal, seal
 
 
 @dataclass(frozen=True)
@@ -75,20 +76,28 @@ def read_run(directory: str | Path) -> RunInfo:
         content = path.read_bytes()
     try:
         data = json.loads(content)
-        found = data["identity"]["format"]
-        if isinstance(found, (int, float)) and found != FORMAT:
-            raise RefusedError(
-                f"{path}: format {found:g}, and this magpend reads {FORMAT}; read it with the version that "
-                f"made it ({data['versions'].get('magpend', 'not named')}), or run its specification "
-                "into another directory."
-            )
-        info = RunInfo(directory=directory, **data)
-        fits = digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
+        _refuse_format(path, data, content)
+        whole = fits(content) and data.pop(CHECKSUM) is not None
+        info = RunInfo(directory=directory, **data) if whole else None
+        whole = (
+            info is not None and digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
+        )
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DamagedError(f"{path}: damaged ({error}); {_remedy(directory)}") from None
-    if not fits:
-        raise DamagedError(f"{path}: damaged (its digest does not fit); {_remedy(directory)}")
+    if info is None or not whole:
+        raise DamagedError(f"{path}: damaged (its checksum does not fit); {_remedy(directory)}")
     return info
+
+
+def _refuse_format(path: Path, data: Mapping[str, Any], content: bytes) -> None:
+    """Refuse another format, unless the number is what is damaged: the file then contradicts its checksum."""
+    found = data["identity"]["format"]
+    if isinstance(found, (int, float)) and found != FORMAT and (fits(content) or not has_seal(content)):
+        raise RefusedError(
+            f"{path}: format {found:g}, and this magpend reads {FORMAT}; read it with the version that "
+            f"made it ({data['versions'].get('magpend', 'not named')}), or run its specification "
+            "into another directory."
+        )
 
 
 def _remedy(directory: Path) -> str:
@@ -117,6 +126,6 @@ def write_run(
         "skeleton": skeleton,
     }
     # not sorted: the order of the axes is that of the cube's dims
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    write_atomically(directory / RUN_FILE, text)
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+    write_atomically(directory / RUN_FILE, seal(text))
     return read_run(directory)

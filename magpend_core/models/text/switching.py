@@ -144,6 +144,8 @@ class Sides:
             return side if node.op == "sign" else g.mul(side, args[0])
         yes, no = args[-2:] if node.op != "maximum" else args[::-1]
         a, b = (self._surface[arg.number] for arg in node.args[:2])
+        if node.op == "less" and not _moves(g.sub(args[1], args[0])):
+            return plain  # of sides alone: they may be equal for a while, and then neither is less
         value, written = g.sub(b, a), g.sub(node.args[1], node.args[0])
         side = self.side(value, g.sub(args[1], args[0]), node.op == "less", more, _plain(value, written))
         return plain if side is None else g.choice(side, yes, no)
@@ -160,8 +162,9 @@ class Sides:
             return self.side(value.args[1], rewritten, jumps, more, written)
         if keeps_sign(g, value):
             return g.one
-        if not any(n.op in ("state", "time") for n in in_order([rewritten])):
-            return g.call("sign", rewritten)
+        if not _moves(rewritten):  # of sides alone: it may be 0 for a while
+            below = g.where_less(rewritten, g.zero, g.number(-1.0), g.zero)
+            return g.where_less(g.zero, rewritten, g.one, below)
         for switch in self.switches:
             if switch.value is value:
                 switch.jumps = switch.jumps or jumps
@@ -250,6 +253,18 @@ class Sides:
         for rank in ranks[1:]:
             found = self.graph.call("minimum", found, rank)
         return found
+
+
+def _moves(rewritten: Node) -> bool:
+    """Whether an expression changes between its jumps."""
+    moves: dict[int, bool] = {}
+    for node in in_order([rewritten]):
+        if node.op in ("square", "sign", "floor"):
+            moves[node.number] = False
+        else:
+            args = node.args[2:] if node.op == "less" else node.args
+            moves[node.number] = node.op in ("state", "time") or any(moves[a.number] for a in args)
+    return moves[rewritten.number]
 
 
 def _plain(value: Node, written: Node) -> Node | None:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
 
 import pytest
 
+from pipeline import open_run
 from pipeline.compute import exponents, task
+from pipeline.compute.execute import TaskFailedError
+from pipeline.runs import extend as extending
 from pipeline.runs.extend import extend
 from pipeline.runs.run import run
 from pipeline.spec.problems import SpecError
 from pipeline.store.errors import RefusedError
+from pipeline.store.run import Run
 
 BASE = """
 kind = "sweep"
@@ -184,3 +191,128 @@ def test_extend__says_why_nothing_is_taken(tmp_path, write_spec):
     with pytest.raises(SpecError, match="nothing to change"):
         extend(tmp_path / "old", None, tmp_path / "new", echo=silent)
     assert not (tmp_path / "new").exists()
+
+
+LONGER = BASE.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7")
+
+
+@pytest.fixture
+def place(tmp_path, write_spec, count):
+    """A finished run, a wider specification, and a fresh run of that."""
+    run(write_spec(BASE, "old.toml"), tmp_path / "runs" / "mine", workers=0, echo=silent)
+    wide = write_spec(LONGER, "new.toml")
+    run(wide, tmp_path / "fresh", workers=0, echo=silent)
+    count.cells = 0
+    return tmp_path / "runs" / "mine", wide, tmp_path / "fresh"
+
+
+def test_in_place__the_old_run_stays_beside(place, bytes_of, count):
+    mine, wide, fresh = place
+    before = bytes_of(mine)
+    assert extend(mine, wide, workers=0, echo=silent).directory == mine
+    assert bytes_of(mine) == bytes_of(fresh)
+    assert bytes_of(mine.with_name("mine.before")) == before
+    assert sorted(p.name for p in mine.parent.iterdir()) == ["mine", "mine.before"]
+    lines = []
+    extend(mine, wide, workers=0, echo=lines.append)
+    assert lines == [f"{mine} holds all this already; nothing to do."]
+    assert count.cells == 10
+
+
+@pytest.mark.parametrize("crash", ["cells", "first rename", "second rename"])
+def test_in_place__the_same_command_goes_on(place, bytes_of, monkeypatch, count, crash):
+    mine, wide, fresh = place
+    before = bytes_of(mine)
+    calls = []
+
+    def fail_at(n, original):
+        def call(*words, **options):
+            calls.append(1)
+            if len(calls) == n:
+                raise OSError("the power went")
+            return original(*words, **options)
+
+        return call
+
+    with monkeypatch.context() as broken:
+        if crash == "cells":
+            broken.setattr(task, "write_task", fail_at(4, task.write_task))
+        else:
+            n = 1 if crash == "first rename" else 2
+            broken.setattr(extending, "sync_folder", fail_at(n, extending.sync_folder))
+        with pytest.raises((OSError, TaskFailedError), match="the power went"):
+            extend(mine, wide, workers=0, echo=silent)
+    assert bytes_of(mine if crash == "cells" else mine.with_name("mine.before")) == before
+    extend(mine, wide, workers=0, echo=silent)
+    assert bytes_of(mine) == bytes_of(fresh)
+    assert bytes_of(mine.with_name("mine.before")) == before
+    assert not mine.with_name("mine.extending").exists()
+    if crash != "cells":
+        assert count.cells == 10
+
+
+def test_in_place__nothing_is_lost(place, write_spec):
+    mine, *_ = place
+    moved = write_spec(BASE.replace("start = 0.10, stop = 0.14", "start = 0.12, stop = 0.16"), "moved.toml")
+    with pytest.raises(RefusedError, match="10 of its cells would not be in the wider run"):
+        extend(mine, moved, echo=silent)
+    assert [p.name for p in mine.parent.iterdir()] == ["mine"]
+
+
+def test_incomplete__what_is_committed_is_taken(place, tmp_path, monkeypatch, bytes_of, count):
+    mine, wide, fresh = place
+    for record in sorted((mine / "commits").iterdir())[:2]:
+        record.unlink()
+    lines = []
+    extend(mine, wide, tmp_path / "new", workers=0, echo=lines.append)
+    assert f"{mine}: is not complete; 15 of 25 cells are committed, and these alone are taken" in lines
+    assert f"15 of 35 cells are taken from {mine}" in lines
+    assert count.cells == 20
+    assert bytes_of(tmp_path / "new") == bytes_of(fresh)
+
+
+def test_kill__extended_run_has_the_same_bytes(place, start, tmp_path, bytes_of):
+    mine, wide, fresh = place
+    process = start("extend", mine, wide, "--out", "new", "--workers", 2)
+    while process.poll() is None and not list((tmp_path / "new" / "commits").glob("0*.json")):
+        time.sleep(0.002)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    extend(mine, wide, tmp_path / "new", workers=0, echo=silent)
+    assert bytes_of(tmp_path / "new") == bytes_of(fresh)
+
+
+def test_command__says_what_is_taken(place, main, bytes_of, tmp_path):
+    mine, _, fresh = place
+    words = ("extend", mine, "--axis", "frequency=0.1:0.16:7")
+    code, out, err = main(*words, "--dry-run")
+    assert code == 0, err
+    assert f"25 of 35 cells are taken from {mine}\n10 cells are left to integrate\n" in out
+    assert "time: about" in out
+    assert [p.name for p in mine.parent.iterdir()] == ["mine"]
+    code, out, err = main(*words, "--workers", 0)
+    assert code == 0, err
+    assert f"the run as it was lies in {mine}.before" in err
+    assert open_run(mine).section.equals(open_run(fresh).section)
+    # the text that was written is a specification like any other
+    text = tmp_path / "again.toml"
+    text.write_text(Run.open(mine).info.spec_text)
+    run(text, tmp_path / "again", workers=0, echo=silent)
+    assert bytes_of(tmp_path / "again") == bytes_of(mine)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--axis", "frequency=1:2"], "must be NAME=LOW:HIGH:NUM"),
+        (["--axis", "q=1:2:3"], "unknown axis"),
+        (["--product", "lyapunov=3"], "must be NAME or NAME="),
+        (["--product", "liapunov"], "did you mean lyapunov"),
+        (["--starts", "9"], "not random samples; widen a state's range"),
+        ([], "nothing to change"),
+    ],
+)
+def test_command__refuses(place, main, words, message):
+    code, _, err = main("extend", place[0], *words)
+    assert code == 2
+    assert message in err

@@ -264,7 +264,7 @@ def test_local_cluster__listens_on_loopback_only():
 
     from pipeline.compute import clients
 
-    with clients.connected(None, 1) as client:
+    with clients.connected(clients.Where("local"), 1) as client:
         assert len(client.nthreads()) == 1
         processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
         listening = {

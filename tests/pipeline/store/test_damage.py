@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 from pathlib import Path
@@ -24,6 +25,7 @@ from pipeline.store.commits import marker_path, read_commits, sweep
 from pipeline.store.errors import DamagedError, IncompleteError, RefusedError, UnreadableError
 from pipeline.store.files import local_path
 from pipeline.store.run import Run
+from pipeline.store.seal import seal, unseal
 from pipeline.store.setup import check, create, establish
 from pipeline.store.skeleton import skeleton_files
 
@@ -303,15 +305,11 @@ def test_rebuild__keeps_only_what_fits_its_record(whole):
 
 def test_rebuild__files_worded_by_another_version(whole):
     """Where the metadata come out otherwise, repair leaves them; a run writes them and their digests anew."""
-    import json
-
-    from pipeline.layout.identity import canonical
-
     directory = whole.info.directory
-    data = json.loads((directory / "run.json").read_text())
+    data = unseal((directory / "run.json").read_bytes())
     metadata = directory / "cube.zarr/q/zarr.json"
     data["skeleton"]["q/zarr.json"] = {"size": 1, "sha256": "0" * 64}
-    (directory / "run.json").write_text(canonical(data))
+    (directory / "run.json").write_text(seal(json.dumps(data)))
     found = verify_run(directory, repair=True)
     assert found.skeleton == ["q/zarr.json: its content has changed"]
     assert "another version" in describe(found, directory, repaired=True)[-1]
@@ -369,10 +367,12 @@ def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
 
 def test_read_run__another_format(whole):
     path = whole.info.directory / "run.json"
-    path.write_text(path.read_text().replace('"format": 2', '"format": 1'))
+    older = json.loads(path.read_text().replace('"format": 3', '"format": 2'))
+    del older["checksum"]  # format 2 had none
+    path.write_text(json.dumps(older))
     before = everything(whole.info.directory)
     for use in (lambda: open_run(whole.info.directory), lambda: check(whole.info.directory, whole.identity)):
-        with pytest.raises(RefusedError, match=r"format 1, and this magpend reads 2"):
+        with pytest.raises(RefusedError, match=r"format 2, and this magpend reads 3"):
             use()
     assert everything(whole.info.directory) == before
 

@@ -151,6 +151,9 @@ def test_rates__are_what_the_text_says_on_each_side_of_its_corners(text, x, v):
         "where(not x < v, 1, 2)", "where(x < 0 and v < 0, 1, 2)", "where(x < 0 or v < 0, 1, 2)",
         "where(x > 0, sqrt(x), v)", "abs(x)*sign(x - v)", "square(t*f + a, 0.3)", "where(phase < 0.2, x, v)",
         "where(t < 0.2, x, v)", "square(2*t*f + where(x < x, a, x), 0.3)", "where(x >= x, x, v)",
+        "sign(sign(x) - sign(v))*x",
+        "where(sign(v) < square(2*t*f + x, 0.3), x, v)", "where(sign(x) <= sign(v), 1, 2)",
+        "abs(sign(x) - sign(v))",
         "sign(sin(2*pi*f*t) - 0.2)", "abs(cos(6*pi*f*t))*x",
     ],
 )  # fmt: skip

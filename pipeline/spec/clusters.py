@@ -1,0 +1,175 @@
+"""The ``[cluster]`` table: what a job of a batch system is, in a TOML file of its own."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from pipeline.spec.files import read_toml
+from pipeline.spec.problems import SpecError, problems_of, unknown_key
+from pipeline.spec.tables import Table
+
+QUEUES = ("slurm", "pbs", "sge", "lsf")
+"""Batch systems that workers can be asked of."""
+
+_TIME = re.compile(r"(\d{1,4}):([0-5]\d):([0-5]\d)")
+_MEMORY = re.compile(r"(\d+(?:\.\d+)?) ?([kMGT]i?)B")
+_UNITS = {"k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "ki": 2**10, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
+_LEAST_MARGIN_S, _MOST_MARGIN_S = 30, 900
+
+Lines = Annotated[tuple[str, ...], Field(strict=False)]
+
+
+def seconds_of(time: str) -> int:
+    """Seconds of a time such as ``04:00:00``; raises `ValueError` if it is none."""
+    match = _TIME.fullmatch(time)
+    if match is None or not any(map(int, match.groups())):
+        raise ValueError(f"{time!r}: must be hours, minutes and seconds above zero, such as '04:00:00'.")
+    hours, minutes, seconds = map(int, match.groups())
+    return 3600 * hours + 60 * minutes + seconds
+
+
+def clock(seconds: int) -> str:
+    """Write seconds as `seconds_of` reads them."""
+    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
+
+
+class Cluster(Table):
+    """What a job is that holds workers, and how many of them there may be."""
+
+    kind: Literal["slurm", "pbs", "sge", "lsf"] = Field(description="The batch system.")
+    queue: str | None = Field(None, description="Queue, or partition.")
+    account: str | None = Field(None, description="Account, or project, that pays.")
+    cores: int = Field(ge=1, le=4096, description="Cores of a job: one worker process for each.")
+    memory: str = Field(description="Memory of a job, such as '16 GB'.")
+    walltime: str = Field(description="Time after which the batch system ends a job, such as '04:00:00'.")
+    lifetime: str | None = Field(
+        None,
+        description="Time after which workers leave by themselves; by default a tenth before the walltime.",
+    )
+    lifetime_stagger: str | None = Field(
+        None, description="They leave up to so much earlier or later, so that not all do at once."
+    )
+    min_jobs: int = Field(0, ge=0, le=10_000, description="Jobs that are kept, whatever there is to do.")
+    max_jobs: int = Field(1, ge=1, le=10_000, description="Jobs at most.")
+    wait: str = Field("24:00:00", description="How long to wait for the first worker.")
+    prologue: Lines = Field(
+        (), description="Shell lines before the workers start, such as 'module load python'."
+    )
+    directives: Lines = Field(
+        (), description="More lines for the batch system, such as '--constraint=avx512'."
+    )
+    interface: str | None = Field(None, description="Network interface, such as 'ib0'.")
+    scratch: str | None = Field(None, description="Folder of a node's own disk, such as '$TMPDIR'.")
+    python: str | None = Field(None, description="Python on the nodes; by default the one that runs here.")
+
+    @field_validator("walltime", "lifetime", "lifetime_stagger", "wait")
+    @classmethod
+    def _time(cls, value: str | None) -> str | None:
+        if value is not None:
+            seconds_of(value)
+        return value
+
+    @field_validator("memory")
+    @classmethod
+    def _size(cls, value: str) -> str:
+        match = _MEMORY.fullmatch(value)
+        if match is None or not float(match[1]):
+            raise ValueError(f"{value!r}: must be a number and kB, MB, GB or TB, such as '16 GB'.")
+        return value
+
+    @field_validator("queue", "account", "interface", "scratch", "python", "prologue", "directives")
+    @classmethod
+    def _one_line(cls, value: Any) -> Any:
+        for text in (value,) if isinstance(value, str) else value or ():
+            if not text.strip() or not text.isprintable():
+                raise ValueError(f"{text!r}: must be one line of text, and not empty.")
+        return value
+
+    @field_validator("queue", "account", "interface", "python")
+    @classmethod
+    def _one_word(cls, value: str | None) -> str | None:
+        if value is not None and re.search(r"[\s'\"`;|&<>()]", value):
+            raise ValueError(f"{value!r}: must be one word, without blanks, quotes or signs of the shell.")
+        return value
+
+    @model_validator(mode="after")
+    def _fits(self) -> Cluster:
+        problems = []
+        if self.min_jobs > self.max_jobs:
+            problems.append(f"min_jobs = {self.min_jobs}: must be at most max_jobs = {self.max_jobs}.")
+        if self.kind == "sge" and self.cores > 1 and not any("-pe" in line for line in self.directives):
+            problems.append(
+                "directives: with cores above 1, Grid Engine wants a parallel environment; "
+                f"add its line, such as '-pe smp {self.cores}' (its name is your site's: qconf -spl)."
+            )
+        if self.lifetime_s + self.stagger_s >= self.walltime_s:
+            problems.append(
+                f"lifetime = {clock(self.lifetime_s)!r} with lifetime_stagger = {clock(self.stagger_s)!r}: "
+                f"must end before walltime = {self.walltime!r}; leave both out to have them chosen."
+            )
+        if problems:
+            raise ValueError("\n".join(problems))
+        return self
+
+    @property
+    def walltime_s(self) -> int:
+        """Time of a job [s]."""
+        return seconds_of(self.walltime)
+
+    @property
+    def margin_s(self) -> int:
+        """Time between the latest leave of a worker and the end of its job, where it is chosen here [s]."""
+        tenth = self.walltime_s // 10
+        return max(1, min(max(tenth, _LEAST_MARGIN_S), _MOST_MARGIN_S, self.walltime_s // 2))
+
+    @property
+    def lifetime_s(self) -> int:
+        """Time after which a worker leaves [s]."""
+        if self.lifetime is not None:
+            return seconds_of(self.lifetime)
+        return max(1, self.walltime_s - self.margin_s - self.stagger_s)
+
+    @property
+    def stagger_s(self) -> int:
+        """How far the leaves of workers are spread [s]."""
+        if self.lifetime_stagger is not None:
+            return seconds_of(self.lifetime_stagger)
+        return self.margin_s // 3
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory of a job."""
+        match = _MEMORY.fullmatch(self.memory)
+        assert match is not None
+        return int(float(match[1]) * _UNITS[match[2]])
+
+    @property
+    def wait_s(self) -> int:
+        """How long to wait for the first worker [s]."""
+        return seconds_of(self.wait)
+
+
+def load_cluster(path: str | Path) -> Cluster:
+    """Read a file with a ``[cluster]`` table.
+
+    Raises
+    ------
+    SpecError
+        Naming all that is wrong with it.
+    """
+    tables = read_toml(path)
+    if not isinstance(tables.get("cluster"), dict):
+        raise SpecError([f"{path}: has no table [cluster]; docs/clusters.md has an example."])
+    problems = [f"{path}: {unknown_key(name, name, ['cluster'])}" for name in tables if name != "cluster"]
+    try:
+        found = Cluster.model_validate(tables["cluster"])
+    except ValidationError as error:
+        lines = "\n".join(problems_of(error, Cluster, "cluster")).splitlines()
+        problems += [f"{path}: {line.removeprefix('cluster: ')}" for line in lines]
+    if problems:
+        raise SpecError(problems)
+    return found
