@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -239,7 +238,7 @@ def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
     """
     runs = []
     for place, expected in sources:
-        run = Run.open(Path(place))
+        run = Run.open(place)
         if run.info.digest != expected:
             raise RefusedError(f"{place}: another run stands there than when its cells were looked up.")
         runs.append(run)

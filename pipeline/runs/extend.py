@@ -29,15 +29,8 @@ from pipeline.runs.zoom import to_toml
 from pipeline.spec.parsing import Spec, load_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.errors import RefusedError
-from pipeline.store.files import (
-    EXTENDED,
-    TIMINGS,
-    local_path,
-    sync_folder,
-    unreadable,
-    write_atomically,
-    writer_lock,
-)
+from pipeline.store.files import EXTENDED, TIMINGS, Files, open_files
+from pipeline.store.local import sync_folder
 from pipeline.store.run import Run
 from pipeline.store.runfile import is_run
 
@@ -81,7 +74,7 @@ class Extension:
         yield from self.notes
         n = self.plan.n_cells
         for run, count in zip(self.runs, self.counts, strict=True):
-            yield f"{count} of {n} cells are taken from {run.directory}"
+            yield f"{count} of {n} cells are taken from {run.name}"
         bound = "at most " if self.spec.refine is not None else ""
         yield f"{bound}{n - self.reused} cells are left to integrate"
 
@@ -137,7 +130,7 @@ def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, 
         wide, origin = widened(parsed, widening), f"specification {path.name}"
     else:
         wide = widened(run.spec, widening)
-        origin = f"run {run.directory.resolve().name}, digest {run.info.digest}"
+        origin = f"run {Path(run.info.files.place).name}, digest {run.info.digest}"
     return wide, f"# Extended. Derived from {_printable(origin)}.\n{to_toml(wide)}"
 
 
@@ -153,13 +146,13 @@ def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tu
     for run in runs:
         lines = obstacles(run, wide, identity)
         if lines:
-            notes.append(f"{run.directory}: none of its cells can be taken ({'; '.join(lines)})")
+            notes.append(f"{run.name}: none of its cells can be taken ({'; '.join(lines)})")
             continue
         fitting.append(run)
         if not run.complete:
             done = sum(run.plan.cells_in(i) for i in run.commits)
             notes.append(
-                f"{run.directory}: is not complete; {done} of {run.plan.n_cells} cells are committed, and "
+                f"{run.name}: is not complete; {done} of {run.plan.n_cells} cells are committed, and "
                 "these alone are taken"
             )
     return fitting, notes
@@ -180,8 +173,8 @@ def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
 def _strangers(run: Run, wide: Spec) -> list[str]:
     """Why a run that fits has no cell of the wider one."""
     if not run.commits:
-        return [f"{run.directory}: nothing of it is committed"]
-    return [f"{run.directory}: {line}" for line in apart(run.spec, wide)]
+        return [f"{run.name}: nothing of it is committed"]
+    return [f"{run.name}: {line}" for line in apart(run.spec, wide)]
 
 
 def describe_extension(extension: Extension, *, workers: int | None = None) -> Iterator[str]:
@@ -257,57 +250,64 @@ def extend(
     from pipeline.compute.clients import Where
 
     widening = Widening(axes or {}, starts, keep, products or {})
-    directory = local_path(source)
-    in_place = out is None or local_path(out).absolute() == directory.absolute()
-    built = _beside(directory) if in_place else local_path(str(out))
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, built)
+    first = open_files(source)
+    in_place = out is None or open_files(out).place == first.place
+    built = open_files(_beside(_folder(first)) if in_place else str(out))
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, built.local)
     where.resolved()
     how: dict[str, Any] = {"workers": workers, "where": where, "echo": echo}
     if in_place:
-        _finish_exchange(directory, echo)
-    extension = plan_extension((directory, *also), spec, widening)
+        _finish_exchange(_folder(first), echo)
+    extension = plan_extension((source, *also), spec, widening)
     if not in_place:
         return _build(extension, built, **how)
-    first = Run.open(directory)
-    if extension.digest == first.info.digest:
-        return _as_it_is(first, echo)
-    _refuse_loss(first, extension.spec)
-    with writer_lock(directory):
+    old = Run.open(first)
+    if extension.digest == old.info.digest:
+        return _as_it_is(old, echo)
+    _refuse_loss(old, extension.spec)
+    with first.lock():
         _build(extension, built, **how)
-        _exchange(directory, built, echo)
-    return state(directory)
+        _exchange(_folder(first), _folder(built), echo)
+    return state(first)
 
 
-def _build(extension: Extension, directory: Path, *, echo: Echo, **how: Any) -> State:
+def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> State:
     """Make the wider run in a directory of its own, or go on with it."""
     for line in extension.lines():
         echo(line)
-    sources = [(str(run.directory.absolute()), run.info.digest) for run in extension.runs]
-    carry_out(extension.spec, extension.text, directory, echo=echo, sources=sources, **how)
-    _record(extension, directory)
-    return state(directory)
+    sources = [(run.info.files.place, run.info.digest) for run in extension.runs]
+    carry_out(extension.spec, extension.text, files, echo=echo, sources=sources, **how)
+    _record(extension, files)
+    return state(files)
 
 
-def _record(extension: Extension, directory: Path) -> None:
+def _record(extension: Extension, files: Files) -> None:
     """Write down where cells come from; no part of the result."""
     taken: dict[int, int] = {}
-    with contextlib.suppress(FileNotFoundError), unreadable(directory / TIMINGS):
-        for line in (directory / TIMINGS).read_text("utf-8").splitlines():
+    with contextlib.suppress(FileNotFoundError):
+        for line in files.read(TIMINGS).decode().splitlines():
             entry = json.loads(line)
             taken[entry["task"]] = entry.get("reused", 0)
     runs = zip(extension.runs, extension.counts, strict=True)
     content = {
         "sources": [
-            {"directory": str(run.directory.absolute()), "digest": run.info.digest, "cells": count}
+            {"directory": run.info.files.place, "digest": run.info.digest, "cells": count}
             for run, count in runs
         ],
         "cells": extension.plan.n_cells,
         "reused": sum(taken.values()),
     }
-    write_atomically(directory / EXTENDED, canonical(content))
+    files.write(EXTENDED, canonical(content).encode())
 
 
 # ---- in place ----------------------------------------------------------------------------------
+
+
+def _folder(files: Files) -> Path:
+    """The folder of a run, which a wider one can take the place of."""
+    if files.local is None:
+        raise RefusedError(f"{files.name}: is no folder of this machine, which can be renamed; give --out.")
+    return files.local
 
 
 def _beside(directory: Path) -> Path:
@@ -326,11 +326,11 @@ def _aside(directory: Path) -> Path:
 def _as_it_is(run: Run, echo: Echo) -> State:
     if not run.complete:
         raise RefusedError(
-            f"{run.directory}: this is its own specification, and it is not complete; complete it with: "
-            f"magpend run SPEC --out {run.directory}"
+            f"{run.name}: this is its own specification, and it is not complete; complete it with: "
+            f"magpend run SPEC --out {run.name}"
         )
-    echo(f"{run.directory} holds all this already; nothing to do.")
-    return state(run.directory)
+    echo(f"{run.name} holds all this already; nothing to do.")
+    return state(run)
 
 
 def _refuse_loss(run: Run, wide: Spec) -> None:
@@ -343,7 +343,7 @@ def _refuse_loss(run: Run, wide: Spec) -> None:
     what += [f"its product {name}" for name in absent]
     if what:
         raise RefusedError(
-            f"{run.directory}: {' and '.join(what)} would not be in the wider run, which would take its "
+            f"{run.name}: {' and '.join(what)} would not be in the wider run, which would take its "
             "place; give another directory with --out, or a specification that has them all."
         )
 
@@ -361,7 +361,7 @@ def _exchange(directory: Path, built: Path, echo: Echo) -> None:
 def _finish_exchange(directory: Path, echo: Echo) -> None:
     """Rename the finished run if the process was killed between the two renames of an exchange."""
     built = _beside(directory)
-    if directory.exists() or not is_run(built):
+    if directory.exists() or not is_run(open_files(built)):
         return
     if not state(built).complete:
         raise RefusedError(f"{directory}: is not there, and {built} is not complete; put one in its place.")

@@ -22,7 +22,7 @@ from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
 from pipeline.store.commits import log_timing, read_commits, sweep
 from pipeline.store.errors import IncompleteError
-from pipeline.store.files import local_path, writer_lock
+from pipeline.store.files import Files, open_files
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
 
@@ -96,7 +96,9 @@ def run(
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
-        If a task failed. What was committed stays.
+        If tasks failed twice. All others are committed.
+    ConnectionError
+        If the scheduler is gone. What was committed stays.
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
@@ -106,31 +108,33 @@ def run(
 
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
-    directory = local_path(out) if out is not None else default_directory(path, smoke)
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, directory)
+    files = open_files(out if out is not None else default_directory(path, smoke))
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.local)
     where.resolved()
     check_starts(parsed)
-    carry_out(parsed, path.read_text("utf-8"), directory, workers=workers, where=where, echo=echo)
-    return state(directory)
+    carry_out(parsed, path.read_text("utf-8"), files, workers=workers, where=where, echo=echo)
+    return state(files)
 
 
 def carry_out(
     spec: Spec,
     text: str,
-    directory: Path,
+    files: Files,
     *,
     workers: int | None,
     where: Where,
     echo: Echo,
     sources: Sources = (),
 ) -> None:
-    """Run a specification, or what is missing of it, in a directory.
+    """Run a specification, or what is missing of it, in a run directory.
 
     Parameters
     ----------
     spec, text
         It, and the TOML text that it was read from.
-    directory, workers, echo
+    files
+        Those of the run directory.
+    workers, echo
         As for `run`.
     where
         Where tasks are computed.
@@ -144,10 +148,10 @@ def carry_out(
     """
     plan = make_plan(spec)
     identity = identity_here(spec, plan)
-    check(directory, identity)
-    with writer_lock(directory):
-        info = establish(directory, spec, plan, identity, text, echo)
-        with stoppable(directory):
+    check(files, identity)
+    with files.lock():
+        info = establish(files, spec, plan, identity, text, echo)
+        with stoppable(files.name):
             _complete(info, spec, plan, workers, where, echo, sources)
 
 
@@ -174,7 +178,7 @@ def _complete(
     sweep(info, commits, echo)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
-        echo(f"{info.directory} is complete; nothing to do.")
+        echo(f"{info.name} is complete; nothing to do.")
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
     echo(
@@ -185,8 +189,7 @@ def _complete(
     seconds = task.warm_up(spec)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
-    place = str(info.directory.absolute())
-    job = partial(task.run_task, place, info.digest, origin=origin(spec.model))
+    job = partial(task.run_task, info.files.place, info.digest, origin=origin(spec.model))
     if sources:
         job = partial(job, sources=tuple(sources))
     started = time.perf_counter()
@@ -194,8 +197,16 @@ def _complete(
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
     terminal = sys.stdout.isatty()
     with Progress(plan.n_cells, before, terminal=terminal, echo=echo, expected_s=expected_s) as progress:
-        for result in execute.run_tasks(job, missing, workers=workers, scheduler=where, echo=echo):
-            log_timing(info.directory, {**result, "at_s": round(time.perf_counter() - started, 4)})
+        results = execute.run_tasks(
+            job,
+            missing,
+            seconds=lambda i: plan.cells_in(i) * plan.seconds_per_cell,
+            workers=workers,
+            scheduler=where,
+            echo=echo,
+        )
+        for result in results:
+            log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
             progress.add(result["cells"])
     _require_all(info, plan)
 
@@ -208,14 +219,14 @@ def _require_all(info: RunInfo, plan: Plan) -> None:
     if absent:
         why = f" {problems[0]}." if problems else ""
         raise IncompleteError(
-            f"{info.directory}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
+            f"{info.name}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
             "and have room to write; then give the same command again: it computes these tasks alone."
         )
 
 
 @contextlib.contextmanager
-def stoppable(directory: Path) -> Iterator[None]:
+def stoppable(directory: str | Path) -> Iterator[None]:
     """Turn Ctrl-C and SIGTERM into `InterruptedRunError`, after everything inside has been closed.
 
     Parameters

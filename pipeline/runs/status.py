@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.layout.plan import Plan
+from pipeline.store.files import Files
 from pipeline.store.run import Run
 
 
@@ -43,7 +44,7 @@ class State:
         return len(self.done) == self.plan.n_tasks
 
 
-def state(source: str | Path | Run) -> State:
+def state(source: str | Path | Files | Run) -> State:
     """Say how far a run is, from its commit records alone.
 
     Raises

@@ -8,7 +8,6 @@ from pathlib import Path
 from pipeline.layout.plan import make_plan
 from pipeline.spec.parsing import kept_spec
 from pipeline.store.commits import Verification, verify, withdraw
-from pipeline.store.files import writer_lock
 from pipeline.store.runfile import read_run
 from pipeline.store.setup import rebuild_skeleton
 
@@ -40,7 +39,7 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
     plan = make_plan(spec)
     if not repair:
         return verify(info, plan)
-    with writer_lock(info.directory):
+    with info.files.lock():
         found = verify(info, plan)
         rest = rebuild_skeleton(info, spec, plan)
         withdraw(info, found.damaged)

@@ -12,7 +12,6 @@ that stops whoever asked, so that nothing is swept on the word of a failing disk
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,23 +19,10 @@ from typing import Any
 
 import numpy as np
 import zarr
-from zarr.storage import LocalStore
 
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import Plan
-from pipeline.store.files import (
-    COMMITS,
-    CUBE,
-    TIMINGS,
-    files_below,
-    object_entry,
-    problems_of,
-    refuse_links,
-    sync,
-    sync_folder,
-    unreadable,
-    write_atomically,
-)
+from pipeline.store.files import COMMITS, CUBE, TIMINGS, Files, LinkError, entry_of, problems_of
 from pipeline.store.runfile import RunInfo
 from pipeline.store.seal import seal, unseal
 
@@ -78,22 +64,22 @@ def write_task(
     ValueError
         If an array has another shape or dtype than the store, or a block cuts a chunk.
     """
-    cube = info.directory / CUBE
-    refuse_links(cube, *(cube / v.name for v in plan.variables), info.directory / COMMITS)
+    info.files.refuse_links(CUBE, *(f"{CUBE}/{v.name}" for v in plan.variables), COMMITS)
+    cube = info.files.below(CUBE)
     objects = [key for v in plan.variables for key in write_block(cube, plan, index, v.name, values[v.name])]
-    sync((cube / key for key in objects), cube)
+    cube.sync(objects)
     record = {
         "digest": info.digest,
         "task": index,
         "status": dict(counts),
-        "objects": {key: object_entry(cube / key) for key in objects},
+        "objects": {key: entry_of(cube.read(key)) for key in objects},
     }
-    write_atomically(marker_path(info.directory, index), record_text(record))
+    info.files.write_once(marker_key(index), record_text(record).encode())
 
 
-def write_block(cube: Path, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
+def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
     """Write one variable's chunks of a task and return their keys."""
-    array = zarr.open_array(LocalStore(cube), path=name, mode="r+")
+    array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+")
     # The setting is not stored: without it a block equal to the fill value would leave no file.
     array = array.with_config({"write_empty_chunks": True})
     block = plan.task(index)
@@ -128,15 +114,14 @@ def record_text(record: Mapping[str, Any]) -> str:
     return seal(json.dumps(record, sort_keys=True, allow_nan=False, ensure_ascii=False))
 
 
-def marker_path(directory: Path, index: int) -> Path:
+def marker_key(index: int) -> str:
     """Where a task's record lies."""
-    return directory / COMMITS / f"{index:06d}.json"
+    return f"{COMMITS}/{index:06d}.json"
 
 
-def log_timing(directory: Path, entry: Mapping[str, Any]) -> None:
+def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
     """Append what a task took to ``timings.jsonl``; no part of the result, not synced."""
-    with (directory / TIMINGS).open("a", encoding="utf-8") as file:
-        file.write(json.dumps(entry, sort_keys=True) + "\n")
+    info.files.append(TIMINGS, json.dumps(entry, sort_keys=True))
 
 
 # ---- reading -----------------------------------------------------------------------------------
@@ -161,7 +146,7 @@ def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> dict[in
     """
     whole, rejected = _read_records(info, plan)
     # taken after the records: a chunk is there before its record is
-    sizes = _sizes(info.directory / CUBE)
+    sizes = info.files.below(CUBE).sizes()
     found = {}
     for commit in whole.values():
         absent = [key for key, entry in commit.objects.items() if sizes.get(key) != entry["size"]]
@@ -177,16 +162,15 @@ def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> dict[in
 
 def _read_records(info: RunInfo, plan: Plan) -> tuple[dict[str, Commit], dict[str, str]]:
     """Return the whole records of the run, and the problems of the others, both by file name."""
-    folder = info.directory / COMMITS
-    refuse_links(folder)
+    info.files.refuse_links(COMMITS)
+    folder = info.files.below(COMMITS)
     whole, rejected = {}, {}
     try:
-        with unreadable(folder), os.scandir(folder) as entries:
-            names = sorted(entry.name for entry in entries if entry.name.endswith(".json"))
+        names = [name for name in folder.names() if name.endswith(".json")]
     except FileNotFoundError:
         return {}, {}
-    for name in names:
-        found = _read_record(folder / name, info, plan)
+    for name, content in folder.read_each(names):
+        found = _read_record(name, content, info, plan)
         if isinstance(found, Commit):
             whole[name] = found
         elif found:
@@ -194,15 +178,10 @@ def _read_records(info: RunInfo, plan: Plan) -> tuple[dict[str, Commit], dict[st
     return whole, rejected
 
 
-def _read_record(path: Path, info: RunInfo, plan: Plan) -> Commit | str:
+def _read_record(name: str, content: bytes | FileNotFoundError, info: RunInfo, plan: Plan) -> Commit | str:
     """Return a record if it is whole, of this run and of this task; else what is wrong with it."""
-    if path.is_symlink():
-        return "is a link"
-    try:
-        with unreadable(path):
-            content = path.read_bytes()
-    except FileNotFoundError:
-        return ""
+    if isinstance(content, FileNotFoundError):
+        return "is a link" if isinstance(content, LinkError) else ""
     try:
         data = unseal(content)
         commit = Commit(int(data["task"]), dict(data["status"]), dict(data["objects"]))
@@ -211,31 +190,13 @@ def _read_record(path: Path, info: RunInfo, plan: Plan) -> Commit | str:
         return "torn or damaged"
     if digest != info.digest:
         return "of another run"
-    named = 0 <= commit.task < plan.n_tasks and path.name == marker_path(info.directory, commit.task).name
+    named = 0 <= commit.task < plan.n_tasks and f"{COMMITS}/{name}" == marker_key(commit.task)
     inside = all(key.partition("/")[0] in {v.name for v in plan.variables} for key in commit.objects)
     return commit if named and inside and not _climbs(commit) else "torn or damaged"
 
 
 def _climbs(commit: Commit) -> bool:
     return any(".." in Path(key).parts for key in commit.objects)
-
-
-def _sizes(cube: Path) -> dict[str, int]:
-    """Size of every plain file of the cube by key."""
-    refuse_links(cube)
-    found: dict[str, int] = {}
-    try:
-        with unreadable(cube), os.scandir(cube) as arrays:
-            folders = [Path(a.path) for a in arrays if a.is_dir()]
-    except FileNotFoundError:
-        return found
-    refuse_links(*folders)
-    for folder in folders:
-        with unreadable(folder), os.scandir(folder) as entries:
-            for entry in entries:
-                if entry.is_file(follow_symlinks=False):
-                    found[f"{folder.name}/{entry.name}"] = entry.stat(follow_symlinks=False).st_size
-    return found
 
 
 def cube_digest(info: RunInfo, commits: Mapping[int, Commit]) -> str:
@@ -262,19 +223,19 @@ def sweep(info: RunInfo, commits: Mapping[int, Commit], echo: Echo | None = None
     echo
         Prints a line; says what is removed.
     """
-    cube, folder = info.directory / CUBE, info.directory / COMMITS
-    refuse_links(cube, folder)
-    keep = {cube / key for key in info.skeleton}
-    keep |= {cube / key for commit in commits.values() for key in commit.objects}
-    keep |= {marker_path(info.directory, index) for index in commits}
-    with unreadable(info.directory):
-        leftovers = [file for top in (cube, folder) for file in files_below(top) if file not in keep]
-    for file in leftovers:
-        file.unlink()
+    info.files.refuse_links(CUBE, COMMITS)
+    keep = {f"{CUBE}/{key}" for key in info.skeleton}
+    keep |= {f"{CUBE}/{key}" for commit in commits.values() for key in commit.objects}
+    keep |= {marker_key(index) for index in commits}
+    found = (f"{top}/{key}" for top in (CUBE, COMMITS) for key in info.files.below(top).everything())
+    leftovers = [key for key in found if key not in keep]
+    info.files.remove(leftovers)
     if leftovers and echo:
-        names = [file.relative_to(info.directory).as_posix() for file in leftovers]
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        echo(f"removed {len(names)} files that no commit record vouches for: {', '.join(names[:3])}{more}")
+        more = f" and {len(leftovers) - 3} more" if len(leftovers) > 3 else ""
+        echo(
+            f"removed {len(leftovers)} files that no commit record vouches for: "
+            f"{', '.join(leftovers[:3])}{more}"
+        )
     return len(leftovers)
 
 
@@ -317,8 +278,8 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
     UnreadableError
         If a file is there and cannot be read.
     """
-    cube = info.directory / CUBE
-    refuse_links(cube)
+    info.files.refuse_links(CUBE)
+    cube = info.files.below(CUBE)
     whole, rejected = _read_records(info, plan)
     damaged = {name: f"{COMMITS}/{name}: {problem}" for name, problem in rejected.items()}
     vouched = set(info.skeleton)
@@ -327,20 +288,16 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
         problems = problems_of(cube, commit.objects)
         if problems:
             damaged[name] = "; ".join(problems)
-    found = [f.relative_to(cube).as_posix() for f in files_below(cube)] if cube.is_dir() else []
     return Verification(
         n_tasks=plan.n_tasks,
         n_committed=len(whole) + len(rejected) - len(damaged),
         damaged=dict(sorted(damaged.items())),
         skeleton=problems_of(cube, info.skeleton),
-        leftovers=sorted(key for key in found if key not in vouched),
+        leftovers=sorted(key for key in cube.everything() if key not in vouched),
     )
 
 
 def withdraw(info: RunInfo, names: Iterable[str]) -> None:
     """Remove commit records by file name, so that the next run computes their tasks again."""
-    folder = info.directory / COMMITS
-    refuse_links(folder)
-    for name in names:
-        (folder / name).unlink(missing_ok=True)
-    sync_folder(folder)
+    info.files.refuse_links(COMMITS)
+    info.files.below(COMMITS).remove(names)

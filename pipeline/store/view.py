@@ -15,7 +15,7 @@ from typing import Any
 
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import LocalStore, WrapperStore
+from zarr.storage import WrapperStore
 
 from pipeline.store.commits import Commit
 from pipeline.store.errors import DamagedError
@@ -126,5 +126,5 @@ def committed_view(
     entries: dict[str, Mapping[str, Any]] = dict(info.skeleton)
     for commit in commits.values():
         entries |= commit.objects
-    store = LocalStore(info.directory / CUBE, read_only=True)
-    return CommittedStore(store, entries, str(info.directory), checks_chunks() if check is None else check)
+    store = info.files.below(CUBE).zarr(read_only=True)
+    return CommittedStore(store, entries, info.name, checks_chunks() if check is None else check)

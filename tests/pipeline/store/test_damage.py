@@ -21,9 +21,10 @@ from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
 from pipeline.runs.zoom import read_source
-from pipeline.store.commits import marker_path, read_commits, sweep
+from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import DamagedError, IncompleteError, RefusedError, UnreadableError
 from pipeline.store.files import local_path
+from pipeline.store.local import LocalFiles
 from pipeline.store.run import Run
 from pipeline.store.seal import seal, unseal
 from pipeline.store.setup import check, create, establish
@@ -108,7 +109,7 @@ def test_run__unreadable_record_removes_nothing(write_spec, sweep_text, tmp_path
 
 
 def test_sweep__says_what_it_removes(whole):
-    marker_path(whole.info.directory, 1).write_text("{")
+    (whole.info.directory / marker_key(1)).write_text("{")
     said = []
     commits = read_commits(whole.info, whole.plan, said.append)
     assert said == ["commits/000001.json: torn or damaged; it does not count"]
@@ -339,21 +340,19 @@ def test_skeleton_files__same_bytes_again(made):
 
 
 def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
-    from pipeline.store import skeleton
-
     n_files = len(made.info.skeleton)
     for n in (0, 1, n_files // 2, n_files - 1):
         directory, calls = tmp_path / f"again{n}", []
-        original = skeleton.write_atomically
+        original = LocalFiles.write
 
-        def crash(path, content, calls=calls, n=n, original=original):
+        def crash(self, key, content, calls=calls, n=n, original=original):
             if len(calls) == n:
                 raise KeyboardInterrupt
-            calls.append(path)
-            original(path, content)
+            calls.append(key)
+            original(self, key, content)
 
         with monkeypatch.context() as patch:
-            patch.setattr(skeleton, "write_atomically", crash)
+            patch.setattr(LocalFiles, "write", crash)
             with pytest.raises(KeyboardInterrupt):
                 create(directory, made.spec, made.plan, made.identity, "text")
         (directory / "cube.zarr/.zarr.json.abc.tmp").write_text("{")  # what a power cut leaves
@@ -394,7 +393,7 @@ def test_run__a_record_that_vanished(write_spec, sweep_text, tmp_path, monkeypat
 
     def losing(job, indices, **options):
         yield from original(job, indices, **options)
-        marker_path(tmp_path / "run", 2).unlink()
+        (tmp_path / "run" / marker_key(2)).unlink()
 
     with monkeypatch.context() as patch:
         patch.setattr(execute, "run_tasks", losing)
