@@ -8,17 +8,18 @@ holds but for a product is taken, and the product computed from its sections.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from magpend_core import Sections, Status
-from pipeline.compute.task import Job, integrate
-from pipeline.layout.cells import Inputs
+from pipeline.compute.task import Integrate, Job, integrate
+from pipeline.compute.walking import WALKED, going_on
+from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import code_version
-from pipeline.layout.matching import NOWHERE, Finder, unlike
+from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
 from pipeline.layout.schema import base_variables
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
@@ -64,14 +65,13 @@ class Source:
         own = [*base_variables(model), *(v for variables in products for v in variables)]
         self.names = [variable.name for variable in own]
         self._read = lru_cache(maxsize=2)(partial(read_block, self.run, names=tuple(self.names)))
-        self._owner = np.asarray(self.run.plan.task_grid), np.asarray(self.run.plan.block)
 
-    def find(self, inputs: Inputs) -> np.ndarray:
+    def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
         """Return the flat index of each cell that is committed, `NOWHERE` for the others.
 
         In a refined grid some of these were inferred, which `take` leaves out.
         """
-        place = self.finder.find(inputs)
+        place = self.finder.find(inputs, way)
         is_committed = np.zeros(self.run.plan.n_tasks + 1, bool)
         is_committed[list(self.run.commits)] = True
         return np.where(is_committed[self._task(place)], place, NOWHERE)
@@ -98,13 +98,12 @@ class Source:
         return taken, {name: array[taken] for name, array in values.items()}
 
     def _task(self, place: np.ndarray) -> np.ndarray:
-        """Task that each cell belongs to; the last but one beyond all for `NOWHERE`."""
-        grid, block = self._owner
-        if not len(grid):
-            return np.where(place == NOWHERE, 1, 0)
-        steps = np.array(np.unravel_index(np.maximum(place, 0), self.run.plan.shape))
-        tasks = np.ravel_multi_index(tuple(steps // block[:, None]), tuple(grid))
-        return np.where(place == NOWHERE, self.run.plan.n_tasks, tasks)
+        """Task that each cell belongs to; the number of tasks for `NOWHERE`."""
+        plan = self.run.plan
+        steps = np.unravel_index(np.maximum(place, 0), plan.shape)
+        places = tuple(step // b for step, b in zip(steps, plan.block, strict=True))
+        tasks = np.ravel_multi_index(places, plan.task_grid) if places else np.zeros(place.shape, np.int64)
+        return np.where(place == NOWHERE, plan.n_tasks, tasks)
 
     def _inside(self, task: int, place: np.ndarray) -> tuple[np.ndarray, ...]:
         """Indices of cells within their task's block."""
@@ -161,40 +160,67 @@ class Pool:
     """
 
     def __init__(self, spec: Spec, runs: Sequence[Run]) -> None:
+        self.spec = spec
         self.sources = [Source(run, spec) for run in runs]
 
-    def count(self, inputs: Inputs) -> list[int]:
-        """Return how many of some cells are taken from each source."""
+    def count(self, inputs: Inputs, way: Way | None) -> list[int]:
+        """Return how many of some cells are taken from each source, as they begin and what they walk."""
         counts, rest = [], np.arange(len(inputs.initial_states))
         for source in self.sources:
-            place = source.find(inputs.take(rest))
+            place = source.find(inputs.take(rest), way)
             found = place != NOWHERE
             if source.run.spec.refine is not None:  # what was inferred is not taken
                 found[found] = source.take(place[found])[0]
-            counts.append(int(found.sum()))
-            rest = rest[~found]
+            n_taken = _leading(found)
+            counts.append(int(n_taken.sum()))
+            rest = rest[n_taken == 0]
         return counts
 
-    def integrate(self, spec: Spec, inputs: Inputs, *, tally: list[int]) -> Values:
-        """Return what `task.integrate` returns, bit for bit, with as little of its work as can be.
+    def integrator(self, cells: CellMap, block: tuple[slice, ...], tally: list[int]) -> Integrate:
+        """Return what gives the cells of a block as `task.integrate` does, bit for bit, with less work.
 
-        The number of cells that were taken is appended to `tally`.
+        The numbers of cells that were taken are appended to `tally`.
         """
+        way = way_of(self.spec, block)
+        if way is None:
+            return lambda spec, inputs: self._give(spec, inputs, inputs, None, tally)
+        return lambda spec, inputs: self._give(spec, inputs, cells.inputs(block), way, tally)
+
+    def _give(self, spec: Spec, inputs: Inputs, begin: Inputs, way: Way | None, tally: list[int]) -> Values:
+        """Take cells, go on from those where a walk goes on, and integrate the rest."""
         values: Values = {}
-        n = len(inputs.initial_states)
-        rest = np.arange(n)
+        n_branches, n_points = inputs.frequency_hz.shape
+        rest = np.arange(n_branches)
         for source in self.sources:
-            place = source.find(inputs.take(rest))
-            taken, stored = source.take(place)
-            rows, rest = rest[taken], rest[~taken]
-            if len(rows):
-                part = {name: array[:, None] for name, array in stored.items()}
-                part |= _products(spec, inputs.take(rows), part, source.missing)
-                _put(values, rows, part, n)
-        tally.append(n - len(rest))
+            place = source.find(begin.take(rest), way)
+            taken, stored = source.take(place.ravel())
+            n_taken = _leading(taken.reshape(place.shape))
+            order = np.cumsum(taken).reshape(place.shape) - 1
+            for n in np.unique(n_taken[n_taken > 0]):
+                own = np.flatnonzero(n_taken == n)
+                part = {name: array[order[own, :n]] for name, array in stored.items()}
+                rows = rest[own]
+                part |= _products(spec, _points(inputs.take(rows), slice(0, n)), part, source.missing)
+                if n < n_points:
+                    tail = _points(inputs.take(rows), slice(n, n_points))
+                    more = integrate(spec, going_on(tail, {k: part[k][:, -1] for k in WALKED if k in part}))
+                    part = {name: np.concatenate([part[name], more[name]], axis=1) for name in more}
+                _put(values, rows, part, n_branches)
+                tally.append(int(n) * len(rows))
+            rest = rest[n_taken == 0]
         if len(rest):
-            _put(values, rest, integrate(spec, inputs.take(rest)), n)
+            _put(values, rest, integrate(spec, inputs.take(rest)), n_branches)
         return values
+
+
+def _leading(taken: np.ndarray) -> np.ndarray:
+    """Points at the begin of each branch that are taken: a walk needs all before a point."""
+    return np.asarray(np.cumprod(taken, axis=1).sum(axis=1))
+
+
+def _points(inputs: Inputs, part: slice) -> Inputs:
+    """Some of the points of branches."""
+    return replace(inputs, parameters=inputs.parameters[:, part], frequency_hz=inputs.frequency_hz[:, part])
 
 
 def _put(values: Values, rows: np.ndarray, part: Mapping[str, np.ndarray], n: int) -> None:
@@ -206,13 +232,14 @@ def _put(values: Values, rows: np.ndarray, part: Mapping[str, np.ndarray], n: in
 
 def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], names: Sequence[str]) -> Values:
     """Compute products of cells that are known but for these."""
-    n = len(inputs.initial_states)
+    if not names:
+        return {}
+    no_turns = np.zeros((*inputs.frequency_hz.shape, 0), np.int32)
     cells = Sections(
-        section=values["section"], turns=values.get("turns", np.zeros((n, 1, 0), np.int32)),
-        status=values["status"], orbit_period=values["orbit_period"], n_periods=values["n_periods"],
-        n_steps=values["n_steps"], n_rejected=values["n_rejected"],
-        final_state=values["section"][:, -1, -1], step_size=np.full(n, np.nan),
-        return_time=values.get("return_time"),
+        section=values["section"], turns=values.get("turns", no_turns), status=values["status"],
+        orbit_period=values["orbit_period"], n_periods=values["n_periods"], n_steps=values["n_steps"],
+        n_rejected=values["n_rejected"], final_state=values["section"][:, :, -1],
+        step_size=values["step_size"], return_time=values.get("return_time"),
     )  # fmt: skip
     found: Values = {}
     for name in names:

@@ -6,7 +6,9 @@ whatever the axes, starts and tasks of either.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from pipeline.spec.tables import FREQUENCY
 NOWHERE = -1
 """Place of a cell that a run does not have."""
 
-_CODE = (*CODE, "compute.recorded", "spec.drives")
+_CODE = (*CODE, "compute.walking", "compute.recorded", "spec.drives")
 
 
 def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -35,6 +37,7 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
         "code": {name: version for name, version in identity["code"].items() if name in _CODE},
         **{name: spec[name] for name in ("kind", "drive", "section") if name in spec},
         "integration": integration,
+        **({"path": spec["continuation"]["path"]} if "continuation" in spec else {}),
     }
 
 
@@ -43,8 +46,49 @@ def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     return differences(deciding(old), deciding(new))
 
 
+@dataclass(frozen=True)
+class Way:
+    """The part of its path that a block of a continuation walks.
+
+    Attributes
+    ----------
+    direction : str
+    values : ndarray
+        The whole path, in the order in which it is walked.
+    first : int
+        How many points of it come before the block.
+    """
+
+    direction: str
+    values: np.ndarray
+    first: int
+
+
+def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
+    """Return what a block walks, all in one direction; None in a sweep."""
+    if spec.continuation is None:
+        return None
+    path, values = _path_of(spec)
+    directions, part = spec.continuation.directions, block[path]
+    direction = directions[block[-1].start // len(initial_states(spec.initial_conditions))]
+    if direction == "down":
+        return Way(direction, values[::-1], len(values) - part.stop)
+    return Way(direction, values, part.start)
+
+
+def _path_of(spec: Spec) -> tuple[int, np.ndarray]:
+    """Number and values of the axis along which branches walk."""
+    assert spec.continuation is not None
+    axes = parameter_axes(spec)
+    path = [a.parameter for a in axes].index(spec.continuation.path)
+    return path, axes[path].values
+
+
 class Finder:
-    """Finds cells of a sweep by what they are integrated from.
+    """Finds cells of a run by what they are integrated from.
+
+    A cell of a walk depends on all that come before it. So those of walks from one initial state are the same
+    up to the first point that differs, and none beyond.
 
     Parameters
     ----------
@@ -59,31 +103,71 @@ class Finder:
         self._axes = parameter_axes(spec)
         states = initial_states(spec.initial_conditions)
         self._starts = _Grid(states) if states.grid is not None else _Rows(states)
-        self.shape = (*(len(a.values) for a in self._axes), *states.shape)
+        self._path, self._directions = None, ()
+        n_last = states.shape
+        if spec.continuation is not None:
+            self._path, self._directions = _path_of(spec)[0], spec.continuation.directions
+            n_last = (len(states) * len(self._directions),)
+        self.shape = (*(len(a.values) for a in self._axes), *n_last)
 
-    def find(self, inputs: Inputs) -> np.ndarray:
-        """Return the flat index in this run of each cell, `NOWHERE` if it is none of its cells.
+    def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
+        """Return the flat index in this run of each cell, shape (branch, point), `NOWHERE` if it has it not.
 
         Parameters
         ----------
         inputs
-            Branches of one point each.
+            Branches as they begin, not as they go on in a later block.
+        way
+            What they walk; None in a sweep.
         """
-        n = len(inputs.initial_states)
-        parameters, frequency = inputs.parameters[:, 0], inputs.frequency_hz[:, 0]
+        n_branches, n_points = inputs.frequency_hz.shape
+        here = self._fixed(inputs)
+        steps = []
+        for i, axis in enumerate(self._axes):
+            if i == self._path:
+                steps.append(np.zeros((n_branches, 1), np.int64))
+                continue
+            step, on = _on_axis(axis.values, self._values(inputs, axis.parameter))
+            steps.append(step[:, None])
+            here &= on
+        start, on = self._starts.find(inputs.initial_states)
+        here = np.repeat((here & on)[:, None], n_points, axis=1)
+        if way is not None:
+            assert self._path is not None
+            if way.direction not in self._directions:
+                return np.full(here.shape, NOWHERE)
+            start = start + self._directions.index(way.direction) * len(self._starts)
+            own = self._axes[self._path].values
+            point = way.first + np.arange(n_points)
+            here &= point < _n_alike(own if way.direction == "up" else own[::-1], way.values)
+            point = np.minimum(point, len(own) - 1)
+            steps[self._path] = point if way.direction == "up" else len(own) - 1 - point
+        n_starts = math.prod(self.shape[len(self._axes) :])
+        place = np.zeros((n_branches, n_points), np.int64)
+        for axis, step in zip(self._axes, steps, strict=True):
+            place = place * len(axis.values) + step
+        return np.where(here, place * n_starts + start[:, None], NOWHERE)
+
+    def _fixed(self, inputs: Inputs) -> np.ndarray:
+        """Which branches have this run's values of all that it does not sweep."""
         swept = {a.parameter for a in self._axes}
         fixed = [i for i, name in enumerate(self._names) if name not in swept]
-        here = (_bits(parameters[:, fixed]) == _bits(self._packed[fixed])).all(axis=1)
+        here = (_bits(inputs.parameters[:, 0, fixed]) == _bits(self._packed[fixed])).all(axis=1)
         if FREQUENCY not in swept:
-            here &= _bits(frequency) == _bits(self._hz)
-        place = np.zeros(n, np.int64)
-        for axis in self._axes:
-            is_frequency = axis.parameter == FREQUENCY
-            values = frequency if is_frequency else parameters[:, self._names.index(axis.parameter)]
-            step, on = _on_axis(axis.values, values)
-            place, here = place * len(axis.values) + step, here & on
-        start, on = self._starts.find(inputs.initial_states)
-        return np.where(here & on, place * len(self._starts) + start, NOWHERE)
+            here &= _bits(inputs.frequency_hz[:, 0]) == _bits(self._hz)
+        return np.asarray(here)
+
+    def _values(self, inputs: Inputs, name: str) -> np.ndarray:
+        if name == FREQUENCY:
+            return inputs.frequency_hz[:, 0]
+        return inputs.parameters[:, 0, self._names.index(name)]
+
+
+def _n_alike(old: np.ndarray, new: np.ndarray) -> int:
+    """Number of points at the begin of two paths that are the same."""
+    n = min(len(old), len(new))
+    differ = np.flatnonzero(_bits(old[:n]) != _bits(new[:n]))
+    return int(differ[0]) if len(differ) else n
 
 
 class _Grid:

@@ -17,7 +17,7 @@ from typing import Any
 from pipeline.layout.cells import CellMap
 from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import canonical, digest_of
-from pipeline.layout.matching import NOWHERE, Finder, apart
+from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.runs.preview import time_line
 from pipeline.runs.progress import size
@@ -165,7 +165,7 @@ def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
     pool, cells = Pool(wide, runs), CellMap(wide)
     counts = [0] * len(runs)
     for block in plan.tasks() if runs else ():
-        for i, n in enumerate(pool.count(cells.inputs(block))):
+        for i, n in enumerate(pool.count(cells.inputs(block), way_of(wide, block))):
             counts[i] += n
     return counts
 
@@ -337,7 +337,8 @@ def _refuse_loss(run: Run, wide: Spec) -> None:
     """Refuse to put a run in the place of one that holds more than it does."""
     cells, finder, lost = CellMap(run.spec), Finder(wide), 0
     for index in run.commits:
-        lost += int((finder.find(cells.inputs(run.plan.task(index))) == NOWHERE).sum())
+        block = run.plan.task(index)
+        lost += int((finder.find(cells.inputs(block), way_of(run.spec, block)) == NOWHERE).sum())
     absent = [name for name in run.spec.products if name not in wide.products]
     what = [f"{lost} of its cells"] if lost else []
     what += [f"its product {name}" for name in absent]

@@ -176,7 +176,8 @@ def _complete(
 
     commits = read_commits(info, plan, echo)
     sweep(info, commits, echo)
-    missing = [i for i in range(plan.n_tasks) if i not in commits]
+    # walks in step, so that none is left to one worker at the end
+    missing = sorted((i for i in range(plan.n_tasks) if i not in commits), key=plan.depth)
     if not missing:
         echo(f"{info.name} is complete; nothing to do.")
         return

@@ -160,6 +160,20 @@ def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> dict[in
     return found
 
 
+def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
+    """Return the record of one task, None if it has no valid one; its objects are not looked at.
+
+    Raises
+    ------
+    UnreadableError
+        If it is there and cannot be read.
+    """
+    path = marker_path(info.directory, index)
+    refuse_links(path.parent)
+    found = _read_record(path, info, plan)
+    return found if isinstance(found, Commit) else None
+
+
 def _read_records(info: RunInfo, plan: Plan) -> tuple[dict[str, Commit], dict[str, str]]:
     """Return the whole records of the run, and the problems of the others, both by file name."""
     info.files.refuse_links(COMMITS)

@@ -10,7 +10,7 @@ import time
 import pytest
 
 from pipeline import open_run
-from pipeline.compute import exponents, task
+from pipeline.compute import exponents, task, walking
 from pipeline.compute.execute import TaskFailedError
 from pipeline.runs import extend as extending
 from pipeline.runs.extend import extend
@@ -59,7 +59,7 @@ class Count:
 
     def __init__(self, monkeypatch):
         self.cells, self.tangents = 0, 0
-        branches, tangents = task.run_branches, exponents.lyapunov_exponents
+        branches, tangents = walking.run_branches, exponents.lyapunov_exponents
 
         def run_branches(parameters, frequency, states, **options):
             self.cells += parameters.shape[0] * parameters.shape[1]
@@ -69,7 +69,7 @@ class Count:
             self.tangents += len(parameters)
             return tangents(parameters, *words, **options)
 
-        monkeypatch.setattr(task, "run_branches", run_branches)
+        monkeypatch.setattr(walking, "run_branches", run_branches)
         monkeypatch.setattr(exponents, "lyapunov_exponents", lyapunov_exponents)
         monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
 
@@ -132,6 +132,42 @@ WIDER = {
 def test_extend__integrates_what_is_new_alone(grown, what):
     old, new, expected = WIDER[what]
     assert grown(old, new) == expected
+
+
+WALK = (
+    BASE.replace('"sweep"', '"continuation"')
+    .replace("[integration]", '[continuation]\ndirection = "both"\n[integration]')
+    .replace("task = 7", "task = 5\npoints_per_task = 2")
+)
+WALKS = {
+    "a longer path": (WALK, WALK.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7"), 10 + 35),
+    "a longer path the other way": (
+        WALK,
+        WALK.replace("start = 0.10, stop = 0.14, num = 5", "start = 0.08, stop = 0.14, num = 7"),
+        10 + 35,
+    ),
+    "more seeds": (WALK, WALK.replace("stop = 1.0, num = 5", "stop = 1.5, num = 6"), 10),
+    "the other direction": (WALK.replace('"both"', '"down"'), WALK, 25),
+    "a further parameter": (
+        WALK.replace("[axes]", "[parameters]\noverrides = { amplitude = 0.3 }\n[axes]"),
+        WALK.replace("[axes]", "[axes]\namplitude = { values = [0.2, 0.3] }"),
+        50,
+    ),
+    "other tasks": (WALK, WALK.replace("points_per_task = 2", "points_per_task = 3"), 0),
+}
+
+
+@pytest.mark.parametrize("what", WALKS)
+def test_walk__goes_on_where_it_ended(grown, what):
+    old, new, expected = WALKS[what]
+    assert grown(old, new) == expected
+
+
+def test_walk__new_products(grown, count):
+    lyapunov = "[products]\nlyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }\n[execution]"
+    new = WALK.replace("[execution]", lyapunov).replace("stop = 0.14, num = 5", "stop = 0.15, num = 6")
+    assert grown(WALK.replace('"both"', '"up"'), new.replace('"both"', '"up"')) == 5
+    assert count.tangents == 30
 
 
 def test_extend__new_products_go_on_from_the_sections(grown, count):
