@@ -139,6 +139,7 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
         Before anything is computed.
     """
     import dask
+    import distributed  # noqa: F401  its defaults come with it, and would go with the setting below
 
     target = where.resolved()
     with contextlib.ExitStack() as stack:

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pipeline.layout.cells import CellMap
 from pipeline.layout.schema import sizes_of, variables_of
+from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable
 from pipeline.spec.drives import TORQUE
@@ -73,6 +74,8 @@ class Plan:
         Whether the drive is a recording.
     directions : tuple of str
         Directions in which branches walk, each for an equal part of the branches; none in a sweep.
+    seconds_at : ndarray or None
+        Estimated time of a cell on one core at each value of the frequency's dim [s], if there is one.
     """
 
     kind: str
@@ -85,6 +88,7 @@ class Plan:
     seconds_per_cell: float
     is_recorded: bool = False
     directions: tuple[str, ...] = ()
+    seconds_at: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def n_cells(self) -> int:
@@ -115,6 +119,13 @@ class Plan:
     def core_seconds(self) -> float:
         """Estimated time on one core [s]."""
         return self.n_cells * self.seconds_per_cell
+
+    def seconds(self, index: int) -> float:
+        """Estimated time of a task on one core [s]."""
+        seconds = self.seconds_per_cell
+        if self.seconds_at is not None:
+            seconds = float(self.seconds_at[self.task(index)[self.dims.index(FREQUENCY_DIM)]].mean())
+        return seconds * self.cells_in(index)
 
     def task(self, index: int) -> tuple[slice, ...]:
         """Return the block of cells of a task."""
@@ -204,7 +215,7 @@ def make_plan(spec: Spec) -> Plan:
     return Plan(
         spec.kind, cells.dims, cells.shape, cells.path, block, variables_of(spec.model, spec.products),
         sizes_of(spec.model, spec.products, spec.integration.n_keep), seconds, spec.recorded is not None,
-        directions,
+        directions, _seconds_at(spec),
     )  # fmt: skip
 
 
@@ -226,10 +237,12 @@ def periods_per_cell(spec: Spec) -> tuple[float, float]:
     return float(spec.integration.n_transient + spec.integration.n_keep), float(products)
 
 
-def _most_seconds_per_cell(spec: Spec) -> float:
-    """Time of a cell at the lowest frequency, where periods take longest [s]."""
-    frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else np.asarray(spec.frequency_hz)
-    return sum(periods_per_cell(spec)) * float(seconds_per_period(frequency, spec.integration.rtol).max())
+def _seconds_at(spec: Spec) -> np.ndarray | None:
+    """Time of a cell at each value of the frequency's axis [s]; None if it is none."""
+    if FREQUENCY not in spec.axes:
+        return None
+    frequency = spec.axes[FREQUENCY].array()
+    return sum(periods_per_cell(spec)) * seconds_per_period(frequency, spec.integration.rtol)
 
 
 def _seconds_per_cell(spec: Spec) -> float:
@@ -271,7 +284,8 @@ def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float
     points = spec.execution.points_per_task
     if points is None:
         by_time = _wanted_seconds(math.prod(cells.shape) * seconds_per_cell) / (n_branches * seconds_per_cell)
-        at_most = MOST_SECONDS / (n_branches * _most_seconds_per_cell(spec))
+        at = _seconds_at(spec)
+        at_most = MOST_SECONDS / (n_branches * (seconds_per_cell if at is None else float(at.max())))
         by_size = CHUNK_BYTES / (n_branches * largest)
         points = _share(n_points, max(1, int(min(by_time, at_most, by_size))))
     block[cells.path] = min(points, n_points)

@@ -176,8 +176,7 @@ def _complete(
 
     commits = read_commits(info, plan, echo)
     sweep(info, commits, echo)
-    # walks in step, so that none is left to one worker at the end
-    missing = sorted((i for i in range(plan.n_tasks) if i not in commits), key=plan.depth)
+    missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
         echo(f"{info.name} is complete; nothing to do.")
         return
@@ -201,7 +200,8 @@ def _complete(
         results = execute.run_tasks(
             job,
             missing,
-            seconds=lambda i: plan.cells_in(i) * plan.seconds_per_cell,
+            after=None if plan.path is None else plan.predecessor,
+            seconds=plan.seconds,
             workers=workers,
             scheduler=where,
             echo=echo,

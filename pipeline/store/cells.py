@@ -42,7 +42,7 @@ def read_cells(
     commit = read_commit(info, plan, index)
     if commit is None:
         raise IncompleteError(
-            f"{info.directory}: task {index}, from which another goes on, is not committed here. Every "
+            f"{info.name}: task {index}, from which another goes on, is not committed here. Every "
             "worker must see this very folder, by this path; then give the same command again."
         )
     view = committed_view(info, {index: commit})

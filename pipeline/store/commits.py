@@ -168,9 +168,10 @@ def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
     UnreadableError
         If it is there and cannot be read.
     """
-    path = marker_path(info.directory, index)
-    refuse_links(path.parent)
-    found = _read_record(path, info, plan)
+    info.files.refuse_links(COMMITS)
+    name = marker_key(index).removeprefix(f"{COMMITS}/")
+    ((_, content),) = info.files.below(COMMITS).read_each([name])
+    found = _read_record(name, content, info, plan)
     return found if isinstance(found, Commit) else None
 
 
