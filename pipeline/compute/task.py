@@ -7,7 +7,7 @@ A task is named by the run directory, the run's digest and its index; it reads t
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -104,8 +104,16 @@ def rest_states(cells: Sections) -> np.ndarray:
     return np.where(is_left[..., None], cells.final_state, np.nan)
 
 
+Integrate = Callable[[Spec, Inputs], dict[str, np.ndarray]]
+"""From branches to all their variables, with leading dims (branch, point)."""
+
+
 def compute(
-    spec: Spec, cells: CellMap, block: tuple[slice, ...], before: Mapping[str, np.ndarray] | None = None
+    spec: Spec,
+    cells: CellMap,
+    block: tuple[slice, ...],
+    before: Mapping[str, np.ndarray] | None = None,
+    integrate: Integrate = integrate,
 ) -> dict[str, np.ndarray]:
     """Return all variables of a block of cells, in the block's shape.
 
@@ -115,6 +123,8 @@ def compute(
         Which cells.
     before
         Variables of the cells in which its branches were left, where they do not begin in the block.
+    integrate
+        What gives the cells.
     """
     inputs = cells.inputs(block)
     if before is not None:
@@ -135,7 +145,12 @@ def compute(
 
 
 def run_task(
-    directory: str, digest: str, index: int, *, origin: tuple[str, str] | None = None
+    directory: str,
+    digest: str,
+    index: int,
+    *,
+    origin: tuple[str, str] | None = None,
+    sources: tuple[tuple[str, str], ...] = (),
 ) -> dict[str, Any]:
     """Compute a task and commit it.
 
@@ -145,22 +160,20 @@ def run_task(
         Which one.
     origin
         Where the model is a Python object: its place and folder, as the person who began the run named them.
+    sources
+        Directories and digests of runs from which cells that they hold are taken; see `compute.reuse`.
 
     Returns
     -------
     dict
-        Task, cells, cells by status, and the seconds taken by the kernel and by writing.
+        Task, cells, cells by status, and the seconds taken by the kernel and by writing; with `sources` how
+        many cells were taken.
     """
     info, spec, plan, cells = _prepare(directory, digest, origin)
     started = time.perf_counter()
-    predecessor = plan.predecessor(index)
-    if predecessor is None:
-        values = compute(spec, cells, plan.task(index))
-    else:
-        names = [v.name for v in plan.variables if v.name in WALKED]
-        region = cells.last_cells(plan.task(predecessor))
-        before = read_cells(info, plan, predecessor, region, names)
-        values = compute(spec, cells, plan.task(index), before)
+    taken: list[int] = []
+    how = _taking(directory, digest, sources, cells, plan.task(index), taken)
+    values = compute(spec, cells, plan.task(index), **_left(info, plan, cells, index), **how)
     computed = time.perf_counter()
     codes, numbers = np.unique(values["status"], return_counts=True)
     counts = {Status(int(c)).name.lower(): int(n) for c, n in zip(codes, numbers, strict=True)}
@@ -171,7 +184,30 @@ def run_task(
         "status": counts,
         "kernel_s": round(computed - started, 4),
         "write_s": round(time.perf_counter() - computed, 4),
+        **({"reused": sum(taken)} if sources else {}),
     }
+
+
+def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, Any]:
+    """Read where the task before has left the branches of a task, if they do not begin in it."""
+    predecessor = plan.predecessor(index)
+    if predecessor is None:
+        return {}
+    names = [v.name for v in plan.variables if v.name in WALKED]
+    region = cells.last_cells(plan.task(predecessor))
+    return {"before": read_cells(info, plan, predecessor, region, names)}
+
+
+def _taking(
+    directory: str, digest: str, sources: tuple[tuple[str, str], ...], cells: CellMap,
+    block: tuple[slice, ...], taken: list[int],
+) -> dict[str, Any]:  # fmt: skip
+    """Say what gives a task's cells where it is not the kernel alone: what other runs hold comes first."""
+    if not sources:
+        return {}
+    from pipeline.compute.reuse import pool_of
+
+    return {"integrate": pool_of(directory, digest, sources).integrator(cells, block, taken)}
 
 
 def warm_up(spec: Spec) -> float:
