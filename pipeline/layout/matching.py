@@ -123,7 +123,7 @@ class Finder:
         """
         n_branches, n_points = inputs.frequency_hz.shape
         here = self._fixed(inputs)
-        steps = []
+        steps: list[np.ndarray] = []
         for i, axis in enumerate(self._axes):
             if i == self._path:
                 steps.append(np.zeros((n_branches, 1), np.int64))
@@ -141,7 +141,7 @@ class Finder:
             own = self._axes[self._path].values
             point = way.first + np.arange(n_points)
             here &= point < _n_alike(own if way.direction == "up" else own[::-1], way.values)
-            point = np.minimum(point, len(own) - 1).astype(np.int64)[None]
+            point = np.minimum(point, len(own) - 1)
             steps[self._path] = point if way.direction == "up" else len(own) - 1 - point
         n_starts = math.prod(self.shape[len(self._axes) :])
         place = np.zeros((n_branches, n_points), np.int64)

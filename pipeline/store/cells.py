@@ -8,8 +8,9 @@ import numpy as np
 import zarr
 
 from pipeline.layout.plan import Plan
-from pipeline.store.commits import Commit, read_commit
+from pipeline.store.commits import read_commit
 from pipeline.store.errors import IncompleteError
+from pipeline.store.records import Commit
 from pipeline.store.run import Run
 from pipeline.store.runfile import RunInfo
 from pipeline.store.view import committed_view
