@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from pipeline.store.errors import LockedError
+from pipeline.store.errors import LockedError, StoreError
 from pipeline.store.files import LOCK
 
 if TYPE_CHECKING:
@@ -90,7 +90,9 @@ def lease(files: ObjectFiles) -> Iterator[None]:
     finally:
         stop.set()
         thread.join()
-        with contextlib.suppress(FileNotFoundError):
+        # what cannot be done now does no harm: the lease lapses
+        with contextlib.suppress(FileNotFoundError, StoreError):
+            files.put_lines()
             if files.read(LOCK) == content:
                 files.remove([LOCK])
 

@@ -90,6 +90,7 @@ class ObjectFiles:
         self.metadata: dict[str, Buffer] = {}
         self._store: Any = None
         self._below: dict[str, ObjectFiles] = {}
+        self._lines: dict[str, list[str]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         # what travels to another process is the place: it has credentials of its own
@@ -218,7 +219,15 @@ class ObjectFiles:
         return True
 
     def append(self, key: str, line: str) -> None:
-        """Do nothing: objects do not grow, and what would be added is no part of the result."""
+        """Keep a line until the lock is released: objects do not grow, and it is no part of the result."""
+        self._lines.setdefault(key, []).append(line)
+
+    def put_lines(self) -> None:
+        """Put what `append` has kept, after what is there."""
+        for key, lines in self._lines.items():
+            before = b"".join(c for _, c in self.read_each([key]) if isinstance(c, bytes))
+            self.write(key, before + "".join(f"{line}\n" for line in lines).encode())
+        self._lines = {}
 
     def sizes(self) -> dict[str, int]:
         """Size of every object by key."""
