@@ -106,7 +106,7 @@ from pipeline import open_run
 from pipeline.runs.status import describe_state, state
 from pipeline.runs.verify import verify_run
 directory, what = sys.argv[1:]
-started = time.perf_counter()
+started, cpu = time.perf_counter(), time.process_time()
 if what == "status":
     found = state(directory); describe_state(found); assert found.complete
 elif what == "open_run":
@@ -117,7 +117,7 @@ elif what == "load_unchecked":
     open_run(directory, check=False).load()
 elif what == "verify":
     assert verify_run(directory).sound
-print(f"{time.perf_counter() - started:.2f} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}")
+print(f"{time.perf_counter() - started:.2f} {time.process_time() - cpu:.2f} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}")
 """
 
 
@@ -128,8 +128,8 @@ def measure(directory: Path, what: str) -> str:
     )
     if done.returncode:
         return done.stderr.strip().splitlines()[-1]
-    seconds, megabytes = done.stdout.split()
-    return f"{seconds:>8s} s {megabytes:>6s} MB"
+    seconds, cpu, megabytes = done.stdout.split()
+    return f"{seconds:>8s} s ({cpu:>6s} s of a core) {megabytes:>6s} MB"
 
 
 def main() -> None:
