@@ -11,8 +11,9 @@ import typer
 
 from pipeline.cli.analyse import analyse_app
 from pipeline.cli.common import EXIT_HELP, CommandError
-from pipeline.cli.console import EnoughError
+from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
+from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.identify import identify_app
 from pipeline.cli.magnet import fit_magnet
@@ -57,7 +58,8 @@ def _main(
 
 
 for _command, _settings in (
-    (run, {}), (submit, {}), (status, {}), (verify, {}), (zoom, EXTRA), (simulate, EXTRA), (models, {}),
+    (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
+    (models, {}),
     (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
@@ -104,7 +106,7 @@ def _complain(error: BaseException) -> None:
         LOG.error(text)
         LOG.debug("where it came from", exc_info=error)
     else:
-        print(text, file=sys.stderr)
+        print(visible(text), file=sys.stderr)
 
 
 def main() -> None:
@@ -139,7 +141,7 @@ def _usage(error: Any) -> None:
     if context is not None and not message.strip():  # a group without a command shows its help
         message = context.get_help()
     hint = f"\nhelp: {context.command_path} --help" if context is not None else ""
-    print(f"magpend: {message}{hint}", file=sys.stderr)
+    print(visible(f"magpend: {message}{hint}"), file=sys.stderr)
 
 
 def _leave_quietly() -> None:

@@ -46,8 +46,8 @@ def make(directory: Path, n_tasks: int, *, packed: bool = True) -> None:
     from pipeline.layout.identity import identity_of
     from pipeline.layout.plan import make_plan
     from pipeline.spec.parsing import load_spec
-    from pipeline.store.keys import keys_of
     from pipeline.store.files import entry_of
+    from pipeline.store.keys import keys_of
     from pipeline.store.records import BLOCK, marker_key, pack_key, pack_text, record_text
     from pipeline.store.setup import create
 
