@@ -110,7 +110,7 @@ def run(
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     files = open_files(out if out is not None else default_directory(path, smoke))
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.local)
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)
     carry_out(parsed, path.read_text("utf-8"), files, workers=workers, where=where, echo=echo)
