@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.layout.cells import CellMap
+from pipeline.layout.limits import MOST_TASKS
 from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable
@@ -204,6 +205,8 @@ def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: flo
     per_cell = _bytes_per_cell(spec)
     limit = CHUNK_BYTES if n_points == 1 else TASK_BYTES
     n = min(wanted_seconds / (seconds_per_cell * n_points), limit / (per_cell * n_points))
+    # blocks are filled dim by dim, which can take twice as many
+    n = max(n, 2 * n_cells / n_points / MOST_TASKS)
     return max(1, round(n / LANES)) * LANES
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from magpend_core.models.imported import origin
 from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
+from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.products.reporting import report
 from pipeline.runs.mending import sound_commits
@@ -115,7 +116,8 @@ def run(
     check_starts(parsed)
     plan = make_plan(parsed)
     identity = identity_here(parsed, plan)
-    check(files, identity)
+    if check(files, identity) is None:
+        check_space(plan, files.local)
     with files.lock():
         info = establish(files, parsed, plan, identity, path.read_text("utf-8"), echo)
         with stoppable(files.name):
@@ -124,9 +126,16 @@ def run(
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """What makes a run this one, with the numerical core that is installed here."""
+    """What makes a run this one, with the numerical core that is installed here.
+
+    Raises
+    ------
+    SpecError
+        If it is too large to be laid out, see `limits.check_plan`.
+    """
     from magpend_core import kernel_version
 
+    check_plan(plan)
     return identity_of(spec, plan, kernel_version())
 
 
@@ -141,6 +150,7 @@ def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where:
         echo(f"{info.name} is complete; nothing to do.")
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
+    check_space(plan, info.files.local, plan.n_cells - before)
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )
