@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.layout.domains import check_starts
+from pipeline.layout.limits import check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate
@@ -90,6 +91,7 @@ def describe_plan(
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
     done = read_commits(info, plan) if info else {}
+    check_space(plan, directory, plan.n_cells - sum(plan.cells_in(i) for i in done))
     if parsed.title:
         yield parsed.title
     dims = ", ".join(f"{d} {n}" for d, n in zip(plan.dims, plan.shape, strict=True))

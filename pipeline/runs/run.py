@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from magpend_core.models.imported import origin
 from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
+from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.products.reporting import report
 from pipeline.runs.mending import sound_commits
@@ -149,7 +150,8 @@ def carry_out(
     """
     plan = make_plan(spec)
     identity = identity_here(spec, plan)
-    check(files, identity)
+    if check(files, identity) is None:
+        check_space(plan, files.local)
     with files.lock():
         info = establish(files, spec, plan, identity, text, echo)
         with stoppable(files.name):
@@ -157,9 +159,16 @@ def carry_out(
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """What makes a run this one, with the numerical core that is installed here."""
+    """What makes a run this one, with the numerical core that is installed here.
+
+    Raises
+    ------
+    SpecError
+        If it is too large to be laid out, see `limits.check_plan`.
+    """
     from magpend_core import kernel_version
 
+    check_plan(plan)
     return identity_of(spec, plan, kernel_version())
 
 
@@ -182,6 +191,7 @@ def _complete(
         echo(f"{info.name} is complete; nothing to do.")
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
+    check_space(plan, info.files.local, plan.n_cells - before)
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )
