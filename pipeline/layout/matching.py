@@ -103,7 +103,8 @@ class Finder:
         self._axes = parameter_axes(spec)
         states = initial_states(spec.initial_conditions)
         self._starts = _Grid(states) if states.grid is not None else _Rows(states)
-        self._path, self._directions = None, ()
+        self._path: int | None = None
+        self._directions: tuple[str, ...] = ()
         n_last = states.shape
         if spec.continuation is not None:
             self._path, self._directions = _path_of(spec)[0], spec.continuation.directions
@@ -122,7 +123,7 @@ class Finder:
         """
         n_branches, n_points = inputs.frequency_hz.shape
         here = self._fixed(inputs)
-        steps = []
+        steps: list[np.ndarray] = []
         for i, axis in enumerate(self._axes):
             if i == self._path:
                 steps.append(np.zeros((n_branches, 1), np.int64))
