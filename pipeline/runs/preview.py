@@ -91,7 +91,7 @@ def describe_plan(
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
     done = read_commits(info, plan) if info else {}
-    check_space(plan, directory, plan.n_cells - sum(plan.cells_in(i) for i in done))
+    check_space(plan, files.local, plan.n_cells - sum(plan.cells_in(i) for i in done))
     if parsed.title:
         yield parsed.title
     dims = ", ".join(f"{d} {n}" for d, n in zip(plan.dims, plan.shape, strict=True))
