@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +16,7 @@ from pipeline.layout.plan import Plan, make_plan
 from pipeline.products.reporting import report
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
+from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
 from pipeline.store.commits import log_timing, read_commits, sweep
@@ -29,24 +28,9 @@ from pipeline.store.setup import check, establish
 if TYPE_CHECKING:
     from pipeline.compute.clients import Where
 
+__all__ = ["InterruptedRunError", "identity_here", "run"]
+
 Echo = Callable[[str], None]
-
-
-class InterruptedRunError(Exception):
-    """The run was stopped by a signal; what was committed stays.
-
-    Attributes
-    ----------
-    signal_number : int
-    """
-
-    def __init__(self, signal_number: int, message: str) -> None:
-        self.signal_number = signal_number
-        super().__init__(message)
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, treated like Ctrl-C."""
 
 
 def run(
@@ -98,7 +82,7 @@ def run(
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
-        After Ctrl-C or SIGTERM. What was committed stays.
+        After Ctrl-C, SIGTERM or SIGHUP. What was committed stays.
     """
     from pipeline.compute.clients import Where
 
@@ -111,10 +95,9 @@ def run(
     plan = make_plan(parsed)
     identity = identity_here(parsed, plan)
     check(directory, identity)
-    with writer_lock(directory):
+    with stoppable(directory), writer_lock(directory):
         info = establish(directory, parsed, plan, identity, path.read_text("utf-8"), echo)
-        with stoppable(directory):
-            _complete(info, parsed, plan, workers, where, echo)
+        _complete(info, parsed, plan, workers, where, echo)
     return state(directory)
 
 
@@ -177,31 +160,3 @@ def _require_all(info: RunInfo, plan: Plan) -> None:
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
             "and have room to write; then give the same command again: it computes these tasks alone."
         )
-
-
-@contextlib.contextmanager
-def stoppable(directory: Path) -> Iterator[None]:
-    """Turn Ctrl-C and SIGTERM into `InterruptedRunError`, after everything inside has been closed.
-
-    Parameters
-    ----------
-    directory
-        Where what has been done is kept, for the message.
-    """
-
-    def stop(number: int, frame: Any) -> None:
-        raise _Terminated
-
-    try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not the main thread: signals are somebody else's
-        before = None
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        number = signal.SIGTERM if isinstance(error, _Terminated) else signal.SIGINT
-        message = f"Stopped. What is committed in {directory} stays; the same command goes on from there."
-        raise InterruptedRunError(number, message) from None
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGTERM, before)
