@@ -519,6 +519,8 @@ class Cells(NamedTuple):
     state: Any  # (branch, n_states): initial, at the end final
     step_size: Any  # (branch,): initial [s] or 0, at the end the next
     turns: Any  # int64 (branch, n_states): at the end the turns since the start
+    final_state: Any  # (..., n_states), in which a cell ended; NaN where none began
+    next_step: Any  # s, step size with which the branch goes on from there; NaN where it does not
     section: Any  # (..., n_keep, n_states)
     measures: Any  # (..., n_measures)
     status: Any  # int64
@@ -590,6 +592,10 @@ def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
     cells.n_periods[at] = work.i_period[lane]
     cells.n_steps[at] = int(work.lanes[base + ROWS.steps + column])
     cells.n_rejected[at] = int(work.lanes[base + ROWS.rejected + column])
+    for i in range(N):
+        cells.final_state[at][i] = work.lanes[base + ROWS.state + i * WIDTH + column]
+    if not has_failed(status):
+        cells.next_step[at] = work.lanes[base + ROWS.wish + column]
     if has_failed(status) or status == NO_RETURN:
         forget(cells, work.branch[lane], work.point[lane])
 

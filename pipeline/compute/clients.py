@@ -139,7 +139,7 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
         Before anything is computed.
     """
     import dask
-    import distributed  # noqa: F401  its defaults come with it, and would go with the setting below
+    import distributed  # noqa: F401 - before its settings change: what is set earlier takes them all along
 
     target = where.resolved()
     with contextlib.ExitStack() as stack:

@@ -6,7 +6,7 @@ import contextlib
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,7 @@ from pipeline.spec.parsing import Spec, load_spec
 from pipeline.store.checking import damaged_records, name_of
 from pipeline.store.commits import log_timing
 from pipeline.store.errors import IncompleteError
-from pipeline.store.files import open_files
+from pipeline.store.files import Files, open_files
 from pipeline.store.packing import Packer
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from pipeline.compute.clients import Where
 
 Echo = Callable[[str], None]
+Sources = Sequence[tuple[str, str]]
+"""Directories and digests of runs that hold cells of the one at hand."""
 
 
 class InterruptedRunError(Exception):
@@ -94,13 +96,11 @@ def run(
     SpecError, RefusedError, LockedError
         Before anything is created or changed.
     addresses.SchedulerError
-        If a scheduler or its workers cannot be used; nothing was computed.
+        If a scheduler or its workers cannot be used, or are lost; what was committed stays.
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
         If tasks failed twice. All others are committed.
-    ConnectionError
-        If the scheduler is gone. What was committed stays.
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
@@ -114,15 +114,48 @@ def run(
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.local)
     where.resolved()
     check_starts(parsed)
-    plan = make_plan(parsed)
-    identity = identity_here(parsed, plan)
+    carry_out(parsed, path.read_text("utf-8"), files, workers=workers, where=where, echo=echo)
+    return state(files)
+
+
+def carry_out(
+    spec: Spec,
+    text: str,
+    files: Files,
+    *,
+    workers: int | None,
+    where: Where,
+    echo: Echo,
+    sources: Sources = (),
+) -> None:
+    """Run a specification, or what is missing of it, in a run directory.
+
+    Parameters
+    ----------
+    spec, text
+        It, and the TOML text that it was read from.
+    files
+        Those of the run directory.
+    workers, echo
+        As for `run`.
+    where
+        Where tasks are computed.
+    sources
+        Runs from which cells that they hold are taken, see `pipeline.runs.extend`.
+
+    Raises
+    ------
+    Exception
+        As `run`.
+    """
+    plan = make_plan(spec)
+    identity = identity_here(spec, plan)
     if check(files, identity) is None:
         check_space(plan, files.local)
     with files.lock():
-        info = establish(files, parsed, plan, identity, path.read_text("utf-8"), echo)
+        info = establish(files, spec, plan, identity, text, echo)
         with stoppable(files.name):
-            _complete(info, parsed, plan, workers, where, echo)
-    return state(files)
+            _complete(info, spec, plan, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
@@ -139,7 +172,15 @@ def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
     return identity_of(spec, plan, kernel_version())
 
 
-def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where: Where, echo: Echo) -> None:
+def _complete(
+    info: RunInfo,
+    spec: Spec,
+    plan: Plan,
+    workers: int | None,
+    where: Where,
+    echo: Echo,
+    sources: Sources = (),
+) -> None:
     """Compute all tasks without a valid commit record."""
     from pipeline.compute import clients, execute, task
 
@@ -160,6 +201,8 @@ def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where:
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
     job = partial(task.run_task, info.files.place, info.digest, origin=origin(spec.model))
+    if sources:
+        job = partial(job, sources=tuple(sources))
     started = time.perf_counter()
     cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(missing)))
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
@@ -168,7 +211,8 @@ def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where:
         results = execute.run_tasks(
             job,
             missing,
-            seconds=lambda i: plan.cells_in(i) * plan.seconds_per_cell,
+            after=None if plan.path is None else plan.predecessor,
+            seconds=plan.seconds,
             workers=workers,
             scheduler=where,
             echo=echo,

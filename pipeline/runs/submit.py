@@ -24,7 +24,8 @@ from pipeline.spec.parsing import load_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.commits import read_commits
 from pipeline.store.errors import LockedError
-from pipeline.store.files import local_path, write_atomically
+from pipeline.store.files import local_path
+from pipeline.store.local import write_atomically
 from pipeline.store.setup import check
 
 CLUSTER_FILE = "MAGPEND_CLUSTER"

@@ -177,3 +177,7 @@ class Execution(Table):
     trajectories_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
         None, description="Cells or branches that a task takes; by default as fits its chunks and its time."
     )
+    points_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
+        None,
+        description="Points of the path that a walk's task takes; by default as fits its time.",
+    )

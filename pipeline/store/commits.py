@@ -160,6 +160,17 @@ def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, st
     return found
 
 
+def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
+    """Return the record of one task, None if it has no valid one; its objects are not looked at.
+
+    Raises
+    ------
+    UnreadableError
+        If it is there and cannot be read.
+    """
+    return scan(info, plan, (index // BLOCK,))[0].get(index)
+
+
 def scan(info: RunInfo, plan: Plan, blocks: Container[int] | None = None) -> tuple[Records, dict[str, str]]:
     """Return the whole records of the run, and the problems of the others by file name.
 

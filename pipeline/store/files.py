@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from zarr.abc.store import Store
 
 RUN_FILE, CUBE, COMMITS, LOCK, TIMINGS = "run.json", "cube.zarr", "commits", "lock", "timings.jsonl"
-DERIVED, FIGURES = "derived", "figures"
-OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, TIMINGS, DERIVED, FIGURES})
+DERIVED, FIGURES, EXTENDED = "derived", "figures", "extended.json"
+OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, TIMINGS, DERIVED, FIGURES, EXTENDED})
 TEMPORARY = ".tmp"
 
 # one letter before the colon is a drive; pathlib makes one slash of two
