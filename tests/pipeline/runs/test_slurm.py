@@ -46,7 +46,6 @@ kind = "slurm"
 cores = 1
 memory = "1 GB"
 walltime = "00:10:00"
-min_jobs = 2
 max_jobs = 2
 coordinator_memory = "1 GB"
 interface = "lo"
@@ -136,7 +135,7 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert "Traceback" not in told
     assert "cells done before" in told
     assert "workers come in slurm jobs" in told
-    assert len(list(logs.glob("magpend-worker-*.out"))) == 2
+    assert 1 <= len(list(logs.glob("magpend-worker-*.out"))) <= 2
     assert bytes_of(out) == bytes_of(tmp_path / "laptop")
     assert "complete; nothing to send" in magpend(
         "submit", "spec.toml", "--cluster", "one.toml", "--out", "out"
