@@ -154,7 +154,8 @@ def job_cluster(
         except (ValueError, OSError, RuntimeError) as error:
             raise SchedulerError(f"{cluster.kind}: no scheduler could be started here ({error}).") from None
         with jobs:
-            # not `scale`: that would not replace workers that have left at the end of their lifetime
+            # not `scale`: that would not replace workers that have left at the end of their lifetime; and
+            # one job at least, as no task is submitted before the first worker was looked at
             jobs.adapt(minimum_jobs=cluster.min_jobs, maximum_jobs=cluster.max_jobs, target_duration=_TARGET)
             echo(
                 f"scheduler at {jobs.scheduler_address} in this process ({os.uname().nodename}); workers "
