@@ -13,7 +13,8 @@ from pipeline.cli.exits import Exit
 from pipeline.cli.options import completing
 
 
-def _workflows() -> Iterable[str]:
+def workflow_names() -> Iterable[str]:
+    """Names of the workflows that ship."""
     from pipeline.runs.workflows import shipped_workflows
 
     return shipped_workflows()
@@ -23,11 +24,15 @@ Spec = Annotated[
     str,
     typer.Argument(
         metavar="SPEC", help="A TOML file, or the name of a shipped workflow.",
-        autocompletion=completing(_workflows),
+        autocompletion=completing(workflow_names),
     ),
 ]  # fmt: skip
 
 
+Workers = Annotated[
+    int | None,
+    typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores."),
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(
@@ -42,23 +47,22 @@ ClusterFile = Annotated[
         metavar="FILE", help="TOML file whose [cluster] says what a job is. Default: $MAGPEND_CLUSTER."
     ),
 ]
+Dashboard = Annotated[
+    bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and say where.")
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")]
 
 
 def run(
     spec: Spec,
-    out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores."),
+    out: Annotated[
+        str | None, typer.Option(help="Run directory, or s3://BUCKET/PREFIX; by default runs/NAME.")
     ] = None,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     cluster: ClusterFile = None,
-    dashboard: Annotated[
-        bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and say where.")
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")
-    ] = False,
+    dashboard: Dashboard = False,
+    dry_run: DryRun = False,
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")
     ] = False,
@@ -85,14 +89,14 @@ def run(
         spec, out, workers=workers, scheduler=scheduler, cluster=cluster, dashboard=dashboard, smoke=smoke,
         echo=console.note,
     )  # fmt: skip
-    console.result(f"cube: {state.directory / 'cube.zarr'}")
+    console.result(f"cube: {state.files.below('cube.zarr').name}")
     if plot:
-        _diagram(state.directory)
+        _diagram(state.name)
     else:
-        console.result(f"plot it with: {preview.figure_command(state.plan, state.directory)}")
+        console.result(f"plot it with: {preview.figure_command(state.plan, state.name)}")
 
 
-def _diagram(directory: Path) -> None:
+def _diagram(directory: str) -> None:
     from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES
 
@@ -108,7 +112,7 @@ def status(directory: Directory, json: Json = False) -> None:
 
     found = state(directory)
     row = {
-        "directory": str(found.directory), "title": found.title, "complete": found.complete,
+        "directory": found.name, "title": found.title, "complete": found.complete,
         "cells": found.plan.n_cells, "committed_cells": found.n_committed, "tasks": found.plan.n_tasks,
         "committed_tasks": len(found.done), "status": dict(found.cells),
     }  # fmt: skip

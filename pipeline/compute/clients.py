@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import OPTION, Address, SchedulerError, ask, read_address, security_of
-from pipeline.compute.jobqueue import check_means, job_cluster
+from pipeline.compute.jobqueue import check_means, job_cluster, jobs_folder
 from pipeline.compute.local import local_cluster
 from pipeline.compute.probe import check_directory, check_versions
 from pipeline.spec.clusters import QUEUES, Cluster, clock, load_cluster, seconds_of
@@ -42,14 +42,14 @@ class Where:
         With the ``[cluster]`` table of a batch system; by default what ``MAGPEND_CLUSTER`` says.
     dashboard : bool
         Serve dask's dashboard on loopback, and say where.
-    directory : Path, optional
-        Which all workers must see.
+    place : str, optional
+        Of the run directory, which all workers must see: see `open_files`.
     """
 
     scheduler: str | None = None
     cluster_file: Path | None = None
     dashboard: bool = False
-    directory: Path | None = None
+    place: str | None = None
 
     @classmethod
     def of(cls, scheduler: Where | str | None) -> Where:
@@ -139,6 +139,7 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
         Before anything is computed.
     """
     import dask
+    import distributed  # noqa: F401  its defaults come with it, and would go with a setting made before them
 
     target = where.resolved()
     with contextlib.ExitStack() as stack:
@@ -148,7 +149,7 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
             client = stack.enter_context(_client(target.url, security_of(target)))
             _wait(client, target.named, _patience(), echo)
         elif isinstance(target, Cluster):
-            folder = jobs_folder(where.directory or Path.cwd() / "magpend")
+            folder = jobs_folder(where.place or "magpend")
             jobs = stack.enter_context(job_cluster(target, folder, dashboard=where.dashboard, echo=echo))
             client = stack.enter_context(_client(jobs, None))
             _wait(client, f"jobs of {target.kind}", target.wait_s, echo)
@@ -158,13 +159,8 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
         if where.dashboard:
             echo(f"dashboard: {client.dashboard_link}")
         if target != LOCAL:
-            _check(client, where.directory)
+            _check(client, where.place)
         yield client
-
-
-def jobs_folder(directory: Path) -> Path:
-    """Where a run's batch scripts, and what its jobs say, are kept: beside its directory."""
-    return directory.absolute().with_name(f"{directory.absolute().name}.jobs")
 
 
 def _client(scheduler: Any, security: Any) -> Any:
@@ -205,8 +201,8 @@ def _workers(client: Any) -> list[str]:
     return list(client.scheduler_info(n_workers=-1)["workers"])
 
 
-def _check(client: Any, directory: Path | None) -> None:
+def _check(client: Any, place: str | None) -> None:
     workers = _workers(client)
     check_versions(client, workers)
-    if directory is not None:
-        check_directory(client, workers, directory)
+    if place is not None:
+        check_directory(client, workers, place)

@@ -1,7 +1,7 @@
 """Run tasks: in this process, or on the workers of a dask scheduler.
 
-Tasks are submitted as futures in a window, so that a scheduler holds few of them however long the run
-is; their results are small dicts. Nothing here knows what a task computes.
+Tasks are submitted in a window, so that a scheduler holds few of them however long the run is; their
+results are small dicts. Nothing here knows what a task computes.
 """
 
 from __future__ import annotations
@@ -11,15 +11,12 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from pipeline.compute.clients import IN_PROCESS, Where, connected
+from pipeline.compute.order import Order, Predecessor, TaskFailedError, why
+
+__all__ = ["TaskFailedError", "default_workers", "run_tasks"]
 
 Task = Callable[[int], dict[str, Any]]
-
-WINDOW = 3
-"""Tasks in flight per worker thread."""
-
-
-class TaskFailedError(Exception):
-    """A task raised; the message says which and why."""
+Echo = Callable[[str], None]
 
 
 def default_workers() -> int:
@@ -31,71 +28,65 @@ def run_tasks(
     task: Task,
     indices: Sequence[int],
     *,
+    after: Predecessor | None = None,
+    seconds: Callable[[int], float] | None = None,
     workers: int | None = None,
     scheduler: Where | str | None = None,
-    echo: Callable[[str], None] = print,
+    echo: Echo = print,
 ) -> Iterator[dict[str, Any]]:
     """Run `task` for every index and yield the results as they come.
+
+    Where one fails, the others go on; it is tried again alone when they are done.
 
     Parameters
     ----------
     task
-        Must be importable on the workers, or a partial of such a function.
+        Must be importable on the workers, or a partial of such a function. Running it twice, even at
+        once, must do no harm.
     indices
-        What to run.
+        What to run, each once.
+    after
+        The task whose result must be there before one starts, or None; one that is not in `indices` is
+        there already.
+    seconds
+        What a task takes on one core, as estimated [s]. A worker that is busy with it for far longer (see
+        `pipeline.compute.limits`) is restarted, and the task goes elsewhere. Not looked at in this process.
     workers
         Processes of the local cluster; 0 runs in this process.
     scheduler
         Where; a text stands for ``Where(text)``.
     echo
-        Prints a line.
+        Takes a line when something goes wrong and is dealt with.
 
     Raises
     ------
     SpecError, SchedulerError
-        Before anything is computed, if there are no such workers.
+        Before anything is computed, if there are no such workers; and when the scheduler is lost.
     TaskFailedError
-        As soon as a task fails; tasks in flight are given up.
+        At the end, if tasks failed twice; at once, if so many fail that it is not the tasks.
     """
+    order = Order(indices, after)
     where = Where.of(scheduler)
     if where.resolved() == IN_PROCESS or workers == 0:
-        yield from _in_process(task, indices)
+        yield from _in_process(task, order)
         return
+    from pipeline.compute.probe import Fitting
+    from pipeline.compute.window import Window
+
     n_workers = min(workers or default_workers(), len(indices))
     with connected(where, n_workers, echo) as client:
-        yield from _window(client, task, indices)
+        task = Fitting(task)
+        yield from Window(client, task, order, seconds=seconds, echo=echo).results()
+    order.close()
 
 
-def _in_process(task: Task, indices: Sequence[int]) -> Iterator[dict[str, Any]]:
-    for index in indices:
+def _in_process(task: Task, order: Order) -> Iterator[dict[str, Any]]:
+    while (index := order.take()) is not None or (index := order.take_failed()) is not None:
         try:
             result = task(index)
         except Exception as error:
-            raise TaskFailedError(f"task {index}: {type(error).__name__}: {error}") from error
+            order.failed(index, why(error))
+            continue
+        order.done(index)
         yield result
-
-
-def _window(client: Any, task: Task, indices: Sequence[int]) -> Iterator[dict[str, Any]]:
-    """Keep a few tasks per thread in flight, and yield results in the order in which they finish."""
-    from distributed import as_completed
-
-    threads = sum(client.nthreads().values()) or 1
-    waiting = iter(indices)
-    names = {}
-
-    def submit(n: int) -> list[Any]:
-        chosen = [i for _, i in zip(range(n), waiting, strict=False)]
-        futures = client.map(task, chosen, pure=False)
-        names.update({f.key: i for f, i in zip(futures, chosen, strict=True)})
-        return list(futures)
-
-    pending = as_completed(submit(WINDOW * threads), loop=client.loop)  # type: ignore[no-untyped-call]
-    for batch in pending.batches():  # type: ignore[no-untyped-call]
-        for future in batch:
-            index = names.pop(future.key)
-            if future.status != "finished":
-                error = future.exception()
-                raise TaskFailedError(f"task {index}: {type(error).__name__}: {error}") from error
-            yield future.result()
-        for future in submit(len(batch)):
-            pending.add(future)  # type: ignore[no-untyped-call]
+    order.close()

@@ -1,52 +1,214 @@
-"""A cluster of this machine's cores, which lives as long as the run."""
+"""A cluster of this machine's cores, which lives as long as the run.
+
+What protects it from other people on this machine: it listens on loopback alone, and every connection
+is TLS with a certificate on both sides, made for this cluster and kept in a folder that its owner alone
+may enter. Who has no key can neither give it work nor read results; its HTTP servers answer nothing.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import logging
+import multiprocessing
 import os
+import shutil
 import signal
 import tempfile
+import time
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import Any
+
+from pipeline.compute.addresses import SchedulerError
+
+PREFIX = "magpend-workers-"
+
+START_S = 180.0
+"""A worker that does not start within this time has failed [s]."""
+
+SETTINGS: dict[str, Any] = {
+    # a profile of every task would grow with their number
+    "distributed.worker.profile.enabled": False,
+    "distributed.worker.http.routes": [],
+    # results are small: there is nothing to write to disk
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    # on a busy machine a worker may take long to come back
+    "distributed.deploy.lost-worker-timeout": "1 hour",
+}
+
+NO_PAGES: dict[str, Any] = {"distributed.scheduler.http.routes": []}
+
+_scratch_folders: set[Path] = set()
 
 
 @contextlib.contextmanager
 def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
-    """Yield a cluster of single-threaded processes, reachable from this machine alone."""
+    """Yield a cluster of single-threaded processes, reachable with its own keys alone.
+
+    Some workers may still be starting when it comes. The dashboard shows what is computed to everyone on
+    this machine.
+
+    Raises
+    ------
+    SchedulerError
+        If none starts.
+    """
+    import dask
     from distributed import LocalCluster
 
+    _start_tracker()
     with (
-        tempfile.TemporaryDirectory(prefix="magpend-", ignore_cleanup_errors=True) as scratch,
+        _scratch() as scratch,
+        dask.config.set({**SETTINGS, **({} if dashboard else NO_PAGES), "temporary-directory": str(scratch)}),
+        _loop() as loop,
         LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=n_workers,
+            n_workers=0,
             threads_per_worker=1,
+            memory_limit=1.0 / n_workers,
             processes=True,
             host="127.0.0.1",
+            protocol="tls",
+            security=_security(scratch),
             # The scheduler serves HTTP even without a dashboard: by default at port 8787, with a
             # warning if another run is there.
             scheduler_kwargs={"dashboard": dashboard, "dashboard_address": "127.0.0.1:0"},
-            local_directory=scratch,
+            local_directory=str(scratch),
             silence_logs=50,
+            loop=loop,
         ) as cluster,
     ):
         try:
+            cluster.scale(n_workers)
+            _await_one(cluster)
             yield cluster
         except BaseException:
-            _kill(cluster)
+            _silence()
+            for nanny in cluster.workers.values():
+                nanny.auto_restart = False
+            kill_workers()
             raise
 
 
-def _kill(cluster: Any) -> None:
-    """End the workers at once: what they are computing is given up, and may take long.
+def _await_one(cluster: Any) -> None:
+    """Wait for the first worker; the others may come later."""
+    end = time.monotonic() + START_S
+    while not cluster.scheduler.workers:
+        if time.monotonic() > end:
+            raise SchedulerError(f"no worker process has started within {START_S:.0f} s.")
+        time.sleep(0.02)
 
-    dask then logs each connection that it misses, some after the cluster has closed; the exception that
-    led here says what happened.
+
+@contextlib.contextmanager
+def _loop() -> Iterator[Any]:
+    """Yield an event loop in a thread of its own.
+
+    Ctrl-C goes to every process of the terminal. Workers shall leave it to the coordinator: they inherit
+    from this thread that it is blocked.
     """
-    for name in ("distributed", "distributed.client"):
+    from distributed.utils import LoopRunner
+
+    with _blocked({signal.SIGINT, signal.SIGHUP}):
+        runner = LoopRunner()
+        runner.start()  # type: ignore[no-untyped-call]
+    try:
+        yield runner.loop
+    finally:
+        runner.stop()  # type: ignore[no-untyped-call]
+
+
+def _security(scratch: Path) -> Any:
+    """Make a key and a certificate for this cluster alone; both sides of a connection must show it."""
+    from distributed import Security
+
+    made = Security.temporary()  # type: ignore[no-untyped-call]
+    files = {}
+    for name, text in (("certificate", made.tls_ca_file), ("key", made.tls_scheduler_key)):
+        files[name] = str(scratch / f"{name}.pem")
+        descriptor = os.open(files[name], os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with open(descriptor, "w", encoding="ascii") as file:
+            file.write(text)
+    certificate, key = files["certificate"], files["key"]
+    roles = {f"tls_{r}_cert": certificate for r in ("client", "scheduler", "worker")}
+    keys = {f"tls_{r}_key": key for r in ("client", "scheduler", "worker")}
+    return Security(  # type: ignore[no-untyped-call]
+        require_encryption=True, tls_ca_file=certificate, **roles, **keys
+    )
+
+
+@contextlib.contextmanager
+def _scratch() -> Iterator[Path]:
+    """Yield a folder of this process alone, and remove those of processes that were killed."""
+    _sweep()
+    folder = Path(tempfile.mkdtemp(prefix=PREFIX))
+    _scratch_folders.add(folder)
+    try:
+        with (folder / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        _scratch_folders.discard(folder)
+
+
+def _sweep() -> None:
+    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        with contextlib.suppress(OSError):
+            status = folder.lstat()
+            if status.st_uid != os.getuid() or not folder.is_dir() or folder.is_symlink():
+                continue
+            with (folder / "lock").open("r") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start_tracker() -> None:
+    """Start the process that removes semaphores of killed processes, without its warning about each.
+
+    What it removes is what it is there for; nobody can do anything about the warning. It must outlive a
+    terminal that closes, as it does Ctrl-C.
+    """
+    name, before = "PYTHONWARNINGS", os.environ.get("PYTHONWARNINGS")
+    quiet = "ignore::UserWarning:multiprocessing.resource_tracker"
+    os.environ[name] = f"{before},{quiet}" if before else quiet
+    try:
+        with _blocked({signal.SIGHUP}):
+            resource_tracker.ensure_running()
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+
+
+@contextlib.contextmanager
+def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
+    """Block signals in this thread, and in what it starts meanwhile."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _silence() -> None:
+    """Say nothing of connections that break now; the exception that leads here says what happened."""
+    for name in ("distributed", "distributed.client", "distributed.core", "distributed.nanny", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    for nanny in cluster.workers.values():
-        nanny.auto_restart = False
-        if nanny.pid:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(nanny.pid, signal.SIGKILL)
+
+
+def kill_workers() -> None:
+    """End the workers at once: what they are computing is given up, and may take long."""
+    for process in multiprocessing.active_children():
+        if process.name.startswith("Dask Worker process"):
+            process.kill()
+
+
+def abandon() -> None:
+    """Leave nothing behind, without waiting: for a process that is about to end at once."""
+    _silence()
+    kill_workers()
+    for folder in list(_scratch_folders):
+        shutil.rmtree(folder, ignore_errors=True)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,39 +12,31 @@ from typing import TYPE_CHECKING, Any
 from magpend_core.models.imported import origin
 from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
+from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.products.reporting import report
+from pipeline.runs.mending import sound_commits
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
+from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
-from pipeline.store.commits import log_timing, read_commits, sweep
+from pipeline.store.checking import damaged_records, name_of
+from pipeline.store.commits import log_timing
 from pipeline.store.errors import IncompleteError
-from pipeline.store.files import local_path, writer_lock
+from pipeline.store.files import Files, open_files
+from pipeline.store.packing import Packer
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
 
 if TYPE_CHECKING:
     from pipeline.compute.clients import Where
 
+__all__ = ["InterruptedRunError", "carry_out", "identity_here", "run"]
+
 Echo = Callable[[str], None]
-
-
-class InterruptedRunError(Exception):
-    """The run was stopped by a signal; what was committed stays.
-
-    Attributes
-    ----------
-    signal_number : int
-    """
-
-    def __init__(self, signal_number: int, message: str) -> None:
-        self.signal_number = signal_number
-        super().__init__(message)
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, treated like Ctrl-C."""
+Sources = Sequence[tuple[str, str]]
+"""Directories and digests of runs that hold cells of the one at hand."""
 
 
 def run(
@@ -90,52 +80,101 @@ def run(
     SpecError, RefusedError, LockedError
         Before anything is created or changed.
     addresses.SchedulerError
-        If a scheduler or its workers cannot be used; nothing was computed.
+        If a scheduler or its workers cannot be used, or are lost; what was committed stays.
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
-        If a task failed. What was committed stays.
+        If tasks failed twice. All others are committed.
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
-        After Ctrl-C or SIGTERM. What was committed stays.
+        After Ctrl-C, SIGTERM or SIGHUP. What was committed stays.
     """
     from pipeline.compute.clients import Where
 
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
-    directory = local_path(out) if out is not None else default_directory(path, smoke)
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, directory)
+    files = open_files(out if out is not None else default_directory(path, smoke))
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)
-    plan = make_plan(parsed)
-    identity = identity_here(parsed, plan)
-    check(directory, identity)
-    with writer_lock(directory):
-        info = establish(directory, parsed, plan, identity, path.read_text("utf-8"), echo)
-        with stoppable(directory):
-            _complete(info, parsed, plan, workers, where, echo)
-    return state(directory)
+    carry_out(parsed, path.read_text("utf-8"), files, workers=workers, where=where, echo=echo)
+    return state(files)
+
+
+def carry_out(
+    spec: Spec,
+    text: str,
+    files: Files,
+    *,
+    workers: int | None,
+    where: Where,
+    echo: Echo,
+    sources: Sources = (),
+) -> None:
+    """Run a specification, or what is missing of it, in a run directory.
+
+    Parameters
+    ----------
+    spec, text
+        It, and the TOML text that it was read from.
+    files
+        Those of the run directory.
+    workers, echo
+        As for `run`.
+    where
+        Where tasks are computed.
+    sources
+        Runs from which cells that they hold are taken, see `pipeline.runs.extend`.
+
+    Raises
+    ------
+    Exception
+        As `run`.
+    """
+    plan = make_plan(spec)
+    identity = identity_here(spec, plan)
+    if check(files, identity) is None:
+        check_space(plan, files.local)
+    with stoppable(files.name), files.lock():
+        info = establish(files, spec, plan, identity, text, echo)
+        _complete(info, spec, plan, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """What makes a run this one, with the numerical core that is installed here."""
+    """What makes a run this one, with the numerical core that is installed here.
+
+    Raises
+    ------
+    SpecError
+        If it is too large to be laid out, see `limits.check_plan`.
+    """
     from magpend_core import kernel_version
 
+    check_plan(plan)
     return identity_of(spec, plan, kernel_version())
 
 
-def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where: Where, echo: Echo) -> None:
+def _complete(
+    info: RunInfo,
+    spec: Spec,
+    plan: Plan,
+    workers: int | None,
+    where: Where,
+    echo: Echo,
+    sources: Sources = (),
+) -> None:
     """Compute all tasks without a valid commit record."""
     from pipeline.compute import clients, execute, task
 
-    commits = read_commits(info, plan, echo)
-    sweep(info, commits, echo)
+    commits = sound_commits(info, plan, echo)
+    packer = Packer(info, plan, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
-        echo(f"{info.directory} is complete; nothing to do.")
+        echo(f"{info.name} is complete; nothing to do.")
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
+    check_space(plan, info.files.local, plan.n_cells - before)
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )
@@ -144,56 +183,38 @@ def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where:
     seconds = task.warm_up(spec)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
-    place = str(info.directory.absolute())
-    job = partial(task.run_task, place, info.digest, origin=origin(spec.model))
+    job = partial(task.run_task, info.files.place, info.digest, origin=origin(spec.model))
+    if sources:
+        job = partial(job, sources=tuple(sources))
     started = time.perf_counter()
     cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(missing)))
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
     terminal = sys.stdout.isatty()
     with Progress(plan.n_cells, before, terminal=terminal, echo=echo, expected_s=expected_s) as progress:
-        for result in execute.run_tasks(job, missing, workers=workers, scheduler=where, echo=echo):
-            log_timing(info.directory, {**result, "at_s": round(time.perf_counter() - started, 4)})
+        results = execute.run_tasks(
+            job,
+            missing,
+            after=None if plan.path is None else plan.predecessor,
+            seconds=plan.seconds,
+            workers=workers,
+            scheduler=where,
+            echo=echo,
+        )
+        for result in results:
+            log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
+            packer.add(result["task"])
             progress.add(result["cells"])
     _require_all(info, plan)
 
 
 def _require_all(info: RunInfo, plan: Plan) -> None:
     """Believe the commit records, not the workers."""
-    problems: list[str] = []
-    commits = read_commits(info, plan, problems.append)
-    absent = [i for i in range(plan.n_tasks) if i not in commits]
+    commits, problems = damaged_records(info, plan, contents=False)
+    absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:
-        why = f" {problems[0]}." if problems else ""
+        why = f" {next(iter(problems.values()))}." if problems else ""
         raise IncompleteError(
-            f"{info.directory}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
+            f"{info.name}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
             "and have room to write; then give the same command again: it computes these tasks alone."
         )
-
-
-@contextlib.contextmanager
-def stoppable(directory: Path) -> Iterator[None]:
-    """Turn Ctrl-C and SIGTERM into `InterruptedRunError`, after everything inside has been closed.
-
-    Parameters
-    ----------
-    directory
-        Where what has been done is kept, for the message.
-    """
-
-    def stop(number: int, frame: Any) -> None:
-        raise _Terminated
-
-    try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not the main thread: signals are somebody else's
-        before = None
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        number = signal.SIGTERM if isinstance(error, _Terminated) else signal.SIGINT
-        message = f"Stopped. What is committed in {directory} stays; the same command goes on from there."
-        raise InterruptedRunError(number, message) from None
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGTERM, before)

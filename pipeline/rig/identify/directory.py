@@ -32,17 +32,16 @@ from pipeline.spec.models import is_model_file
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import (
     FIGURES,
+    HOLDER,
     LOCK,
     RUN_FILE,
+    entry_of,
     is_temporary,
-    is_there,
     local_path,
-    object_entry,
+    open_files,
     problems_of,
-    sync_folder,
-    unreadable,
-    write_atomically,
 )
+from pipeline.store.local import is_there, sync_folder, unreadable, write_atomically
 from pipeline.store.provenance import provenance, versions
 
 T = TypeVar("T")
@@ -51,7 +50,7 @@ FORMAT = 1
 IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES = (
     "identification.json", "result.json", "residuals.nc", "preset.toml", "outcomes",
 )  # fmt: skip
-_OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK})
+_OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK, HOLDER})
 _ROOM = Path(__file__).parent
 _NOT_NUMBERS = (
     "check.py", "comparison.py", "directory.py", "figures.py", "reports.py", "residuals.py",
@@ -219,7 +218,9 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
         return None
     if not is_identification(directory):
         with unreadable(directory):
-            names = sorted(p.name for p in directory.iterdir() if p.name != LOCK and not is_temporary(p.name))
+            locks = (LOCK, HOLDER)
+            found = [p.name for p in directory.iterdir()]
+            names = sorted(name for name in found if name not in locks and not is_temporary(name))
         if names:
             raise RefusedError(
                 f"{directory}: is not empty and holds no identification ({', '.join(names[:5])}); give "
@@ -293,7 +294,7 @@ class Outcomes:
 
 def write_result(directory: Path, result: Mapping[str, Any], files: Sequence[str]) -> None:
     """Write ``result.json``, which says that everything is there, with the digests of the other files."""
-    entries = {name: object_entry(directory / name) for name in sorted(files)}
+    entries = {name: entry_of((directory / name).read_bytes()) for name in sorted(files)}
     write_atomically(directory / RESULT, canonical({**result, "files": entries}))
 
 
@@ -329,4 +330,4 @@ def is_complete(directory: Path) -> bool:
         result = read_result(directory)
     except DamagedError:
         return False
-    return not problems_of(directory, result.get("files", {}))
+    return not problems_of(open_files(directory), result.get("files", {}))

@@ -1,0 +1,305 @@
+"""Tasks on the workers of a dask scheduler: a few in flight per thread, watched while they run.
+
+What has to do with waiting happens in the client's event loop; the results, the starts of tasks and the
+news of workers meet in one queue, so that nothing that stands still can hold up the rest.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import queue
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from pipeline.compute.addresses import SchedulerError
+from pipeline.compute.limits import SILENT_S, Limits
+from pipeline.compute.order import Order, why
+
+WINDOW = 3
+"""Tasks in flight per worker thread."""
+
+TICK_S = 1.0
+"""The workers are looked at so often [s]."""
+
+ANSWER_S = 30.0
+"""A scheduler that does not answer for so long is taken for gone [s]."""
+
+WAITING_S = 30.0
+"""Without workers for so long, a line says so [s]."""
+
+MOST_HANGS = 2
+"""A task that hung so often is set aside, to be tried again alone."""
+
+Task = Callable[[int], dict[str, Any]]
+Echo = Callable[[str], None]
+
+
+@dataclass
+class _Flight:
+    """A task that was submitted."""
+
+    index: int
+    future: Any
+    started: float | None = None
+    worker: str = ""
+
+
+def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]:
+    """Run a task on a worker and say before that it begins."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    worker.log_event(topic, {"ticket": ticket, "worker": worker.address})
+    return task(index)
+
+
+class Window:
+    """Runs the tasks of an `Order` on the workers that a client reaches.
+
+    Parameters
+    ----------
+    client
+        Of dask.
+    task
+        Takes an index; must be importable on the workers.
+    order
+        Hands out the tasks.
+    seconds
+        Estimated time of a task on one core [s].
+    echo
+        Takes a line when something goes wrong and is dealt with.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        task: Task,
+        order: Order,
+        *,
+        seconds: Callable[[int], float] | None = None,
+        echo: Echo = print,
+    ) -> None:
+        self._client, self._order, self._echo = client, order, echo
+        self._limits = Limits(seconds)
+        self._topic = f"magpend-{uuid.uuid4().hex}"
+        self._task = partial(announced, task, self._topic)
+        self._flights: dict[int, _Flight] = {}
+        self._ticket = 0
+        self._news: queue.SimpleQueue[tuple[str, int, Any]] = queue.SimpleQueue()
+        self._hangs: dict[int, int] = {}
+        self._watch = Watch()
+        self._waiting_since: float | None = None
+
+    def results(self) -> Iterator[dict[str, Any]]:
+        """Yield results in the order in which tasks finish.
+
+        Raises
+        ------
+        TaskFailedError
+            At once, if so many tasks fail that it is not the tasks.
+        SchedulerError
+            If the scheduler is gone.
+        """
+        self._client.subscribe_topic(self._topic, self._on_start)
+        self._look()
+        self._fill()
+        while self._flights:
+            for kind, ticket, value in self._wait():
+                yield from self._take(kind, ticket, value)
+            if self._watch.due():
+                self._look()
+                self._give_up_late()
+            self._fill()
+
+    def _fill(self) -> None:
+        """Submit what may start, up to the window; when nothing is left, what failed, one by one."""
+        wanted = WINDOW * max(self._watch.n_threads, 1) - len(self._flights)
+        chosen: list[int] = []
+        while len(chosen) < wanted and (index := self._order.take()) is not None:
+            chosen.append(index)
+        if not chosen and not self._flights and (index := self._order.take_failed()) is not None:
+            chosen.append(index)
+        if chosen:
+            self._submit(chosen)
+
+    def _submit(self, indices: list[int], elsewhere: list[str] | None = None) -> None:
+        tickets = range(self._ticket, self._ticket + len(indices))
+        self._ticket = tickets.stop
+        futures = self._client.map(self._task, tickets, indices, pure=False, workers=elsewhere)
+        for ticket, index, future in zip(tickets, indices, futures, strict=True):
+            self._flights[ticket] = _Flight(index, future)
+            future.add_done_callback(partial(self._on_end, ticket))
+
+    def _on_start(self, event: tuple[float, dict[str, Any]]) -> None:
+        self._news.put(("start", event[1]["ticket"], event[1]["worker"]))
+
+    def _on_end(self, ticket: int, future: Any) -> None:
+        """Have a result fetched; in a thread of the client's."""
+        if ticket not in self._flights:
+            return
+        if future.status == "finished":
+            fetch = asyncio.run_coroutine_threadsafe(
+                _fetched(self._client, future), self._client.loop.asyncio_loop
+            )
+            fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
+        else:
+            error = future.exception() if future.status == "error" else asyncio.CancelledError()
+            self._news.put(("end", ticket, (None, error)))
+
+    def _wait(self) -> Iterator[tuple[str, int, Any]]:
+        """Yield all news, after waiting for some for a moment."""
+        with contextlib.suppress(queue.Empty):
+            yield self._news.get(timeout=TICK_S)
+            while True:
+                yield self._news.get_nowait()
+
+    def _take(self, kind: str, ticket: int, value: Any) -> Iterator[dict[str, Any]]:
+        flight = self._flights.get(ticket)
+        if flight is None:
+            return  # of a task that was given up
+        if kind == "start":
+            flight.started, flight.worker = self._watch.now, value
+            return
+        del self._flights[ticket]
+        result, error = value
+        if error is None:
+            if flight.started is not None:
+                self._limits.finished(flight.index, self._watch.now - flight.started)
+            self._order.done(flight.index)
+            yield result
+        elif isinstance(error, asyncio.CancelledError):
+            raise SchedulerError(self._lost())
+        else:
+            self._order.failed(flight.index, _reason(error))
+
+    def _lost(self) -> str:
+        return (
+            f"The scheduler {self._client.scheduler.address} is gone. What is committed stays; the same "
+            "command goes on once a scheduler is there."
+        )
+
+    def _look(self) -> None:
+        """See which workers there are and which of them do not answer, and restart those."""
+        try:
+            seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
+        except (OSError, TimeoutError) as error:
+            raise SchedulerError(self._lost()) from error
+        silent = self._watch.look(seen["workers"])
+        for address in silent:
+            self._echo(
+                f"a worker has not answered for {SILENT_S:.0f} s: it is restarted, its tasks go elsewhere"
+            )
+            self._restart(address)
+        self._say_if_waiting()
+
+    def _say_if_waiting(self) -> None:
+        if self._watch.n_threads:
+            self._waiting_since = None
+        elif self._waiting_since is None:
+            self._waiting_since = self._watch.now
+        elif self._watch.now - self._waiting_since > WAITING_S:
+            self._waiting_since = float("inf")
+            self._echo("the scheduler has no workers; waiting for some")
+
+    def _give_up_late(self) -> None:
+        """Take tasks that have run for too long away from their workers, and restart these."""
+        for ticket, flight in list(self._flights.items()):
+            if flight.started is None:
+                continue
+            tries = 1 + self._hangs.get(flight.index, 0)
+            limit = self._limits.limit_s(flight.index, tries)
+            if self._watch.now - flight.started > limit:
+                self._give_up(ticket, flight, limit)
+
+    def _give_up(self, ticket: int, flight: _Flight, limit: float) -> None:
+        del self._flights[ticket]
+        flight.future.cancel(force=True)
+        self._restart(flight.worker)
+        hangs = self._hangs[flight.index] = 1 + self._hangs.get(flight.index, 0)
+        text = f"not done after {limit:.0f} s, far more than estimated"
+        self._echo(f"task {flight.index}: {text}; its worker is restarted")
+        if hangs < MOST_HANGS:
+            self._submit([flight.index])
+        else:
+            self._order.failed(flight.index, text)
+
+    def _restart(self, address: str) -> None:
+        """End a worker; its nanny starts a new one, and the scheduler gives its tasks to others."""
+        self._watch.forget(address)
+        restart = self._client.restart_workers(
+            [address], timeout=ANSWER_S, raise_for_error=False, asynchronous=True
+        )
+        asyncio.run_coroutine_threadsafe(_quietly(restart), self._client.loop.asyncio_loop)
+
+
+class Watch:
+    """Knows which workers there are and when each was last heard of.
+
+    Its clock goes on only while it is looked at: time in which this process was itself stopped, by Ctrl-Z
+    or a closed lid, blames nobody.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._last = clock()
+        self._looked = float("-inf")
+        self._heard: dict[str, tuple[float, float]] = {}
+        self.n_threads = 0
+        self._time = 0.0
+
+    @property
+    def now(self) -> float:
+        """Seconds on this clock."""
+        now = self._clock()
+        self._time += min(now - self._last, 5 * TICK_S)
+        self._last = now
+        return self._time
+
+    def due(self) -> bool:
+        """Whether it is time to look again."""
+        return self.now - self._looked >= TICK_S
+
+    def look(self, workers: dict[str, Any]) -> list[str]:
+        """Take what the scheduler knows of its workers, and return those that have fallen silent."""
+        now = self._looked = self.now
+        self.n_threads = sum(w["nthreads"] for w in workers.values())
+        heard = {}
+        for address, worker in workers.items():
+            seen = worker["last_seen"]
+            before = self._heard.get(address)
+            heard[address] = before if before is not None and before[0] == seen else (seen, now)
+        self._heard = heard
+        limit = max(SILENT_S, len(workers) / 50)
+        return [address for address, (_, since) in heard.items() if now - since > limit]
+
+    def forget(self, address: str) -> None:
+        """Begin anew with a worker."""
+        self._heard.pop(address, None)
+
+
+async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
+    """Fetch a result."""
+    try:
+        return await client.gather(future, asynchronous=True), None
+    except (Exception, asyncio.CancelledError) as error:
+        return None, error
+
+
+async def _quietly(restart: Any) -> None:
+    with contextlib.suppress(Exception):
+        await restart
+
+
+def _reason(error: BaseException) -> str:
+    from distributed.scheduler import KilledWorker
+
+    if isinstance(error, KilledWorker):
+        n = error.allowed_failures + 1
+        times = "died" if n == 1 else f"died {n} times"
+        return f"its worker {times} (out of memory, or killed)"
+    return why(error)
