@@ -22,10 +22,10 @@ kind = "sweep"
 title = "two attractors of a flow"
 
 [model]
-name = "bautin"
+name = "normal_form"  # tests/core/flows.py has it, too: it compiles once
 states = { x = {}, y = {} }
-parameters = { mu = -0.1, omega = 2.0 }
-define = { s = "x**2 + y**2", g = "mu + s - s**2" }
+parameters = { mu = -0.1, omega = 2.0, cubic = 1.0, quintic = -1.0 }
+define = { s = "x**2 + y**2", g = "mu + cubic*s + quintic*s**2" }
 equations = { x = "g*x - omega*y", y = "omega*x + g*y" }
 
 [section]
