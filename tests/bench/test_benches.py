@@ -165,3 +165,12 @@ def test_text_peers__equations_are_those_of_the_engine(bench, name):
     function = heyoka.cfunc(right, variables)
     theirs = function(inputs=np.ascontiguousarray(states.T), time=np.full(len(states), 0.1)).T
     assert np.allclose(theirs, ours, rtol=1e-10, atol=1e-10)
+
+
+def test_object_store__prints_a_table(bench, monkeypatch, capsys):
+    pytest.importorskip("obstore")
+    for name in ("AWS_ENDPOINT_URL", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_REGION"):
+        monkeypatch.setenv(name, "")  # the benchmark sets them, and they are as before at the end
+    bench("object_store").main(["--tasks", "2", "--latency-ms", "1"])
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in ("set up", "commit a task", "load a variable", "verify"))
