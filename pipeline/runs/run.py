@@ -26,6 +26,7 @@ from pipeline.store.commits import log_timing
 from pipeline.store.errors import IncompleteError
 from pipeline.store.files import Files, open_files
 from pipeline.store.packing import Packer
+from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
 
@@ -150,10 +151,12 @@ def carry_out(
     plan = make_plan(spec)
     identity = identity_here(spec, plan)
     check(files, identity)
-    with files.lock():
-        info = establish(files, spec, plan, identity, text, echo)
+    with files.lock() as alone:
+        is_alone = alone is not False
+        info = establish(files, spec, plan, identity, text, echo, alone=is_alone)
         with stoppable(files.name):
-            _complete(info, spec, plan, workers, where, echo, sources)
+            commits = sound_commits(info, plan, echo, alone=is_alone)
+            _complete(info, spec, plan, commits, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
@@ -167,6 +170,7 @@ def _complete(
     info: RunInfo,
     spec: Spec,
     plan: Plan,
+    commits: Records,
     workers: int | None,
     where: Where,
     echo: Echo,
@@ -175,7 +179,6 @@ def _complete(
     """Compute all tasks without a valid commit record."""
     from pipeline.compute import clients, execute, task
 
-    commits = sound_commits(info, plan, echo)
     packer = Packer(info, plan, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from zarr.abc.store import Store
 
 RUN_FILE, CUBE, COMMITS, LOCK, TIMINGS = "run.json", "cube.zarr", "commits", "lock", "timings.jsonl"
-DERIVED, FIGURES, EXTENDED = "derived", "figures", "extended.json"
-OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, TIMINGS, DERIVED, FIGURES, EXTENDED})
+DERIVED, FIGURES, EXTENDED, HOLDER = "derived", "figures", "extended.json", "lock.json"
+OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, HOLDER, TIMINGS, DERIVED, FIGURES, EXTENDED})
 TEMPORARY = ".tmp"
 
 # one letter before the colon is a drive; pathlib makes one slash of two
@@ -133,8 +133,10 @@ class Files(Protocol):
         """What zarr reads and writes here."""
         ...
 
-    def lock(self) -> AbstractContextManager[None]:
+    def lock(self) -> AbstractContextManager[bool | None]:
         """Hold the lock: a courtesy between people, the commit protocol does not rest on it.
+
+        Gives False where locks do not work, so that another process may be writing, too.
 
         Raises
         ------

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import platform
 import shutil
 import stat
 import uuid
@@ -11,13 +13,14 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from pipeline.store.errors import LockedError, RefusedError, UnreadableError
-from pipeline.store.files import LOCK, TEMPORARY, LinkError
+from pipeline.store.files import HOLDER, LOCK, TEMPORARY, LinkError
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class LocalFiles:
         """The folder as zarr takes it."""
         return LocalStore(self.root, read_only=read_only)
 
-    def lock(self) -> AbstractContextManager[None]:
+    def lock(self) -> AbstractContextManager[bool]:
         """Hold the folder's lock."""
         return writer_lock(self.root)
 
@@ -269,13 +272,15 @@ def remove_tree(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def writer_lock(directory: Path) -> Iterator[None]:
+def writer_lock(directory: Path) -> Iterator[bool]:
     """Hold the directory's lock: a courtesy between people, the commit protocol does not rest on it.
+
+    The system frees the lock of a process that has ended, however it did. Gives False where locks fail.
 
     Raises
     ------
     LockedError
-        If another process holds it.
+        If another process holds it; names that one.
     """
     from filelock import FileLock, Timeout
 
@@ -285,13 +290,34 @@ def writer_lock(directory: Path) -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout:
         raise LockedError(
-            f"{directory}: another magpend run is writing here. Wait for it or stop it, then run again."
+            f"{directory}: another magpend run is writing here{_holder(directory)}. Wait for it or stop it, "
+            "then run again."
         ) from None
     except (NotImplementedError, OSError) as error:
         warnings.warn(f"{directory}: no file lock here ({error}); start one run at a time.", stacklevel=3)
-        yield
+        yield False
         return
     try:
-        yield
+        _sign(directory)
+        yield True
     finally:
+        with contextlib.suppress(OSError):
+            (directory / HOLDER).unlink()
         lock.release()
+
+
+def _sign(directory: Path) -> None:
+    """Say who holds the lock; beside it, since some locks lose what is written into them."""
+    since = datetime.now(UTC).isoformat(timespec="seconds")
+    text = json.dumps({"host": platform.node(), "pid": os.getpid(), "since": since})
+    with contextlib.suppress(OSError):  # nothing rests on it
+        (directory / HOLDER).write_text(text + "\n", "utf-8")
+
+
+def _holder(directory: Path) -> str:
+    """Who holds the lock, as far as is known."""
+    try:
+        data = json.loads((directory / HOLDER).read_text("utf-8"))
+        return f": process {int(data['pid'])} on {str(data['host'])!r} since {str(data['since'])!r}"
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""

@@ -166,7 +166,7 @@ class CommittedStore(WrapperStore[Store]):
 
 
 def _crc32c_fits(content: bytes) -> bool:
-    return google_crc32c.value(content[:-4]) == int.from_bytes(content[-4:], "little")
+    return bool(google_crc32c.value(content[:-4]) == int.from_bytes(content[-4:], "little"))
 
 
 async def _sha256(content: Any, size: int) -> str:
