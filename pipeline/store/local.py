@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import platform
 import shutil
 import stat
 import uuid
@@ -13,7 +12,6 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 from zarr.abc.store import Store
@@ -21,6 +19,7 @@ from zarr.storage import LocalStore
 
 from pipeline.store.errors import LockedError, RefusedError, UnreadableError
 from pipeline.store.files import HOLDER, LOCK, TEMPORARY, LinkError
+from pipeline.store.lease import holder, in_words
 
 
 @dataclass(frozen=True)
@@ -289,35 +288,33 @@ def writer_lock(directory: Path) -> Iterator[bool]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
+        said = b""
+        with contextlib.suppress(OSError):
+            said = (directory / HOLDER).read_bytes()
         raise LockedError(
-            f"{directory}: another magpend run is writing here{_holder(directory)}. Wait for it or stop it, "
-            "then run again."
+            f"{directory}: another magpend run is writing here{in_words(said)}. Wait for it or stop it, then "
+            "run again."
         ) from None
     except (NotImplementedError, OSError) as error:
         warnings.warn(f"{directory}: no file lock here ({error}); start one run at a time.", stacklevel=3)
         yield False
         return
     try:
-        _sign(directory)
-        yield True
+        with _named(directory / HOLDER):
+            yield True
     finally:
-        with contextlib.suppress(OSError):
-            (directory / HOLDER).unlink()
         lock.release()
 
 
-def _sign(directory: Path) -> None:
-    """Say who holds the lock; beside it, since some locks lose what is written into them."""
-    since = datetime.now(UTC).isoformat(timespec="seconds")
-    text = json.dumps({"host": platform.node(), "pid": os.getpid(), "since": since})
-    with contextlib.suppress(OSError):  # nothing rests on it
-        (directory / HOLDER).write_text(text + "\n", "utf-8")
-
-
-def _holder(directory: Path) -> str:
-    """Who holds the lock, as far as is known."""
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Say beside a lock who holds it, for those who ask in vain; a process that is killed leaves it there."""
+    content = json.dumps(holder()).encode()
+    with contextlib.suppress(OSError):
+        path.write_bytes(content)
     try:
-        data = json.loads((directory / HOLDER).read_text("utf-8"))
-        return f": process {int(data['pid'])} on {str(data['host'])!r} since {str(data['since'])!r}"
-    except (OSError, ValueError, KeyError, TypeError):
-        return ""
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            if path.read_bytes() == content:  # the folder may have been renamed meanwhile
+                path.unlink()

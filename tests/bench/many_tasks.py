@@ -117,7 +117,8 @@ elif what == "load_unchecked":
     open_run(directory, check=False).load()
 elif what == "verify":
     assert verify_run(directory).sound
-print(f"{time.perf_counter() - started:.2f} {time.process_time() - cpu:.2f} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}")
+wall, cpu = time.perf_counter() - started, time.process_time() - cpu
+print(f"{wall:.2f} {cpu:.2f} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}")
 """
 
 

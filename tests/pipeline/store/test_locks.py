@@ -78,7 +78,7 @@ def test_writer_lock__names_its_holder_and_frees_a_killed_one(holder, tmp_path):
     with pytest.raises(LockedError) as caught, writer_lock(tmp_path):
         pass
     said = str(caught.value)
-    assert f"process {holder.pid} on '{platform.node()}' since '20" in said
+    assert f"(process {holder.pid} on {platform.node()} since 20" in said
     assert "Wait for it or stop it" in said
     holder.kill()
     holder.join()
