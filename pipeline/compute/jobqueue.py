@@ -47,9 +47,15 @@ def check_means(cluster: Cluster) -> None:
         raise SpecError(problems)
 
 
-def jobs_folder(directory: Path) -> Path:
-    """Where a run's batch scripts, and what its jobs say, are kept: beside its directory."""
-    return directory.absolute().with_name(f"{directory.absolute().name}.jobs")
+def jobs_folder(place: str) -> Path:
+    """Where a run's batch scripts, and what its jobs say, are kept: beside its directory.
+
+    Those of a run that is in no local folder are kept in the working directory.
+    """
+    where = (
+        Path(place).absolute() if "://" not in place else Path.cwd() / place.rstrip("/").rpartition("/")[2]
+    )
+    return where.with_name(f"{where.name}.jobs")
 
 
 def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:

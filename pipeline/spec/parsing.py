@@ -8,6 +8,7 @@ angles in degrees are converted once, in `pipeline.layout.cells`.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -118,6 +119,7 @@ _TABLES: dict[str, type[Table]] = {
     "section": SectionTable,
 }
 _OPTIONAL = ("drive", "section")
+MAX_CELLS = 10**15
 MOST_RELATED = 12
 """Axes of parameters that a model relates to each other: all corners of their box are looked at."""
 _KEYS = (
@@ -230,6 +232,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
     problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
+    problems += _size_problems(axes, starts)
     problems += method_problems(tables["integration"], products, "drive" in data)
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
     has_periods = "drive" in data or "section" in data or model.autonomous
@@ -391,6 +394,19 @@ def _walk(
             "add it to [axes] or set the path."
         )
     return walk
+
+
+def _size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
+    """Say that nobody could count the cells, so that nothing behind this overflows."""
+    sizes = {f"axes.{name}": axis.n for name, axis in axes.items()}
+    if isinstance(starts, GridStarts):
+        sizes |= {f"initial_conditions.{name}": axis.n for name, axis in starts.ranges.items()}
+    if math.prod(sizes.values()) <= MAX_CELLS:
+        return []
+    return [
+        f"{' x '.join(sizes)}: {math.prod(sizes.values()):.3g} cells; {MAX_CELLS:.0e} are the most: take "
+        "fewer values."
+    ]
 
 
 def _parameter_problems(

@@ -95,6 +95,10 @@ def magpend(shell):
     return lambda *words, code=0: shell(sys.executable, "-m", "pipeline.cli.main", *words, code=code)
 
 
+def is_run(directory):
+    return (directory / "run.json").is_file()
+
+
 def wait(for_what, logs):
     deadline = time.monotonic() + PATIENCE_S
     while not for_what():
@@ -108,7 +112,6 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
         (tmp_path / f"{name}.toml").write_text(text)
     run(tmp_path / "spec.toml", tmp_path / "laptop", workers=0, echo=lambda line: None)
     out, logs = tmp_path / "out", tmp_path / "out.jobs"
-    commits = out / "commits"
 
     # one job holds all; it is cancelled when some tasks are committed and some are not
     said = magpend("submit", "spec.toml", "--cluster", "one.toml", "--out", "out")
@@ -118,7 +121,7 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert job in shell("squeue", "-h", "-o", "%i")
     refused = magpend("submit", "spec.toml", "--cluster", "one.toml", "--out", "out", code=3)
     assert f"job {job} of this run is there already" in refused
-    wait(lambda: commits.is_dir() and len(list(commits.glob("*.json"))) >= 2, logs)
+    wait(lambda: is_run(out) and len(state(out).done) >= 2, logs)
     shell(*f"scancel {job}".split())
     wait(lambda: not shell("squeue", "-h"), logs)
     assert "incomplete" in magpend("status", "out")
