@@ -185,11 +185,16 @@ def sync(files: Iterable[Path], top: Path) -> None:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a small file so that after a crash it is there whole or not at all."""
     temporary = temporary_beside(path)
-    with temporary.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
     sync_folder(path.parent)
 
 
