@@ -22,7 +22,14 @@ from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
-from magpend_core.validation import check_array, check_count, check_frequency, check_states, check_tolerance
+from magpend_core.validation import (
+    check_array,
+    check_count,
+    check_flag,
+    check_frequency,
+    check_states,
+    check_tolerance,
+)
 
 
 @dataclass(frozen=True)
@@ -153,6 +160,7 @@ def run_branches(
     n_keep = check_count("n_keep", n_keep, 1)
     max_orbit_period = check_count("max_orbit_period", max_orbit_period, 1)
     tolerance = check_tolerance("closure_tolerance", closure_tolerance)
+    observer = RECORD_CLOSED if check_flag("stop_when_closed", stop_when_closed) else RECORD_LAST
     settings = Settings(n_transient, n_keep, max_orbit_period, tolerance, window_of(max_orbit_period))
     if method is not None:
         system = replace(system, method=method)
@@ -161,7 +169,7 @@ def run_branches(
             raise ValueError("frequency_hz must be None with a section by crossing: its periods are returns.")
         system, parameters, frequency_hz = section.applied(check_array("parameters", parameters, 3), system)
     cells = integrate(
-        system, RECORD_CLOSED if stop_when_closed else RECORD_LAST, settings,
+        system, observer, settings,
         parameters=parameters, frequency_hz=frequency_hz, initial_states=initial_states,
         n_keep=n_keep, n_measures=FIRST_TURN + system.n_states, rtol=rtol, atol=atol,
         max_steps_per_period=max_steps_per_period, step_size=step_size, n_lanes=n_lanes,
@@ -235,10 +243,9 @@ def sections(
             raise ValueError("frequency_hz = None: give the drive's frequency, or a section by crossing.")
         frequency = None
     else:
-        frequency = np.asarray(frequency_hz, np.float64)
-        if frequency.ndim == 0:
-            frequency = np.full(len(initial), float(frequency))
-        frequency = check_frequency(frequency, 1)[:, None]
+        frequency = check_frequency(frequency_hz, (0, 1))
+        frequency = np.full(len(initial), frequency) if frequency.ndim == 0 else frequency
+        frequency = frequency[:, None]
     n = len(initial) if frequency is None else len(frequency)
     packed = np.broadcast_to(parameters.pack(), (n, 1, len(parameters.names)))
     result = run_branches(

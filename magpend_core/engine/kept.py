@@ -112,7 +112,7 @@ def _exposed(found: os.stat_result) -> str:
 class _InItsFolder(CompileResultCacheImpl):
     """What numba would keep beside the sources, where its folder cannot be used, is not kept."""
 
-    _locator_classes = [UserProvidedCacheLocator]
+    _locator_classes = [UserProvidedCacheLocator]  # noqa: RUF012 # as declared there
 
 
 class KeptCode(FunctionCache):

@@ -13,7 +13,7 @@ from typing import Any
 from pipeline.compute.clients import IN_PROCESS, Where, connected
 from pipeline.compute.order import Order, Predecessor, TaskFailedError, why
 
-__all__ = ["IN_PROCESS", "TaskFailedError", "default_workers", "run_tasks"]
+__all__ = ["TaskFailedError", "default_workers", "run_tasks"]
 
 Task = Callable[[int], dict[str, Any]]
 Echo = Callable[[str], None]
@@ -61,13 +61,12 @@ def run_tasks(
     Raises
     ------
     SpecError, SchedulerError
-        Before anything is computed, if there are no such workers.
+        Before anything is computed, if there are no such workers; and when the scheduler is lost.
     TaskFailedError
         At the end, if tasks failed twice; at once, if so many fail that it is not the tasks.
-    ConnectionError
-        If the scheduler is gone.
     """
-    order, where = Order(indices, after), Where.of(scheduler)
+    order = Order(indices, after)
+    where = Where.of(scheduler)
     if where.resolved() == IN_PROCESS or workers == 0:
         yield from _in_process(task, order)
         return

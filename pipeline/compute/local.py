@@ -21,12 +21,14 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
+from pipeline.compute.addresses import SchedulerError
+
 PREFIX = "magpend-workers-"
 
 START_S = 180.0
 """A worker that does not start within this time has failed [s]."""
 
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     # a profile of every task would grow with their number
     "distributed.worker.profile.enabled": False,
     "distributed.worker.http.routes": [],
@@ -46,11 +48,12 @@ _scratch_folders: set[Path] = set()
 def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
     """Yield a cluster of single-threaded processes, reachable with its own keys alone.
 
-    Workers may still be starting when it comes.
+    Some workers may still be starting when it comes. The dashboard shows what is computed to everyone on
+    this machine.
 
     Raises
     ------
-    ConnectionError
+    SchedulerError
         If none starts.
     """
     import dask
@@ -58,7 +61,7 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
 
     _quiet_tracker()
     with (
-        dask.config.set(SETTINGS if dashboard else {**SETTINGS, **NO_PAGES}),
+        dask.config.set(SETTINGS if dashboard else SETTINGS | NO_PAGES),
         _scratch() as scratch,
         _loop() as loop,
         LocalCluster(  # type: ignore[no-untyped-call]
@@ -94,7 +97,7 @@ def _await_one(cluster: Any) -> None:
     end = time.monotonic() + START_S
     while not cluster.scheduler.workers:
         if time.monotonic() > end:
-            raise ConnectionError(f"no worker process has started within {START_S:.0f} s.")
+            raise SchedulerError(f"no worker process has started within {START_S:.0f} s.")
         time.sleep(0.02)
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from pipeline.compute.addresses import SchedulerError
 from pipeline.compute.limits import SILENT_S, Limits
 from pipeline.compute.order import Order, why
 
@@ -38,17 +39,12 @@ Task = Callable[[int], dict[str, Any]]
 Echo = Callable[[str], None]
 
 
-class SchedulerLostError(ConnectionError):
-    """The scheduler is gone; what is committed stays."""
-
-
 @dataclass
 class _Flight:
     """A task that was submitted."""
 
     index: int
     future: Any
-    fetch: Any
     started: float | None = None
     worker: str = ""
 
@@ -106,23 +102,19 @@ class Window:
         ------
         TaskFailedError
             At once, if so many tasks fail that it is not the tasks.
-        SchedulerLostError
+        SchedulerError
             If the scheduler is gone.
         """
         self._client.subscribe_topic(self._topic, self._on_start)
         self._look()
-        try:
+        self._fill()
+        while self._flights:
+            for kind, ticket, value in self._wait():
+                yield from self._take(kind, ticket, value)
+            if self._watch.due():
+                self._look()
+                self._give_up_late()
             self._fill()
-            while self._flights:
-                for kind, ticket, value in self._wait():
-                    yield from self._take(kind, ticket, value)
-                if self._watch.due():
-                    self._look()
-                    self._give_up_late()
-                self._fill()
-        finally:
-            for flight in self._flights.values():
-                flight.fetch.cancel()
 
     def _fill(self) -> None:
         """Submit what may start, up to the window; when nothing is left, what failed, one by one."""
@@ -140,18 +132,24 @@ class Window:
         self._ticket = tickets.stop
         futures = self._client.map(self._task, tickets, indices, pure=False, workers=elsewhere)
         for ticket, index, future in zip(tickets, indices, futures, strict=True):
-            fetch = asyncio.run_coroutine_threadsafe(
-                _fetched(self._client, future), self._client.loop.asyncio_loop
-            )
-            self._flights[ticket] = _Flight(index, future, fetch)
-            fetch.add_done_callback(partial(self._on_end, ticket))
+            self._flights[ticket] = _Flight(index, future)
+            future.add_done_callback(partial(self._on_end, ticket))
 
     def _on_start(self, event: tuple[float, dict[str, Any]]) -> None:
         self._news.put(("start", event[1]["ticket"], event[1]["worker"]))
 
-    def _on_end(self, ticket: int, fetch: Any) -> None:
-        if not fetch.cancelled():
-            self._news.put(("end", ticket, fetch.result()))
+    def _on_end(self, ticket: int, future: Any) -> None:
+        """Have a result fetched; in a thread of the client's."""
+        if ticket not in self._flights:
+            return
+        if future.status == "finished":
+            fetch = asyncio.run_coroutine_threadsafe(
+                _fetched(self._client, future), self._client.loop.asyncio_loop
+            )
+            fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
+        else:
+            error = future.exception() if future.status == "error" else asyncio.CancelledError()
+            self._news.put(("end", ticket, (None, error)))
 
     def _wait(self) -> Iterator[tuple[str, int, Any]]:
         """Yield all news, after waiting for some for a moment."""
@@ -175,7 +173,7 @@ class Window:
             self._order.done(flight.index)
             yield result
         elif isinstance(error, asyncio.CancelledError):
-            raise SchedulerLostError(self._lost())
+            raise SchedulerError(self._lost())
         else:
             self._order.failed(flight.index, _reason(error))
 
@@ -190,7 +188,7 @@ class Window:
         try:
             seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
         except (OSError, TimeoutError) as error:
-            raise SchedulerLostError(self._lost()) from error
+            raise SchedulerError(self._lost()) from error
         silent = self._watch.look(seen["workers"])
         for address in silent:
             self._echo(
@@ -220,7 +218,6 @@ class Window:
 
     def _give_up(self, ticket: int, flight: _Flight, limit: float) -> None:
         del self._flights[ticket]
-        flight.fetch.cancel()
         flight.future.cancel(force=True)
         self._restart(flight.worker)
         hangs = self._hangs[flight.index] = 1 + self._hangs.get(flight.index, 0)
@@ -286,12 +283,10 @@ class Watch:
 
 
 async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
-    """Wait for a future and fetch its result."""
-    from distributed.client import FutureCancelledError
-
+    """Fetch a result."""
     try:
         return await client.gather(future, asynchronous=True), None
-    except (Exception, FutureCancelledError) as error:
+    except (Exception, asyncio.CancelledError) as error:
         return None, error
 
 

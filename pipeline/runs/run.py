@@ -16,13 +16,16 @@ from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.products.reporting import report
+from pipeline.runs.mending import sound_commits
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
-from pipeline.store.commits import log_timing, read_commits, sweep
+from pipeline.store.checking import damaged_records, name_of
+from pipeline.store.commits import log_timing
 from pipeline.store.errors import IncompleteError
 from pipeline.store.files import Files, open_files
+from pipeline.store.packing import Packer
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
 
@@ -92,13 +95,11 @@ def run(
     SpecError, RefusedError, LockedError
         Before anything is created or changed.
     addresses.SchedulerError
-        If a scheduler or its workers cannot be used; nothing was computed.
+        If a scheduler or its workers cannot be used, or are lost; what was committed stays.
     UnreadableError
         If a file of the directory is there and cannot be read; nothing is removed.
     execute.TaskFailedError
         If tasks failed twice. All others are committed.
-    ConnectionError
-        If the scheduler is gone. What was committed stays.
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
@@ -174,8 +175,8 @@ def _complete(
     """Compute all tasks without a valid commit record."""
     from pipeline.compute import clients, execute, task
 
-    commits = read_commits(info, plan, echo)
-    sweep(info, commits, echo)
+    commits = sound_commits(info, plan, echo)
+    packer = Packer(info, plan, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
         echo(f"{info.name} is complete; nothing to do.")
@@ -208,17 +209,17 @@ def _complete(
         )
         for result in results:
             log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
+            packer.add(result["task"])
             progress.add(result["cells"])
     _require_all(info, plan)
 
 
 def _require_all(info: RunInfo, plan: Plan) -> None:
     """Believe the commit records, not the workers."""
-    problems: list[str] = []
-    commits = read_commits(info, plan, problems.append)
-    absent = [i for i in range(plan.n_tasks) if i not in commits]
+    commits, problems = damaged_records(info, plan, contents=False)
+    absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:
-        why = f" {problems[0]}." if problems else ""
+        why = f" {next(iter(problems.values()))}." if problems else ""
         raise IncompleteError(
             f"{info.name}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "

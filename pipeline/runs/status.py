@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,10 +52,7 @@ def state(source: str | Path | Files | Run) -> State:
         As `Run.open`.
     """
     run = Run.open(source)
-    cells: Counter[str] = Counter()
-    for commit in run.commits.values():
-        cells.update(commit.status)
-    return State(run.directory, run.info.title, run.plan, frozenset(run.commits), dict(cells))
+    return State(run.directory, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
 
 
 def describe_state(found: State) -> list[str]:

@@ -1,4 +1,4 @@
-"""Cells of one committed task, for the task that goes on from them."""
+"""Cells of one committed task, compared with its record: for whoever goes on from them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import zarr
 from pipeline.layout.plan import Plan
 from pipeline.store.commits import read_commit
 from pipeline.store.errors import IncompleteError
+from pipeline.store.records import Commit
+from pipeline.store.run import Run
 from pipeline.store.runfile import RunInfo
 from pipeline.store.view import committed_view
 
@@ -45,5 +47,24 @@ def read_cells(
             f"{info.name}: task {index}, from which another goes on, is not committed here. Every "
             "worker must see this very folder, by this path; then give the same command again."
         )
-    view = committed_view(info, {index: commit})
+    return _read(info, plan, index, commit, region, names)
+
+
+def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Read variables of a task of an opened run, in the shape of its block followed by their own dims.
+
+    Raises
+    ------
+    DamagedError
+        If what is read is not what was written.
+    KeyError
+        If the task is not committed.
+    """
+    return _read(run.info, run.plan, index, run.commits[index], run.plan.task(index), names)
+
+
+def _read(
+    info: RunInfo, plan: Plan, index: int, commit: Commit, region: tuple[slice, ...], names: Iterable[str]
+) -> dict[str, np.ndarray]:
+    view = committed_view(info, plan, {index: commit}, check=True)
     return {name: np.asarray(zarr.open_array(view, path=name, mode="r")[region]) for name in names}

@@ -1,4 +1,4 @@
-"""Which chunk belongs to which task: keys such as ``section/c.0.3.0.0`` follow from the plan, and lead back."""
+"""Which chunk belongs to which task: keys such as ``section/c.0.3.0.0`` follow from the plan, and back."""
 
 from __future__ import annotations
 
@@ -29,24 +29,35 @@ def keys_of(plan: Plan, index: int) -> list[str]:
 
 
 class Owners:
-    """The task that a chunk belongs to."""
+    """The task that a chunk belongs to.
+
+    Parameters
+    ----------
+    plan
+        Of the run.
+    """
 
     def __init__(self, plan: Plan) -> None:
-        self._n_dims = len(plan.shape)
-        self._chunks = {v.name: plan.chunks(v)[: self._n_dims] for v in plan.variables}
         self._block, self._grid = plan.block, plan.task_grid
+        self._chunks: dict[str, tuple[int, ...]] = {}
+        self._counts: dict[str, tuple[int, ...]] = {}
+        for variable in plan.variables:
+            chunks = plan.chunks(variable)
+            shape = (*plan.shape, *(plan.sizes[dim] for dim in variable.own_dims))
+            self._chunks[variable.name] = chunks
+            self._counts[variable.name] = tuple(-(-n // c) for n, c in zip(shape, chunks, strict=True))
 
     def task(self, key: str) -> int | None:
         """Return the task of a chunk's key; None for what is no chunk of a cell."""
         name, _, rest = key.partition("/")
-        chunks = self._chunks.get(name)
-        mark, *places = rest.split(".")
-        if chunks is None or mark != "c" or len(places) < self._n_dims:
+        mark, *words = rest.split(".")
+        counts = self._counts.get(name)
+        if counts is None or mark != "c" or len(words) != len(counts):
+            return None
+        places = [int(word) if word.isdecimal() and len(word) < 12 else -1 for word in words]
+        if any(not 0 <= p < n or str(p) != w for p, n, w in zip(places, counts, words, strict=True)):
             return None
         index = 0
-        for place, c, b, n in zip(places, chunks, self._block, self._grid, strict=False):
-            task = int(place) * c // b if place.isdecimal() else n
-            if task >= n:
-                return None
-            index = index * n + task
+        for place, c, b, n in zip(places, self._chunks[name], self._block, self._grid, strict=False):
+            index = index * n + place * c // b
         return index

@@ -10,7 +10,7 @@ from typing import Any
 from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan
 from pipeline.spec.parsing import Spec
-from pipeline.store.commits import verify, withdraw
+from pipeline.store.checking import verify
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import (
     COMMITS,
@@ -21,6 +21,7 @@ from pipeline.store.files import (
     is_temporary,
     open_files,
 )
+from pipeline.store.packing import withdraw
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
 from pipeline.store.skeleton import (
     GROUP_KEY,
@@ -117,7 +118,10 @@ def _holds_something(files: Files, name: str) -> bool:
 
 def _digests(files: Files) -> set[str]:
     """Digests of runs that the group's metadata and the commit records name."""
-    records = [f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith(".json")]
+    records = [
+        f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith((".json", ".jsonl"))
+    ]
+    # of a pack, its first record
     found = {_text_in(content, "digest") for _, content in files.read_each(records)}
     for _, content in files.read_each([f"{CUBE}/{GROUP_KEY}"]):
         found.add(_text_in(content, "attributes", "digest"))
@@ -129,7 +133,7 @@ def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
     if isinstance(content, FileNotFoundError):
         return None
     try:
-        data = json.loads(content)
+        data = json.loads(content if len(keys) > 1 else content.split(b"\n")[0])
         for key in keys:
             data = data[key]
     except (ValueError, TypeError, KeyError):

@@ -25,6 +25,7 @@ from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import DamagedError, IncompleteError, RefusedError, UnreadableError
 from pipeline.store.files import local_path
 from pipeline.store.local import LocalFiles
+from pipeline.store.records import Records
 from pipeline.store.run import Run
 from pipeline.store.seal import seal, unseal
 from pipeline.store.setup import check, create, establish
@@ -113,9 +114,9 @@ def test_sweep__says_what_it_removes(whole):
     said = []
     commits = read_commits(whole.info, whole.plan, said.append)
     assert said == ["commits/000001.json: torn or damaged; it does not count"]
-    n = sweep(whole.info, commits, said.append)
+    n = sweep(whole.info, whole.plan, commits, said.append)
     assert f"removed {n} files that no commit record vouches for: cube.zarr/" in said[1]
-    assert sweep(whole.info, commits, said.append) == 0
+    assert sweep(whole.info, whole.plan, commits, said.append) == 0
     assert len(said) == 2
 
 
@@ -172,7 +173,7 @@ def test_run__links_are_not_followed(whole, tmp_path, name):
             use()
     if name != "cube.zarr/section":
         with pytest.raises(RefusedError, match="is a link"):
-            sweep(whole.info, {})
+            sweep(whole.info, whole.plan, Records(whole.info.files, whole.info.digest, {}))
     assert everything(target) == before
 
 
@@ -185,7 +186,7 @@ def test_sweep__removes_a_link_and_not_what_it_leads_to(whole, tmp_path):
     (cube / "status/c.link").symlink_to(file)
     (cube / "status/folder").symlink_to(folder)
     assert verify_run(whole.info.directory).leftovers == ["status/c.link", "status/folder"]
-    assert sweep(whole.info, read_commits(whole.info, whole.plan)) == 2
+    assert sweep(whole.info, whole.plan, read_commits(whole.info, whole.plan)) == 2
     assert (folder / "kept").read_text() == file.read_text() == "x"
 
 
@@ -359,7 +360,7 @@ def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
         (directory / ".run.json.abc.tmp").write_text("{")
         assert check(directory, made.identity) is None
         info = establish(directory, made.spec, made.plan, made.identity, "text", silent)
-        sweep(info, {})
+        sweep(info, made.plan, Records(info.files, info.digest, {}))
         assert verify_run(directory).sound
         assert not list(directory.rglob("*.tmp"))
 

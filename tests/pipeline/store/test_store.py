@@ -19,6 +19,7 @@ from pipeline.store import local
 from pipeline.store.commits import marker_key, read_commits, sweep, write_task
 from pipeline.store.errors import DamagedError, LockedError, RefusedError
 from pipeline.store.local import LocalFiles, writer_lock
+from pipeline.store.records import Records
 from pipeline.store.run import Run
 from pipeline.store.runfile import read_run
 from pipeline.store.setup import check, create
@@ -32,6 +33,11 @@ def read_all(directory):
     """Every variable as `open_run` shows it."""
     ds = open_run(directory)
     return {v.name: ds[v.name].values for v in VARIABLES}
+
+
+def none_of(info):
+    """No record at all."""
+    return Records(info.files, info.digest, {})
 
 
 def assert_pending(directory, plan, index):
@@ -127,7 +133,7 @@ def test_write_task__crash_between_steps_leaves_pending(made, monkeypatch, modul
     assert_pending(made.info.directory, made.plan, 0)
     commits = read_commits(made.info, made.plan)
     assert set(commits) == {1}
-    sweep(made.info, commits)
+    sweep(made.info, made.plan, commits)
     assert_data(made.info.directory, made, 1)
     made.commit(0)
     assert_data(made.info.directory, made, 0)
@@ -149,7 +155,7 @@ def test_write_task__crash_before_the_marker_is_renamed(made, monkeypatch):
     leftovers = list((made.info.directory / "commits").iterdir())
     assert len(leftovers) == 1
     assert_pending(made.info.directory, made.plan, 0)
-    assert sweep(made.info, {}) == 1 + CUBE_WRITES
+    assert sweep(made.info, made.plan, none_of(made.info)) == 1 + CUBE_WRITES
     assert list((made.info.directory / "commits").iterdir()) == []
 
 
@@ -280,7 +286,7 @@ def test_sweep__touches_nothing_else(made):
         (directory / name / "kept.txt").write_text("x")
     (directory / "cube.zarr/section/c.0.0.abc.partial").write_bytes(b"x")
     before = sorted(p for p in directory.rglob("*") if p.is_file() and not p.name.endswith("partial"))
-    assert sweep(made.info, read_commits(made.info, made.plan)) == 1
+    assert sweep(made.info, made.plan, read_commits(made.info, made.plan)) == 1
     assert sorted(p for p in directory.rglob("*") if p.is_file()) == before
 
 
