@@ -267,7 +267,7 @@ def extend(
     first = open_files(source)
     in_place = out is None or open_files(out).place == first.place
     built = open_files(_beside(_folder(first)) if in_place else str(out))
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, built.local)
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, built.place)
     where.resolved()
     how: dict[str, Any] = {"workers": workers, "where": where, "echo": echo}
     if in_place:

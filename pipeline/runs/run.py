@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 from magpend_core.models.imported import origin
 from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
+from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.products.reporting import report
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
+from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
 from pipeline.store.checking import damaged_records, name_of
@@ -32,26 +32,11 @@ from pipeline.store.setup import check, establish
 if TYPE_CHECKING:
     from pipeline.compute.clients import Where
 
+__all__ = ["InterruptedRunError", "carry_out", "identity_here", "run"]
+
 Echo = Callable[[str], None]
 Sources = Sequence[tuple[str, str]]
 """Directories and digests of runs that hold cells of the one at hand."""
-
-
-class InterruptedRunError(Exception):
-    """The run was stopped by a signal; what was committed stays.
-
-    Attributes
-    ----------
-    signal_number : int
-    """
-
-    def __init__(self, signal_number: int, message: str) -> None:
-        self.signal_number = signal_number
-        super().__init__(message)
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, treated like Ctrl-C."""
 
 
 def run(
@@ -103,14 +88,14 @@ def run(
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
-        After Ctrl-C or SIGTERM. What was committed stays.
+        After Ctrl-C, SIGTERM or SIGHUP. What was committed stays.
     """
     from pipeline.compute.clients import Where
 
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     files = open_files(out if out is not None else default_directory(path, smoke))
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.local)
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)
     carry_out(parsed, path.read_text("utf-8"), files, workers=workers, where=where, echo=echo)
@@ -149,17 +134,24 @@ def carry_out(
     """
     plan = make_plan(spec)
     identity = identity_here(spec, plan)
-    check(files, identity)
-    with files.lock():
+    if check(files, identity) is None:
+        check_space(plan, files.local)
+    with stoppable(files.name), files.lock():
         info = establish(files, spec, plan, identity, text, echo)
-        with stoppable(files.name):
-            _complete(info, spec, plan, workers, where, echo, sources)
+        _complete(info, spec, plan, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """What makes a run this one, with the numerical core that is installed here."""
+    """What makes a run this one, with the numerical core that is installed here.
+
+    Raises
+    ------
+    SpecError
+        If it is too large to be laid out, see `limits.check_plan`.
+    """
     from magpend_core import kernel_version
 
+    check_plan(plan)
     return identity_of(spec, plan, kernel_version())
 
 
@@ -182,6 +174,7 @@ def _complete(
         echo(f"{info.name} is complete; nothing to do.")
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
+    check_space(plan, info.files.local, plan.n_cells - before)
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )
@@ -225,31 +218,3 @@ def _require_all(info: RunInfo, plan: Plan) -> None:
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
             "and have room to write; then give the same command again: it computes these tasks alone."
         )
-
-
-@contextlib.contextmanager
-def stoppable(directory: str | Path) -> Iterator[None]:
-    """Turn Ctrl-C and SIGTERM into `InterruptedRunError`, after everything inside has been closed.
-
-    Parameters
-    ----------
-    directory
-        Where what has been done is kept, for the message.
-    """
-
-    def stop(number: int, frame: Any) -> None:
-        raise _Terminated
-
-    try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not the main thread: signals are somebody else's
-        before = None
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        number = signal.SIGTERM if isinstance(error, _Terminated) else signal.SIGINT
-        message = f"Stopped. What is committed in {directory} stays; the same command goes on from there."
-        raise InterruptedRunError(number, message) from None
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGTERM, before)
