@@ -32,8 +32,8 @@ PAIR = {
 """Two oscillators: multipliers exp((mu +- i slow) 2 pi/fast) of the first; a torus from mu = 0."""
 
 VAN_DER_POL = {
-    # as in the library
-    "name": "van-der-pol", "states": {"x": {}, "v": {}}, "parameters": {"mu": 1.0},
+    # as in the library, and compiled once with it
+    "name": "van_der_pol", "states": {"x": {}, "v": {}}, "parameters": {"mu": 1.0},
     "equations": {"x": "v", "v": "mu*(1 - x**2)*v - x"},
 }  # fmt: skip
 
