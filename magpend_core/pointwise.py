@@ -15,7 +15,7 @@ from magpend_core.engine.modes import mode_bindings
 from magpend_core.engine.simd import WIDTH, load, load_rows, store_rows
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
-from magpend_core.validation import check_frequency, check_states
+from magpend_core.validation import check_frequency, check_states, check_times
 
 
 def _rates(t: Any, y: Any, c: Any) -> Any:
@@ -110,7 +110,7 @@ def _at(kind: str, n_out: int, t: Any, state: Any, parameters: Parameters, frequ
     states = check_states(state, tuple(range(1, np.ndim(state) + 1)), system.n_states)
     leading = states.shape[:-1]
     many = states.reshape(-1, system.n_states)
-    times = np.broadcast_to(np.asarray(t, np.float64), leading).reshape(-1)
+    times = check_times(t, leading).reshape(-1)
     # one period is as good as another, and short times keep the drive's phase exact
     local = np.ascontiguousarray(np.mod(times, 1.0 / float(frequency)))
     packed = parameters.pack()
@@ -232,7 +232,7 @@ def rates(t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np
     Raises
     ------
     ValueError
-        If a state is not finite or has the wrong shape, or the frequency is not positive.
+        If a time or a state is not finite or has the wrong shape, or the frequency is not positive.
     """
     return _at("rates", parameters.model.system.n_states, t, state, parameters, frequency_hz)
 
@@ -257,7 +257,7 @@ def drive_level(t: Any, parameters: Parameters, frequency_hz: float) -> np.ndarr
     Raises
     ------
     ValueError
-        If the frequency is not positive.
+        If a time is not finite, or the frequency is not positive.
     """
     at_rest = np.zeros((*np.shape(t), parameters.model.system.n_states))
     return _at("forcing", 1, t, at_rest, parameters, frequency_hz)[..., 0]

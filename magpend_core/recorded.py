@@ -219,8 +219,8 @@ class _Walk:
             n_periods=self.n_periods[:, None].astype(np.int32),
             n_steps=self.n_steps[:, None].astype(np.int32),
             n_rejected=self.n_rejected[:, None].astype(np.int32),
-            final_state=self.state,
-            step_size=self.step,
+            final_state=self.state[:, None],
+            step_size=np.where(failed, np.nan, self.step)[:, None],
             extremes=self.watched[:, None] if with_extremes else None,
         )
 

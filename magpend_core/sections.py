@@ -14,7 +14,15 @@ from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD_CLOSE
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
-from magpend_core.validation import check_array, check_count, check_frequency, check_states, check_tolerance
+from magpend_core.status import Status
+from magpend_core.validation import (
+    check_array,
+    check_count,
+    check_flag,
+    check_frequency,
+    check_states,
+    check_tolerance,
+)
 
 
 @dataclass(frozen=True)
@@ -29,18 +37,18 @@ class Sections:
         Kept states at the ends of consecutive drive periods, angles in (-pi, pi] [rad, rad/s]; NaN
         for cells that failed.
     turns : ndarray of int32, (..., n_angles)
-        Full turns of each angle between the first and the last kept section.
+        Full turns of each angle between the first and the last kept section; 0 for cells that failed.
     status : ndarray of int8
         Codes of `Status`.
     orbit_period : ndarray of int16
         Period of the closed orbit in drive periods; 0 if not closed.
     n_periods, n_steps, n_rejected : ndarray of int32
         Drive periods integrated, accepted steps and rejected attempts, per cell.
-    final_state : ndarray, (branch, n_states)
-        State at the end of each branch, angles in (-pi, pi].
-    step_size : ndarray, (branch,)
-        Step size that the error control would try next [s]: with `final_state` it continues a
-        branch bit for bit.
+    final_state : ndarray, (..., n_states)
+        State in which each cell ended, angles in (-pi, pi]; NaN where the branch had ended before.
+    step_size : ndarray
+        Step size that the error control would try next [s]: with the `final_state` of the same cell it
+        continues a branch bit for bit. NaN where the branch ends with the cell, or has ended before.
     extremes : ndarray, (..., n_keep, n_quantities, 3), or None
         Least and largest value and mean of each watched quantity over the drive period that ends at the
         section; NaN for cells that failed, None if nothing was watched. See `engine.watching`.
@@ -114,7 +122,7 @@ def run_branches(
         Longest orbit period looked for [drive periods].
     step_size
         First step of each branch, shape (branch,) [s]; 0 or None lets the engine choose. With the
-        values of an earlier result the branch goes on bit for bit.
+        values and states at the last points of an earlier result the branch goes on bit for bit.
     system
         What is integrated.
     n_lanes
@@ -145,6 +153,7 @@ def run_branches(
     n_keep = check_count("n_keep", n_keep, 1)
     max_orbit_period = check_count("max_orbit_period", max_orbit_period, 1)
     tolerance = check_tolerance("closure_tolerance", closure_tolerance)
+    observer = RECORD_CLOSED if check_flag("stop_when_closed", stop_when_closed) else RECORD_LAST
     settings = Settings(n_transient, n_keep, max_orbit_period, tolerance, max(64, 4 * max_orbit_period))
     if method is not None:
         system = replace(system, method=method)
@@ -153,23 +162,25 @@ def run_branches(
             raise ValueError("frequency_hz must be None with a section by crossing: its periods are returns.")
         system, parameters, frequency_hz = section.applied(check_array("parameters", parameters, 3), system)
     cells = integrate(
-        system, RECORD_CLOSED if stop_when_closed else RECORD_LAST, settings,
+        system, observer, settings,
         parameters=parameters, frequency_hz=frequency_hz, initial_states=initial_states,
         n_keep=n_keep, n_measures=FIRST_TURN + system.n_states, rtol=rtol, atol=atol,
         max_steps_per_period=max_steps_per_period, step_size=step_size, n_lanes=n_lanes,
         quantities=quantities,
     )  # fmt: skip
     angles = [FIRST_TURN + i for i, angle in enumerate(system.is_angle) if angle]
+    # where a cell fails between its kept sections, what the observer has noted is no count
+    kept = np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED))
     return Sections(
         section=cells.section,
-        turns=cells.measures[..., angles].astype(np.int32),
+        turns=np.where(kept[..., None], cells.measures[..., angles], 0).astype(np.int32),
         status=cells.status.astype(np.int8),
         orbit_period=cells.measures[..., ORBIT_PERIOD].astype(np.int16),
         n_periods=cells.n_periods.astype(np.int32),
         n_steps=cells.n_steps.astype(np.int32),
         n_rejected=cells.n_rejected.astype(np.int32),
-        final_state=cells.state,
-        step_size=cells.step_size,
+        final_state=cells.final_state,
+        step_size=cells.next_step,
         extremes=cells.watched if quantities is not None else None,
         return_time=cells.return_times if system.section is not None else None,
     )
@@ -225,10 +236,9 @@ def sections(
             raise ValueError("frequency_hz = None: give the drive's frequency, or a section by crossing.")
         frequency = None
     else:
-        frequency = np.asarray(frequency_hz, np.float64)
-        if frequency.ndim == 0:
-            frequency = np.full(len(initial), float(frequency))
-        frequency = check_frequency(frequency, 1)[:, None]
+        frequency = check_frequency(frequency_hz, (0, 1))
+        frequency = np.full(len(initial), frequency) if frequency.ndim == 0 else frequency
+        frequency = frequency[:, None]
     n = len(initial) if frequency is None else len(frequency)
     packed = np.broadcast_to(parameters.pack(), (n, 1, len(parameters.names)))
     result = run_branches(
@@ -236,5 +246,4 @@ def sections(
         rtol=rtol, atol=atol, system=system, **options,
     )  # fmt: skip
     found = {f.name: getattr(result, f.name) for f in fields(result)}
-    per_cell = {k: v for k, v in found.items() if v is not None and k not in ("final_state", "step_size")}
-    return replace(result, **{name: value[:, 0] for name, value in per_cell.items()})
+    return replace(result, **{name: value[:, 0] for name, value in found.items() if value is not None})

@@ -34,6 +34,9 @@ from magpend_core.models.parameters import Parameters
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_frequency, check_states
 
+MOST_PERIODS = 1e7
+"""Drive periods that a trajectory may take, since it cannot be interrupted: some minutes."""
+
 
 def prepare(frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any) -> Any:
     """Return the rows of one group: the trajectory in lane 0, copies that stand still beside it."""
@@ -77,7 +80,8 @@ def follow(
     y0, k0, events, n_watching = np.zeros(N), np.zeros(N), np.zeros(1, np.bool_), np.zeros(1, np.int64)
     turns = np.zeros(N, np.int64)
     edge = begin_period(w, 0, 0, edge_table)
-    take_section(w, 0, 0, section, turns)
+    if not take_section(w, 0, 0, section, turns):
+        return DIVERGED
     if HAS_EVENTS:
         begin_events(w, 0, 0)
     done, i_period = ZERO, ZERO
@@ -161,6 +165,11 @@ def trajectory(
     grid = check_array("times", times, 1)
     if len(grid) and (grid[0] < 0.0 or np.any(np.diff(grid) <= 0.0)):
         raise ValueError("times must start at 0 or later and rise from entry to entry.")
+    if len(grid) and not grid[-1] * frequency <= MOST_PERIODS:
+        raise ValueError(
+            f"times end at {grid[-1]:g} s, after {grid[-1] * frequency:.3g} periods at {frequency:g} Hz; a "
+            f"trajectory has at most {MOST_PERIODS:g}: end earlier, and go on from the last state."
+        )
     rtol, atol = check_tolerances(rtol, atol)
     attempts = check_count("max_steps_per_period", max_steps_per_period, 1)
     packed = parameters.pack()

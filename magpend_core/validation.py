@@ -13,8 +13,9 @@ def check_array(name: str, values: Any, ndim: int | tuple[int, ...]) -> np.ndarr
     Raises
     ------
     ValueError
-        If the shape does not fit or a number is not finite.
+        If the shape does not fit, a number is not finite or an entry is masked.
     """
+    _refuse_masks(name, values)
     array = np.asarray(values, dtype=np.float64, order="C")
     allowed = (ndim,) if isinstance(ndim, int) else ndim
     if array.ndim not in allowed:
@@ -26,6 +27,33 @@ def check_array(name: str, values: Any, ndim: int | tuple[int, ...]) -> np.ndarr
         entry = name + (str(list(where)) if where else "")
         raise ValueError(f"{entry} = {array[where]} is not finite; give finite numbers.")
     return array
+
+
+def _refuse_masks(name: str, values: Any) -> None:
+    """Refuse masked entries: what they hide is no number of theirs, and an array of float64 cannot say so."""
+    parts = values if isinstance(values, (list, tuple)) else [values]
+    n_masked = sum(int(np.ma.getmaskarray(p).sum()) for p in parts if isinstance(p, np.ma.MaskedArray))
+    if n_masked:
+        raise ValueError(
+            f"{name} has {n_masked} masked entries; leave these out, or fill them with numbers (.filled())."
+        )
+
+
+def check_times(values: Any, shape: tuple[int, ...], name: str = "t") -> np.ndarray:
+    """Return finite times as an array of a shape, to which a single one is spread.
+
+    Raises
+    ------
+    ValueError
+        See `check_array`; or if the shapes do not go together.
+    """
+    array = check_array(name, values, tuple(range(len(shape) + 1)))
+    try:
+        return np.broadcast_to(array, shape)
+    except ValueError:
+        raise ValueError(
+            f"{name} has shape {array.shape}; it must be one number, or one per state: {shape}."
+        ) from None
 
 
 def check_states(values: Any, ndim: int | tuple[int, ...], n_states: int, name: str = "state") -> np.ndarray:
@@ -44,7 +72,7 @@ def check_states(values: Any, ndim: int | tuple[int, ...], n_states: int, name: 
     return array
 
 
-def check_frequency(values: Any, ndim: int) -> np.ndarray:
+def check_frequency(values: Any, ndim: int | tuple[int, ...]) -> np.ndarray:
     """Return drive frequencies [Hz], all positive.
 
     Raises
@@ -72,6 +100,19 @@ def check_count(name: str, value: Any, least: int) -> int:
     if value < least:
         raise ValueError(f"{name} = {value} is out of bounds: it must be {least} or more.")
     return int(value)
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """Return a truth value; texts such as ``"no"`` would count as true.
+
+    Raises
+    ------
+    ValueError
+        If it is neither True nor False.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} = {value!r} is neither True nor False; give one of them.")
+    return bool(value)
 
 
 def check_tolerance(name: str, value: Any, least: float = 0.0) -> float:

@@ -1,14 +1,16 @@
-"""What all tests share: a command called in this process, and how hypothesis draws examples.
+"""What all tests share: one compile cache, a command called in this process, how hypothesis draws examples.
 
-Those are the same ones in every run of the suite, unless one asks for fresh ones.
-
-``HYPOTHESIS_PROFILE=fresh`` draws new examples in every run, more of them, and remembers what failed.
+``HYPOTHESIS_PROFILE=fresh`` draws new examples in every run, more of them, and remembers what failed;
+otherwise they are the same ones in every run. ``MAGPEND_LONG=1`` runs what is marked ``long``, too.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import tempfile
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -17,6 +19,47 @@ from hypothesis import settings
 settings.register_profile("repeatable", derandomize=True, database=None, deadline=None, print_blob=True)
 settings.register_profile("fresh", deadline=None, max_examples=300, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
+
+
+def _is_writable(folder: Path) -> bool:
+    """Whether a file can be put into a folder, which is made if need be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _share_compile_cache() -> None:
+    """Let all tests, their subprocesses and pytest's workers compile into one folder, before any does.
+
+    It is the user's own, so that a second run compiles nothing; one for this run where there is none.
+    """
+    if os.environ.get("MAGPEND_CACHE_DIR"):
+        return
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "magpend"
+    if not _is_writable(folder):
+        folder = Path(tempfile.mkdtemp(prefix="magpend-tests-"))
+        _TO_REMOVE.append(folder)
+    os.environ["MAGPEND_CACHE_DIR"] = str(folder)
+
+
+_TO_REMOVE: list[Path] = []
+_share_compile_cache()
+
+
+def pytest_unconfigure() -> None:
+    for folder in _TO_REMOVE:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if os.environ.get("MAGPEND_LONG", "0") == "1":
+        return
+    for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker(pytest.mark.skip(reason="takes minutes; MAGPEND_LONG=1 runs it"))
 
 
 @pytest.fixture

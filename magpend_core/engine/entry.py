@@ -152,6 +152,8 @@ def integrate(
         state=initial.copy(),
         step_size=first_step.copy(),
         turns=np.zeros(initial.shape, np.int64),
+        final_state=np.full((*per_cell, system.n_states), np.nan),
+        next_step=np.full(per_cell, np.nan),
         section=np.full((*per_cell, n_keep, system.n_states), np.nan),
         measures=np.zeros((*per_cell, n_measures)),
         status=np.zeros(per_cell, np.int64),

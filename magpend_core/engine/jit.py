@@ -13,7 +13,8 @@ Environment variables, read once at import:
 ``MAGPEND_CACHE``
     ``0`` compiles in every process and writes nothing.
 ``MAGPEND_CACHE_DIR``
-    The folder that holds the caches; by default ``magpend`` in the user's cache folder.
+    The folder that holds the caches; unset or empty, ``magpend`` in the user's cache folder. What is in it is
+    executed: it must be the user's own, see `kept`.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ import numba
 from numba import njit
 
 from magpend_core.engine.digests import PACKAGE, functions_digest
+from magpend_core.engine.kept import keep
 from magpend_core.engine.parts import PartCompiler, RawCompiler
 
 # `contract` lets a product and a sum become one fused operation and nothing else: wider flags would
@@ -61,11 +63,14 @@ def _cache_folder() -> Path | None:
     if os.environ.get("MAGPEND_CACHE", "1") == "0":
         return None
     home = os.environ.get("MAGPEND_CACHE_DIR")
-    if home is None:
-        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-        home = str(Path(base) / "magpend")
+    try:
+        folder = Path(home or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # nobody's home
+        return None
+    folder = folder if home else folder / "magpend"
     versions = f"numba-{numba.__version__}-llvmlite-{llvmlite.__version__}"
-    return Path(home) / f"{source_digest()}-{versions}"
+    # absolute, so that it stays where it is when the process goes elsewhere
+    return folder.absolute() / f"{source_digest()}-{versions}"
 
 
 CACHE_FOLDER = _cache_folder()
@@ -121,14 +126,7 @@ def kernel(function: F, kept: str | None = "") -> F:
     if CACHE_FOLDER is None or kept is None:
         return njit(**OPTIONS, **WITHOUT_C)(function)
     folder = CACHE_FOLDER / kept[:32] if kept else CACHE_FOLDER
-    # numba picks the folder while it decorates; the setting is put back so that other users of
-    # numba in the same process keep theirs.
-    settings: Any = numba.config
-    before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
-    try:
-        return njit(cache=True, **OPTIONS, **WITHOUT_C)(function)
-    finally:
-        settings.CACHE_DIR = before
+    return keep(njit(**OPTIONS, **WITHOUT_C)(function), CACHE_FOLDER.parent, folder)
 
 
 def specialise(template: Callable[..., Any], name: str, **bindings: Any) -> Callable[..., Any]:

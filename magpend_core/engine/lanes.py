@@ -71,6 +71,8 @@ exp(-pi m), which equals slack/1e4, the tolerance, at m = 5.1 - log(slack/(J d))
 """
 FIRST_STEP = 1e-3
 """First step of a branch in drive periods; error control finds the right size within a few steps."""
+FARTHEST = 1e15
+"""Largest angle [rad]: beyond, neighbouring numbers are so far apart that they are no angle any more."""
 SAFETY = 0.85
 SHRINK = 0.2
 GROW = 5.0
@@ -344,7 +346,8 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
     arrived = where_less(h, target - t, 0.0, 1.0 - rejected)
     t_new = where_less(0.5, arrived, target, t + h)
     store(w, base + ROWS.time, where_less(0.5, rejected, t, t_new))
-    attempts = load(w, base + ROWS.attempts) + stepped
+    # an attempt too short to be one counts, or a lane that cannot move would stay for ever
+    attempts = load(w, base + ROWS.attempts) + (1.0 - load(w, base + ROWS.fresh))
     store(w, base + ROWS.attempts, attempts)
     store(w, base + ROWS.steps, load(w, base + ROWS.steps) + stepped * (1.0 - rejected))
     store(w, base + ROWS.rejected, load(w, base + ROWS.rejected) + rejected)
@@ -516,6 +519,8 @@ class Cells(NamedTuple):
     state: Any  # (branch, n_states): initial, at the end final
     step_size: Any  # (branch,): initial [s] or 0, at the end the next
     turns: Any  # int64 (branch, n_states): at the end the turns since the start
+    final_state: Any  # (..., n_states), in which a cell ended; NaN where none began
+    next_step: Any  # s, step size with which the branch goes on from there; NaN where it does not
     section: Any  # (..., n_keep, n_states)
     measures: Any  # (..., n_measures)
     status: Any  # int64
@@ -587,6 +592,10 @@ def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
     cells.n_periods[at] = work.i_period[lane]
     cells.n_steps[at] = int(work.lanes[base + ROWS.steps + column])
     cells.n_rejected[at] = int(work.lanes[base + ROWS.rejected + column])
+    for i in range(N):
+        cells.final_state[at][i] = work.lanes[base + ROWS.state + i * WIDTH + column]
+    if not has_failed(status):
+        cells.next_step[at] = work.lanes[base + ROWS.wish + column]
     if has_failed(status) or status == NO_RETURN:
         forget(cells, work.branch[lane], work.point[lane])
 
@@ -779,7 +788,10 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "RENEW_BELOW": observer.renew_below,
         "IS_ANGLE": system.is_angle,
         "SCALES": system.scales,
-        "ESCAPE": system.escape,
+        "ESCAPE": tuple(
+            min(bound, FARTHEST) if angle else bound
+            for bound, angle in zip(system.escape, system.is_angle, strict=True)
+        ),
         "constants": system.constants,
         "edges": system.edges,
         "forcing": system.forcing,

@@ -27,6 +27,18 @@ class EnoughError(Exception):
     """Whoever read the standard output has enough, as ``head`` does."""
 
 
+def visible(text: str) -> str:
+    """Show control characters as escapes: a text from a file must not steer a terminal."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in text)
+
+
+class _Visible(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return visible(super().format(record))
+
+
 def note(line: str) -> None:
     """Say what happens; not with ``--quiet``."""
     LOG.info(line)
@@ -41,7 +53,7 @@ def result(line: str) -> None:
         If nobody reads it any more.
     """
     try:
-        sys.stdout.write(f"{line}\n")
+        sys.stdout.write(f"{visible(line)}\n")
         sys.stdout.flush()
     except BrokenPipeError:
         raise EnoughError from None
@@ -75,6 +87,7 @@ def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
     LOG.setLevel(logging.DEBUG)
     shown = logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO
     stderr = _Stderr(shown)
+    stderr.setFormatter(_Visible())
     LOG.addHandler(stderr)
     if log is not None:
         try:
@@ -83,7 +96,7 @@ def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
             from pipeline.spec.problems import SpecError
 
             raise SpecError([f"--log {log}: cannot be written to ({error.strerror})."]) from None
-        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        file.setFormatter(_Visible("%(asctime)s %(levelname)s %(message)s"))
         LOG.addHandler(file)
         LOG.debug("command: %s", " ".join(sys.argv))
 

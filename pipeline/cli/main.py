@@ -15,8 +15,9 @@ import typer
 
 from pipeline.cli.analyse import analyse_app
 from pipeline.cli.common import EXIT_HELP, CommandError
-from pipeline.cli.console import EnoughError
+from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
+from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.identify import identify_app
 from pipeline.cli.magnet import fit_magnet
@@ -28,6 +29,7 @@ from pipeline.cli.plot import plot_app
 from pipeline.cli.recordings import recordings_app
 from pipeline.cli.running import run, status, verify
 from pipeline.cli.simulate import EXTRA, simulate
+from pipeline.cli.submit import submit
 from pipeline.cli.zoom import zoom
 
 app = typer.Typer(
@@ -60,8 +62,9 @@ def _main(
 
 
 for _command, _settings in (
-    (run, {}), (status, {}), (verify, {}), (zoom, EXTRA), (simulate, EXTRA), (models, {}), (presets, {}),
-    (fit_magnet, {}),
+    (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
+    (models, {}),
+    (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
 app.add_typer(analyse_app, name="analyse")
@@ -77,6 +80,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     from magpend_core.models.parameters import ParameterError
     from pipeline.compute.addresses import SchedulerError
     from pipeline.compute.execute import TaskFailedError
+    from pipeline.runs.submit import SubmitError
     from pipeline.spec.problems import SpecError
     from pipeline.store.errors import (
         DamagedError,
@@ -91,7 +95,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
         ((DamagedError,), Exit.DAMAGED),
         ((IncompleteError, UnreadableError), Exit.FAILED),
         ((SpecError, ParameterError, StoreError), Exit.REFUSED),
-        ((TaskFailedError, SchedulerError, ArithmeticError, OSError), Exit.FAILED),
+        ((TaskFailedError, SchedulerError, SubmitError, ArithmeticError, OSError), Exit.FAILED),
     ]
 
 
@@ -106,7 +110,7 @@ def _complain(error: BaseException) -> None:
         LOG.error(text)
         LOG.debug("where it came from", exc_info=error)
     else:
-        print(text, file=sys.stderr)
+        print(visible(text), file=sys.stderr)
 
 
 def main() -> None:
@@ -145,7 +149,7 @@ def _usage(error: Any) -> None:
     if context is not None and not message.strip():  # a group without a command shows its help
         message = context.get_help()
     hint = f"\nhelp: {context.command_path} --help" if context is not None else ""
-    print(f"magpend: {message}{hint}", file=sys.stderr)
+    print(visible(f"magpend: {message}{hint}"), file=sys.stderr)
 
 
 def _leave_quietly() -> None:

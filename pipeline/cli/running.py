@@ -13,7 +13,8 @@ from pipeline.cli.exits import Exit
 from pipeline.cli.options import completing
 
 
-def _workflows() -> Iterable[str]:
+def workflow_names() -> Iterable[str]:
+    """Names of the workflows that ship."""
     from pipeline.runs.workflows import shipped_workflows
 
     return shipped_workflows()
@@ -23,11 +24,15 @@ Spec = Annotated[
     str,
     typer.Argument(
         metavar="SPEC", help="A TOML file, or the name of a shipped workflow.",
-        autocompletion=completing(_workflows),
+        autocompletion=completing(workflow_names),
     ),
 ]  # fmt: skip
 
 
+Workers = Annotated[
+    int | None,
+    typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores."),
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(
@@ -42,23 +47,20 @@ ClusterFile = Annotated[
         metavar="FILE", help="TOML file whose [cluster] says what a job is. Default: $MAGPEND_CLUSTER."
     ),
 ]
+Dashboard = Annotated[
+    bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and say where.")
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")]
 
 
 def run(
     spec: Spec,
     out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores."),
-    ] = None,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     cluster: ClusterFile = None,
-    dashboard: Annotated[
-        bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and say where.")
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")
-    ] = False,
+    dashboard: Dashboard = False,
+    dry_run: DryRun = False,
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")
     ] = False,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import OPTION, Address, SchedulerError, ask, read_address, security_of
-from pipeline.compute.jobqueue import check_means, job_cluster
+from pipeline.compute.jobqueue import check_means, job_cluster, jobs_folder
 from pipeline.compute.local import local_cluster
 from pipeline.compute.probe import check_directory, check_versions
 from pipeline.spec.clusters import QUEUES, Cluster, clock, load_cluster, seconds_of
@@ -161,11 +161,6 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
         if target != LOCAL:
             _check(client, where.directory)
         yield client
-
-
-def jobs_folder(directory: Path) -> Path:
-    """Where a run's batch scripts, and what its jobs say, are kept: beside its directory."""
-    return directory.absolute().with_name(f"{directory.absolute().name}.jobs")
 
 
 def _client(scheduler: Any, security: Any) -> Any:

@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
-from pipeline.spec.clusters import Cluster
+from pipeline.spec.clusters import Cluster, hours_and_minutes
 from pipeline.spec.problems import SpecError
 
 JOB_NAME = "magpend-worker"
 _CLASSES = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "sge": "SGECluster", "lsf": "LSFCluster"}
-_COMMANDS = {"slurm": "sbatch", "pbs": "qsub", "sge": "qsub", "lsf": "bsub"}
+COMMANDS = {"slurm": "sbatch", "pbs": "qsub", "sge": "qsub", "lsf": "bsub"}
+"""What sends a batch script."""
+
 _THREADS = ("export NUMBA_NUM_THREADS=1", "export OMP_NUM_THREADS=1")
 _MEANWHILE_S = 60
 
@@ -36,20 +38,18 @@ def check_means(cluster: Cluster) -> None:
             f"{cluster.kind}: needs packages that are not installed; install them: pip install "
             "'magpend[cluster]'."
         )
-    problems += missing_command(cluster)
+    if not shutil.which(COMMANDS[cluster.kind]):
+        problems.append(
+            f"{cluster.kind}: there is no command {COMMANDS[cluster.kind]!r} here; give the command on a "
+            "machine that sends jobs, such as the login node."
+        )
     if problems:
         raise SpecError(problems)
 
 
-def missing_command(cluster: Cluster) -> list[str]:
-    """A sentence, if the batch system's command is not on this machine."""
-    command = _COMMANDS[cluster.kind]
-    if shutil.which(command):
-        return []
-    return [
-        f"{cluster.kind}: there is no command {command!r} here; give the command on a machine that sends "
-        "jobs, such as the login node."
-    ]
+def jobs_folder(directory: Path) -> Path:
+    """Where a run's batch scripts, and what its jobs say, are kept: beside its directory."""
+    return directory.absolute().with_name(f"{directory.absolute().name}.jobs")
 
 
 def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
         Where the batch system puts what jobs say.
     """
     account = "account" if cluster.kind in ("slurm", "pbs") else "project"
-    time = cluster.walltime if cluster.kind != "lsf" else _hours_and_minutes(cluster.walltime_s)
+    time = cluster.walltime if cluster.kind != "lsf" else hours_and_minutes(cluster.walltime_s)
     found: dict[str, Any] = {
         "queue": cluster.queue,
         account: cluster.account,
@@ -88,17 +88,33 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def _hours_and_minutes(seconds: int) -> str:
-    minutes = max(1, seconds // 60)
-    return f"{minutes // 60:02d}:{minutes % 60:02d}"
-
-
 def worker_script(cluster: Cluster, folder: Path) -> str:
     """The batch script of a job that holds workers, as far as it is known before a scheduler runs."""
     import dask_jobqueue
 
     job = getattr(dask_jobqueue, _CLASSES[cluster.kind]).job_cls
     return str(job("tls://SCHEDULER:PORT", name="NAME", **settings(cluster, folder)).job_script())
+
+
+def _keys(folder: Path) -> Any:
+    """Make keys and write them where the jobs find them; scheduler, workers and client have the same."""
+    from distributed import Security
+
+    made = Security.temporary()  # type: ignore[no-untyped-call]
+    files = {}
+    for name, content in made.get_tls_config_for_role("worker").items():
+        if content is not None and "\n" in content:
+            files[name] = folder / name
+            with os.fdopen(os.open(files[name], os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write(content)
+    roles = {
+        f"tls_{role}_{name}": str(files[name])
+        for role in ("scheduler", "worker", "client")
+        for name in ("cert", "key")
+    }
+    return Security(  # type: ignore[no-untyped-call]
+        require_encryption=True, tls_ca_file=str(files["ca_file"]), **roles
+    )
 
 
 @contextlib.contextmanager
@@ -123,8 +139,7 @@ def job_cluster(
         options = {"dashboard": dashboard, "dashboard_address": "127.0.0.1:0"}
         try:
             jobs = kind(
-                security=True,
-                shared_temp_directory=keys,
+                security=_keys(Path(keys)),
                 scheduler_options=options,
                 silence_logs=50,
                 **settings(cluster, folder.absolute()),

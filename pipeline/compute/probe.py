@@ -6,7 +6,7 @@ import os
 import platform
 import time
 import uuid
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -115,3 +115,28 @@ def sees(path: str, token: str) -> str:
 def _listed(problems: Mapping[str, str]) -> str:
     shown = [f"{address} {why}" for address, why in list(problems.items())[:_SHOWN]]
     return "; ".join(shown) + (f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else "")
+
+
+class MisfitError(Exception):
+    """A worker that came later has other programs than whoever sends it tasks."""
+
+
+class Fitting:
+    """A task that is done by workers with the same programs alone, also by those that come later.
+
+    Parameters
+    ----------
+    task
+        Takes an index.
+    programs
+        See `installation`; by default those here.
+    """
+
+    def __init__(self, task: Callable[[int], dict[str, Any]], programs: dict[str, str] | None = None) -> None:
+        self.task, self.programs = task, programs or installation()
+
+    def __call__(self, index: int) -> dict[str, Any]:
+        """Do the task; raises `MisfitError` where it would not be the same."""
+        if why := _difference(self.programs, installation()):
+            raise MisfitError(f"this worker has other programs ({why}); install the same versions everywhere")
+        return self.task(index)

@@ -7,6 +7,7 @@ A task is named by the run directory, the run's digest and its index; it reads t
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core import Sections, Status, kernel_version, run_branches
+from magpend_core import Sections, Status, kernel_version
 from magpend_core.engine.system import System
 from magpend_core.models import import_model
 from pipeline.compute.recorded import under_recording
 from pipeline.compute.refinement import infer
+from pipeline.compute.walking import WALKED, going_on, walk
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
@@ -26,6 +28,7 @@ from pipeline.layout.schema import REST_STATE, base_variables
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec, kept_spec
+from pipeline.store.cells import read_cells
 from pipeline.store.commits import write_task
 from pipeline.store.errors import RefusedError
 from pipeline.store.runfile import RunInfo, read_run
@@ -83,13 +86,7 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
         del keywords["method"]  # the specification allows no other
         cells = under_recording(spec.recorded, inputs, system=spec.model.system, **keywords)
     else:
-        cells = run_branches(
-            inputs.parameters,
-            inputs.frequency_hz,
-            inputs.initial_states,
-            system=spec.model.system,
-            **keywords,
-        )
+        cells = walk(inputs, system=spec.model.system, **keywords)
     own = {REST_STATE.name: rest_states(cells)} if spec.section is not None else {}
     values = {
         v.name: np.asarray(own.get(v.name, getattr(cells, v.name, None)), dtype=v.dtype)
@@ -102,17 +99,36 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def rest_states(cells: Sections) -> np.ndarray:
-    """States in which cells that did not come back to the section were left, NaN for all others.
-
-    A walk ends with such a cell, so that it is left where the walk is.
-    """
+    """States in which cells that did not come back to the section were left, NaN for all others."""
     is_left = cells.status == Status.NO_RETURN
-    return np.where(is_left[..., None], cells.final_state[:, None], np.nan)
+    return np.where(is_left[..., None], cells.final_state, np.nan)
 
 
-def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
-    """Return all variables of a block of cells, in the block's shape."""
+Integrate = Callable[[Spec, Inputs], dict[str, np.ndarray]]
+"""From branches to all their variables, with leading dims (branch, point)."""
+
+
+def compute(
+    spec: Spec,
+    cells: CellMap,
+    block: tuple[slice, ...],
+    before: Mapping[str, np.ndarray] | None = None,
+    integrate: Integrate = integrate,
+) -> dict[str, np.ndarray]:
+    """Return all variables of a block of cells, in the block's shape.
+
+    Parameters
+    ----------
+    spec, cells, block
+        Which cells.
+    before
+        Variables of the cells in which its branches were left, where they do not begin in the block.
+    integrate
+        What gives the cells.
+    """
     inputs = cells.inputs(block)
+    if before is not None:
+        inputs = going_on(inputs, before)
     if spec.refine is None:
         values = integrate(spec, inputs)
     else:
@@ -129,7 +145,12 @@ def compute(spec: Spec, cells: CellMap, block: tuple[slice, ...]) -> dict[str, n
 
 
 def run_task(
-    directory: str, digest: str, index: int, *, origin: tuple[str, str] | None = None
+    directory: str,
+    digest: str,
+    index: int,
+    *,
+    origin: tuple[str, str] | None = None,
+    sources: tuple[tuple[str, str], ...] = (),
 ) -> dict[str, Any]:
     """Compute a task and commit it.
 
@@ -139,15 +160,20 @@ def run_task(
         Which one.
     origin
         Where the model is a Python object: its place and folder, as the person who began the run named them.
+    sources
+        Directories and digests of runs from which cells that they hold are taken; see `compute.reuse`.
 
     Returns
     -------
     dict
-        Task, cells, cells by status, and the seconds taken by the kernel and by writing.
+        Task, cells, cells by status, and the seconds taken by the kernel and by writing; with `sources` how
+        many cells were taken.
     """
     info, spec, plan, cells = _prepare(directory, digest, origin)
     started = time.perf_counter()
-    values = compute(spec, cells, plan.task(index))
+    taken: list[int] = []
+    how = _taking(directory, digest, sources, cells, plan.task(index), taken)
+    values = compute(spec, cells, plan.task(index), **_left(info, plan, cells, index), **how)
     computed = time.perf_counter()
     codes, numbers = np.unique(values["status"], return_counts=True)
     counts = {Status(int(c)).name.lower(): int(n) for c, n in zip(codes, numbers, strict=True)}
@@ -158,7 +184,30 @@ def run_task(
         "status": counts,
         "kernel_s": round(computed - started, 4),
         "write_s": round(time.perf_counter() - computed, 4),
+        **({"reused": sum(taken)} if sources else {}),
     }
+
+
+def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, Any]:
+    """Read where the task before has left the branches of a task, if they do not begin in it."""
+    predecessor = plan.predecessor(index)
+    if predecessor is None:
+        return {}
+    names = [v.name for v in plan.variables if v.name in WALKED]
+    region = cells.last_cells(plan.task(predecessor))
+    return {"before": read_cells(info, plan, predecessor, region, names)}
+
+
+def _taking(
+    directory: str, digest: str, sources: tuple[tuple[str, str], ...], cells: CellMap,
+    block: tuple[slice, ...], taken: list[int],
+) -> dict[str, Any]:  # fmt: skip
+    """Say what gives a task's cells where it is not the kernel alone: what other runs hold comes first."""
+    if not sources:
+        return {}
+    from pipeline.compute.reuse import pool_of
+
+    return {"integrate": pool_of(directory, digest, sources).integrator(cells, block, taken)}
 
 
 def warm_up(spec: Spec) -> float:

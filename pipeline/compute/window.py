@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import queue
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -231,10 +232,7 @@ class Window:
     def _restart(self, address: str) -> None:
         """End a worker; its nanny starts a new one, and the scheduler gives its tasks to others."""
         self._watch.forget(address)
-        restart = self._client.restart_workers(
-            [address], timeout=ANSWER_S, raise_for_error=False, asynchronous=True
-        )
-        asyncio.run_coroutine_threadsafe(_quietly(restart), self._client.loop.asyncio_loop)
+        threading.Thread(target=_restarted, args=(self._client, address), daemon=True).start()
 
 
 class Watch:
@@ -290,9 +288,10 @@ async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]
         return None, error
 
 
-async def _quietly(restart: Any) -> None:
+def _restarted(client: Any, address: str) -> None:
+    """Restart a worker, and wait for that; in a thread of its own, for a stopped process takes its time."""
     with contextlib.suppress(Exception):
-        await restart
+        client.restart_workers([address], timeout=ANSWER_S, raise_for_error=False)
 
 
 def _reason(error: BaseException) -> str:

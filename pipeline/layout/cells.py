@@ -211,22 +211,29 @@ class Inputs:
     parameters : ndarray, (branch, point, parameter)
     frequency_hz : ndarray, (branch, point)
     initial_states : ndarray, (branch, n_states)
+    step_size : ndarray, (branch,), or None
+        Step with which each branch goes on from where it was left [s]; NaN where it has ended before. None
+        where all begin.
     """
 
     parameters: np.ndarray
     frequency_hz: np.ndarray
     initial_states: np.ndarray
+    step_size: np.ndarray | None = None
 
     def take(self, branches: Any) -> Inputs:
         """Return some of the branches."""
-        return Inputs(self.parameters[branches], self.frequency_hz[branches], self.initial_states[branches])
+        step = None if self.step_size is None else self.step_size[branches]
+        return Inputs(
+            self.parameters[branches], self.frequency_hz[branches], self.initial_states[branches], step
+        )
 
 
 class CellMap:
     """Between the cells of a block of the cube and the branches and points of the kernel.
 
-    In a sweep each cell is a branch of one point. In a continuation the branches of a block walk the
-    whole path, those that go down from its end.
+    In a sweep each cell is a branch of one point. In a continuation the branches of a block walk its part
+    of the path, those that go down from its end.
     """
 
     def __init__(self, spec: Spec) -> None:
@@ -261,6 +268,14 @@ class CellMap:
         return Inputs(
             parameters, values.get(FREQUENCY, fixed), self._states.at(self._start_of(index[:, :, 0]))
         )
+
+    def last_cells(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
+        """Return the cells of a block in which its branches are left; all walk in one direction."""
+        assert self.path is not None
+        part = block[self.path]
+        down = self._down(np.array([block[-1].start]))[0]
+        last = slice(part.start, part.start + 1) if down else slice(part.stop - 1, part.stop)
+        return tuple(last if i == self.path else s for i, s in enumerate(block))
 
     def _start_of(self, index: np.ndarray) -> np.ndarray:
         """Flat index of the initial state of each branch."""

@@ -62,8 +62,9 @@ def code_of(spec: Spec) -> list[str]:
     """Modules of the pipeline that decide the numbers of a run's tasks."""
     products = [CELL_PRODUCTS[name].compute.partition(":")[0] for name in spec.products]
     refined = ["compute.refinement"] if spec.refine is not None else []
+    walked = ["compute.walking"] if spec.continuation is not None else []
     driven = ["compute.recorded", "spec.drives"] if spec.drive is not None else []
-    return [*CODE, *refined, *driven, *(module.removeprefix("pipeline.") for module in products)]
+    return [*CODE, *refined, *walked, *driven, *(module.removeprefix("pipeline.") for module in products)]
 
 
 @lru_cache

@@ -3,18 +3,22 @@
 A task computes a block of cells and owns whole chunks of every variable. The layout follows from the
 specification alone, never from the number of workers, so that a run can be resumed anywhere and its
 files are the same bytes.
+
+A branch of a continuation is walked in tasks one after the other, each from where the one before, its
+predecessor, has left it; what is walked up and what is walked down are different tasks.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pipeline.layout.cells import CellMap
 from pipeline.layout.schema import sizes_of, variables_of
+from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable
 from pipeline.spec.drives import TORQUE
@@ -68,6 +72,10 @@ class Plan:
         Estimated time on one core [s].
     is_recorded : bool
         Whether the drive is a recording.
+    directions : tuple of str
+        Directions in which branches walk, each for an equal part of the branches; none in a sweep.
+    seconds_at : ndarray or None
+        Estimated time of a cell on one core at each value of the frequency's dim [s], if there is one.
     """
 
     kind: str
@@ -79,6 +87,8 @@ class Plan:
     sizes: Mapping[str, int]
     seconds_per_cell: float
     is_recorded: bool = False
+    directions: tuple[str, ...] = ()
+    seconds_at: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def n_cells(self) -> int:
@@ -110,16 +120,48 @@ class Plan:
         """Estimated time on one core [s]."""
         return self.n_cells * self.seconds_per_cell
 
+    def seconds(self, index: int) -> float:
+        """Estimated time of a task on one core [s]."""
+        seconds = self.seconds_per_cell
+        if self.seconds_at is not None:
+            seconds = float(self.seconds_at[self.task(index)[self.dims.index(FREQUENCY_DIM)]].mean())
+        return seconds * self.cells_in(index)
+
     def task(self, index: int) -> tuple[slice, ...]:
         """Return the block of cells of a task."""
+        places = zip(self._place(index), self.block, self.shape, strict=True)
+        return tuple(slice(p * b, min((p + 1) * b, n)) for p, b, n in places)
+
+    def _place(self, index: int) -> tuple[int, ...]:
+        """Place of a task in the grid of tasks."""
         if not 0 <= index < self.n_tasks:
             raise IndexError(f"task {index} does not exist; there are {self.n_tasks}.")
-        starts = []
+        places = []
         for n_blocks in reversed(self.task_grid):
             index, place = divmod(index, n_blocks)
-            starts.append(place)
-        places = zip(reversed(starts), self.block, self.shape, strict=True)
-        return tuple(slice(p * b, min((p + 1) * b, n)) for p, b, n in places)
+            places.append(place)
+        return tuple(reversed(places))
+
+    def walks_down(self, index: int) -> bool:
+        """Whether the branches of a task walk down."""
+        if self.path is None or not self.directions:
+            return False
+        first = self._place(index)[-1] * self.block[-1]
+        return self.directions[first * len(self.directions) // self.shape[-1]] == "down"
+
+    def depth(self, index: int) -> int:
+        """How many tasks come before a task on its walk; 0 in a sweep."""
+        if self.path is None:
+            return 0
+        place = self._place(index)[self.path]
+        return self.task_grid[self.path] - 1 - place if self.walks_down(index) else place
+
+    def predecessor(self, index: int) -> int | None:
+        """Return the task that leaves the branches where this one takes them up; None if they start here."""
+        if self.path is None or self.depth(index) == 0:
+            return None
+        stride = math.prod(self.task_grid[self.path + 1 :])
+        return index + stride if self.walks_down(index) else index - stride
 
     def tasks(self) -> Iterator[tuple[slice, ...]]:
         """Return the blocks of all tasks in order."""
@@ -137,8 +179,9 @@ class Plan:
             n_points = chunk[self.path]
             per_point = math.prod(chunk) // n_points * variable.itemsize(sizes)
             most = max(1, CHUNK_BYTES // per_point)
-            # as few chunks as can be, about equal: a chunk that is rounded up stays within the most
-            chunk[self.path] = -(-n_points // -(-n_points // most))
+            # as few chunks as can be; tasks that follow each other share none
+            apart = self.task_grid[self.path] > 1
+            chunk[self.path] = _part(n_points, most) if apart else _share(n_points, most)
         return (*chunk, *(sizes[d] for d in variable.own_dims))
 
 
@@ -148,7 +191,8 @@ def make_plan(spec: Spec) -> Plan:
     Tasks take a thirty-second part of the run each, but between 2 and 20 s of one core's time by
     the rule of thumb, and at most 8 MB in a sweep; always whole multiples of 16 trajectories unless
     ``execution.trajectories_per_task`` says otherwise. In a refined grid they are tiles: one parameter
-    point, about as many cells along each grid dim, multiples of the stride.
+    point, about as many cells along each grid dim, multiples of the stride. In a continuation they are
+    about 16 branches of one direction over so many points that they take that time, none more than 20 s.
     """
     cells = CellMap(spec)
     seconds = _seconds_per_cell(spec)
@@ -156,8 +200,12 @@ def make_plan(spec: Spec) -> Plan:
     wanted = spec.execution.trajectories_per_task or _trajectories(
         spec, math.prod(cells.shape), n_points, seconds
     )
-    if spec.refine is None:
-        block = _block(cells.shape, cells.path, wanted)
+    directions: tuple[str, ...] = ()
+    if spec.continuation is not None:
+        directions = spec.continuation.directions
+        block = _walk_block(spec, cells, wanted, seconds)
+    elif spec.refine is None:
+        block = _block(cells.shape, None, wanted)
     else:
         grid = cells.shape[len(spec.axes) :]
         if spec.execution.trajectories_per_task is None:
@@ -167,6 +215,7 @@ def make_plan(spec: Spec) -> Plan:
     return Plan(
         spec.kind, cells.dims, cells.shape, cells.path, block, variables_of(spec.model, spec.products),
         sizes_of(spec.model, spec.products, spec.integration.n_keep), seconds, spec.recorded is not None,
+        directions, _seconds_at(spec),
     )  # fmt: skip
 
 
@@ -188,6 +237,14 @@ def periods_per_cell(spec: Spec) -> tuple[float, float]:
     return float(spec.integration.n_transient + spec.integration.n_keep), float(products)
 
 
+def _seconds_at(spec: Spec) -> np.ndarray | None:
+    """Time of a cell at each value of the frequency's axis [s]; None if it is none."""
+    if FREQUENCY not in spec.axes:
+        return None
+    frequency = spec.axes[FREQUENCY].array()
+    return sum(periods_per_cell(spec)) * seconds_per_period(frequency, spec.integration.rtol)
+
+
 def _seconds_per_cell(spec: Spec) -> float:
     """Mean time of a cell [s]."""
     periods = sum(periods_per_cell(spec))
@@ -200,11 +257,55 @@ def _seconds_per_cell(spec: Spec) -> float:
 
 def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:
     """Trajectories per task."""
-    wanted_seconds = min(max(n_cells * seconds_per_cell / WANTED_TASKS, LEAST_SECONDS), MOST_SECONDS)
+    wanted_seconds = _wanted_seconds(n_cells * seconds_per_cell)
     per_cell = _bytes_per_cell(spec)
     limit = CHUNK_BYTES if n_points == 1 else TASK_BYTES
     n = min(wanted_seconds / (seconds_per_cell * n_points), limit / (per_cell * n_points))
     return max(1, round(n / LANES)) * LANES
+
+
+def _wanted_seconds(core_seconds: float) -> float:
+    """Time of a task of a run that takes so long on one core [s]."""
+    return min(max(core_seconds / WANTED_TASKS, LEAST_SECONDS), MOST_SECONDS)
+
+
+def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float) -> tuple[int, ...]:
+    """Cells of a task of a continuation: branches of one direction, over a part of the path."""
+    assert spec.continuation is not None
+    assert cells.path is not None
+    n_points, directions = cells.shape[cells.path], spec.continuation.directions
+    sizes = sizes_of(spec.model, spec.products, spec.integration.n_keep)
+    largest = max(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
+    n_seeds = cells.shape[-1] // len(directions)
+    if len(directions) > 1:
+        n_seeds = _group(n_seeds, wanted, TASK_BYTES // _bytes_per_cell(spec))
+    block = list(_block((*cells.shape[:-1], n_seeds), cells.path, wanted))
+    n_branches = math.prod(block) // n_points
+    points = spec.execution.points_per_task
+    if points is None:
+        by_time = _wanted_seconds(math.prod(cells.shape) * seconds_per_cell) / (n_branches * seconds_per_cell)
+        at = _seconds_at(spec)
+        at_most = MOST_SECONDS / (n_branches * (seconds_per_cell if at is None else float(at.max())))
+        by_size = CHUNK_BYTES / (n_branches * largest)
+        points = _share(n_points, max(1, int(min(by_time, at_most, by_size))))
+    block[cells.path] = min(points, n_points)
+    return tuple(block)
+
+
+def _group(n_seeds: int, wanted: int, most: int) -> int:
+    """Seeds per task: a divisor near the wanted number, so that no task holds branches of both directions."""
+    divisors = [d for d in range(1, min(n_seeds, max(most, 1)) + 1) if n_seeds % d == 0]
+    return min(divisors, key=lambda d: (max(d / wanted, wanted / d), -d))
+
+
+def _share(n: int, most: int) -> int:
+    """Size of the parts of `n` things, as few as can be and about equal, of at most `most`."""
+    return -(-n // -(-n // most))
+
+
+def _part(n: int, most: int) -> int:
+    """Largest size of at most `most` that divides `n`."""
+    return n // next(k for k in range(-(-n // most), n + 1) if n % k == 0)
 
 
 def _bytes_per_cell(spec: Spec) -> int:

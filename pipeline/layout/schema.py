@@ -57,6 +57,7 @@ def _counts(periods: str) -> tuple[Variable, ...]:
         Variable("n_periods", (), "int32", 0, "1", f"{periods} integrated in all"),
         Variable("n_steps", (), "int32", 0, "1", "accepted integration steps"),
         Variable("n_rejected", (), "int32", 0, "1", "rejected integration steps"),
+        Variable("step_size", (), "float64", math.nan, "s", "step that would come next; NaN: it failed"),
     )  # fmt: skip
 
 

@@ -84,7 +84,7 @@ def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *
     """
     cells = CellMap(spec)
     n_points = 1 if plan.path is None else plan.shape[plan.path]
-    in_task = math.prod(plan.block) // n_points
+    in_task = math.prod(n for i, n in enumerate(plan.block) if i != plan.path)
     branches = [n for i, n in enumerate(plan.shape) if i != plan.path]
     chosen = rng.choice(math.prod(branches), min(n_branches, in_task, math.prod(branches)), replace=False)
     parts = []

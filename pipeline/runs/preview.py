@@ -97,19 +97,20 @@ def describe_plan(
     yield f"tasks: {plan.n_tasks} of {' x '.join(map(str, plan.block)) or '1'} cells, {len(done)} done"
     yield f"cube: {size(plan.n_bytes)} before compression"
     yield f"directory: {directory}" + ("" if info else " (not created)")
-    yield _time_line(parsed, plan, set(range(plan.n_tasks)) - set(done), workers)
+    missing = set(range(plan.n_tasks)) - set(done)
+    share = sum(plan.cells_in(i) for i in missing) / plan.n_cells
+    yield time_line(parsed, plan, share, len(missing), workers)
 
 
-def _time_line(spec: Spec, plan: Plan, missing: set[int], workers: int | None) -> str:
-    """What the missing tasks will take, as measured on a few of the run's cells."""
+def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | None) -> str:
+    """What a share of a run's cells, in some tasks, will take, as measured on a few of its cells."""
     from pipeline.compute.execute import default_workers
 
-    if not missing:
+    if not share:
         return "time: nothing is left to compute"
-    share = sum(plan.cells_in(i) for i in missing) / plan.n_cells
     found = estimate(spec, plan)
     seconds = share * found.core_seconds
-    cores = max(1, min(default_workers() if workers is None else workers, len(missing)))
+    cores = max(1, min(default_workers() if workers is None else workers, n_tasks))
     bound = "about" if spec.refine is None else "at most"
     compiled = (
         f"; the kernel was compiled for it in {duration(found.compiled_s)}" if found.compiled_s > 1 else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,14 +14,17 @@ from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.products.reporting import report
+from pipeline.runs.mending import sound_commits
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
-from pipeline.store.commits import log_timing, read_commits, sweep
+from pipeline.store.checking import damaged_records, name_of
+from pipeline.store.commits import log_timing
 from pipeline.store.errors import IncompleteError
-from pipeline.store.files import local_path, writer_lock
+from pipeline.store.files import Files, open_files
+from pipeline.store.packing import Packer
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
 
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["InterruptedRunError", "identity_here", "run"]
 
 Echo = Callable[[str], None]
+Sources = Sequence[tuple[str, str]]
+"""Directories and digests of runs that hold cells of the one at hand."""
 
 
 def run(
@@ -88,17 +93,50 @@ def run(
 
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
-    directory = local_path(out) if out is not None else default_directory(path, smoke)
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, directory)
+    files = open_files(out if out is not None else default_directory(path, smoke))
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.local)
     where.resolved()
     check_starts(parsed)
-    plan = make_plan(parsed)
-    identity = identity_here(parsed, plan)
-    check(directory, identity)
-    with stoppable(directory), writer_lock(directory):
-        info = establish(directory, parsed, plan, identity, path.read_text("utf-8"), echo)
-        _complete(info, parsed, plan, workers, where, echo)
-    return state(directory)
+    carry_out(parsed, path.read_text("utf-8"), files, workers=workers, where=where, echo=echo)
+    return state(files)
+
+
+def carry_out(
+    spec: Spec,
+    text: str,
+    files: Files,
+    *,
+    workers: int | None,
+    where: Where,
+    echo: Echo,
+    sources: Sources = (),
+) -> None:
+    """Run a specification, or what is missing of it, in a run directory.
+
+    Parameters
+    ----------
+    spec, text
+        It, and the TOML text that it was read from.
+    files
+        Those of the run directory.
+    workers, echo
+        As for `run`.
+    where
+        Where tasks are computed.
+    sources
+        Runs from which cells that they hold are taken, see `pipeline.runs.extend`.
+
+    Raises
+    ------
+    Exception
+        As `run`.
+    """
+    plan = make_plan(spec)
+    identity = identity_here(spec, plan)
+    check(files, identity)
+    with stoppable(files.name), files.lock():
+        info = establish(files, spec, plan, identity, text, echo)
+        _complete(info, spec, plan, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
@@ -108,15 +146,23 @@ def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
     return identity_of(spec, plan, kernel_version())
 
 
-def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where: Where, echo: Echo) -> None:
+def _complete(
+    info: RunInfo,
+    spec: Spec,
+    plan: Plan,
+    workers: int | None,
+    where: Where,
+    echo: Echo,
+    sources: Sources = (),
+) -> None:
     """Compute all tasks without a valid commit record."""
     from pipeline.compute import clients, execute, task
 
-    commits = read_commits(info, plan, echo)
-    sweep(info, commits, echo)
+    commits = sound_commits(info, plan, echo)
+    packer = Packer(info, plan, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
-        echo(f"{info.directory} is complete; nothing to do.")
+        echo(f"{info.name} is complete; nothing to do.")
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
     echo(
@@ -127,8 +173,9 @@ def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where:
     seconds = task.warm_up(spec)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
-    place = str(info.directory.absolute())
-    job = partial(task.run_task, place, info.digest, origin=origin(spec.model))
+    job = partial(task.run_task, info.files.place, info.digest, origin=origin(spec.model))
+    if sources:
+        job = partial(job, sources=tuple(sources))
     started = time.perf_counter()
     cores = max(1, min(workers or 1 if workers is not None else execute.default_workers(), len(missing)))
     expected_s = plan.core_seconds / cores * (1 - before / plan.n_cells)
@@ -137,26 +184,27 @@ def _complete(info: RunInfo, spec: Spec, plan: Plan, workers: int | None, where:
         results = execute.run_tasks(
             job,
             missing,
-            seconds=lambda i: plan.cells_in(i) * plan.seconds_per_cell,
+            after=None if plan.path is None else plan.predecessor,
+            seconds=plan.seconds,
             workers=workers,
             scheduler=where,
             echo=echo,
         )
         for result in results:
-            log_timing(info.directory, {**result, "at_s": round(time.perf_counter() - started, 4)})
+            log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
+            packer.add(result["task"])
             progress.add(result["cells"])
     _require_all(info, plan)
 
 
 def _require_all(info: RunInfo, plan: Plan) -> None:
     """Believe the commit records, not the workers."""
-    problems: list[str] = []
-    commits = read_commits(info, plan, problems.append)
-    absent = [i for i in range(plan.n_tasks) if i not in commits]
+    commits, problems = damaged_records(info, plan, contents=False)
+    absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:
-        why = f" {problems[0]}." if problems else ""
+        why = f" {next(iter(problems.values()))}." if problems else ""
         raise IncompleteError(
-            f"{info.directory}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
+            f"{info.name}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
             "and have room to write; then give the same command again: it computes these tasks alone."
         )

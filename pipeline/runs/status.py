@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.layout.plan import Plan
+from pipeline.store.files import Files
 from pipeline.store.run import Run
 
 
@@ -43,7 +43,7 @@ class State:
         return len(self.done) == self.plan.n_tasks
 
 
-def state(source: str | Path | Run) -> State:
+def state(source: str | Path | Files | Run) -> State:
     """Say how far a run is, from its commit records alone.
 
     Raises
@@ -52,10 +52,7 @@ def state(source: str | Path | Run) -> State:
         As `Run.open`.
     """
     run = Run.open(source)
-    cells: Counter[str] = Counter()
-    for commit in run.commits.values():
-        cells.update(commit.status)
-    return State(run.directory, run.info.title, run.plan, frozenset(run.commits), dict(cells))
+    return State(run.directory, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
 
 
 def describe_state(found: State) -> list[str]:

@@ -94,7 +94,7 @@ def leave(number: int) -> NoReturn:
 
 
 @contextlib.contextmanager
-def stoppable(directory: Path) -> Iterator[None]:
+def stoppable(directory: str | Path) -> Iterator[None]:
     """Turn Ctrl-C, SIGTERM and SIGHUP into `InterruptedRunError`, after all that is inside has been closed.
 
     Parameters

@@ -7,8 +7,10 @@ from pathlib import Path
 
 from pipeline.layout.plan import make_plan
 from pipeline.spec.parsing import kept_spec
-from pipeline.store.commits import Verification, verify, withdraw
-from pipeline.store.files import writer_lock
+from pipeline.store.checking import Verification, verify
+from pipeline.store.files import DERIVED
+from pipeline.store.packing import withdraw
+from pipeline.store.products import remove_product
 from pipeline.store.runfile import read_run
 from pipeline.store.setup import rebuild_skeleton
 
@@ -21,8 +23,8 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
     directory
         Run directory.
     repair
-        Rebuild damaged metadata and coordinates, and withdraw the records of damaged tasks: these are
-        pending from then on.
+        Rebuild damaged metadata and coordinates, withdraw the records of damaged tasks, which are pending
+        from then on, and remove damaged products.
 
     Raises
     ------
@@ -40,10 +42,12 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
     plan = make_plan(spec)
     if not repair:
         return verify(info, plan)
-    with writer_lock(info.directory):
+    with info.files.lock():
         found = verify(info, plan)
         rest = rebuild_skeleton(info, spec, plan)
         withdraw(info, found.damaged)
+        for name in found.derived:
+            remove_product(info.directory / DERIVED / name)
     rebuilt = [problem for problem in found.skeleton if problem not in rest]
     return replace(found, skeleton=rest, rebuilt=rebuilt)
 
@@ -51,7 +55,9 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
 def describe(found: Verification, directory: str | Path, *, repaired: bool) -> list[str]:
     """Return the lines to print."""
     lines = [f"{directory}: {found.n_committed} of {found.n_tasks} tasks committed and intact"]
-    lines += [f"  damaged: {text}" for text in (*found.damaged.values(), *found.skeleton)]
+    lines += [
+        f"  damaged: {text}" for text in (*found.damaged.values(), *found.skeleton, *found.derived.values())
+    ]
     lines += [f"  rebuilt: {text}" for text in found.rebuilt]
     if found.leftovers:
         lines.append(f"  {len(found.leftovers)} uncommitted files, read by nobody; the next run removes them")
@@ -67,6 +73,10 @@ def describe(found: Verification, directory: str | Path, *, repaired: bool) -> l
         lines.append(
             f"{len(found.damaged)} records withdrawn: run the specification again to compute these tasks."
         )
-    elif found.damaged:
+    if found.derived and repaired:
+        lines.append(f"{len(found.derived)} products removed: they are computed again when asked for.")
+    elif found.derived:
+        lines.append("Damaged products are computed again when asked for; --repair removes them.")
+    if found.damaged and not repaired:
         lines.append("Withdraw them with --repair, then run the specification again to compute these tasks.")
     return lines

@@ -101,14 +101,14 @@ def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
     data = spec.as_dict()
     notes: list[str] = []
     for key, value in changes.pins.items():
-        _put(spec, data, key, value)
+        put_value(spec, data, key, value)
     for key, (low, high) in changes.ranges.items():
         old = _extent(spec, key)
         if old and not (old[0] - _slack(old) <= low and high <= old[1] + _slack(old)):
             notes.append(f"{key}: {low:g} to {high:g} reaches beyond the old {old[0]:g} to {old[1]:g}.")
         num = _points(spec, key, changes)
         as_interval = _state(spec, key) is not None and isinstance(spec.initial_conditions, RandomStarts)
-        _put(spec, data, key, [low, high] if as_interval else {"start": low, "stop": high, "num": num})
+        put_value(spec, data, key, [low, high] if as_interval else {"start": low, "stop": high, "num": num})
     if changes.samples is not None:
         data["initial_conditions"]["n"] = changes.samples
     data["title"] = spec.title if spec.title.endswith(MARK) else f"{spec.title} {MARK}".strip()
@@ -228,7 +228,7 @@ def _slack(extent: tuple[float, float]) -> float:
     return _ROUNDING * max(abs(extent[0]), abs(extent[1]))
 
 
-def _put(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
+def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
     """Set a state's or parameter's value or range in plain data, and take its old one out."""
     state = _state(spec, key)
     if state is not None:

@@ -32,9 +32,23 @@ def seconds_of(time: str) -> int:
     return 3600 * hours + 60 * minutes + seconds
 
 
+def bytes_of(memory: str) -> int:
+    """Bytes of a size such as ``16 GB``; raises `ValueError` if it is none."""
+    match = _MEMORY.fullmatch(memory)
+    if match is None or not float(match[1]):
+        raise ValueError(f"{memory!r}: must be a number and kB, MB, GB or TB, such as '16 GB'.")
+    return int(float(match[1]) * _UNITS[match[2]])
+
+
 def clock(seconds: int) -> str:
     """Write seconds as `seconds_of` reads them."""
     return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
+
+
+def hours_and_minutes(seconds: int) -> str:
+    """Write seconds as LSF has times: whole minutes, at least one."""
+    minutes = max(1, seconds // 60)
+    return f"{minutes // 60:02d}:{minutes % 60:02d}"
 
 
 class Cluster(Table):
@@ -55,6 +69,12 @@ class Cluster(Table):
     )
     min_jobs: int = Field(0, ge=0, le=10_000, description="Jobs that are kept, whatever there is to do.")
     max_jobs: int = Field(1, ge=1, le=10_000, description="Jobs at most.")
+    coordinator_memory: str = Field(
+        "4 GB", description="Memory of the job that sends tasks to the others, where there are several."
+    )
+    coordinator_walltime: str | None = Field(
+        None, description="Its time; by default the walltime of the others."
+    )
     wait: str = Field("24:00:00", description="How long to wait for the first worker.")
     prologue: Lines = Field(
         (), description="Shell lines before the workers start, such as 'module load python'."
@@ -66,19 +86,17 @@ class Cluster(Table):
     scratch: str | None = Field(None, description="Folder of a node's own disk, such as '$TMPDIR'.")
     python: str | None = Field(None, description="Python on the nodes; by default the one that runs here.")
 
-    @field_validator("walltime", "lifetime", "lifetime_stagger", "wait")
+    @field_validator("walltime", "lifetime", "lifetime_stagger", "coordinator_walltime", "wait")
     @classmethod
     def _time(cls, value: str | None) -> str | None:
         if value is not None:
             seconds_of(value)
         return value
 
-    @field_validator("memory")
+    @field_validator("memory", "coordinator_memory")
     @classmethod
     def _size(cls, value: str) -> str:
-        match = _MEMORY.fullmatch(value)
-        if match is None or not float(match[1]):
-            raise ValueError(f"{value!r}: must be a number and kB, MB, GB or TB, such as '16 GB'.")
+        bytes_of(value)
         return value
 
     @field_validator("queue", "account", "interface", "scratch", "python", "prologue", "directives")
@@ -143,9 +161,7 @@ class Cluster(Table):
     @property
     def memory_bytes(self) -> int:
         """Memory of a job."""
-        match = _MEMORY.fullmatch(self.memory)
-        assert match is not None
-        return int(float(match[1]) * _UNITS[match[2]])
+        return bytes_of(self.memory)
 
     @property
     def wait_s(self) -> int:

@@ -9,17 +9,83 @@ from typing import Any
 
 from pipeline.spec.problems import SpecError
 
+MOST_BYTES = 32_000_000
+MOST_DEPTH = 32
+MOST_KEY = 200
+"""Characters of a key."""
+WHOLE_NUMBERS = range(-(2**63), 2**63)
+
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Return the tables of a TOML file; raises `SpecError` if it cannot be read."""
+    """Return the tables of a TOML file.
+
+    Raises
+    ------
+    SpecError
+        If it cannot be read, or holds what no specification can (see `odd_data`).
+    """
     try:
-        return tomllib.loads(Path(path).read_text("utf-8"))
-    except OSError as error:
-        raise SpecError([f"{path}: cannot be read ({error.strerror or error})."]) from None
-    except UnicodeDecodeError:
-        raise SpecError([f"{path}: is not text in UTF-8; a specification is a TOML file."]) from None
-    except tomllib.TOMLDecodeError as error:
-        raise SpecError([f"{path}: is not valid TOML: {error}."]) from None
+        with open(path, "rb") as file:
+            content = file.read(MOST_BYTES + 1)
+        if len(content) > MOST_BYTES:
+            raise SpecError([
+                f"{path}: has more than {MOST_BYTES // 1_000_000} MB, the most that a specification has; "
+                "give ranges, or random starts with a seed, instead of lists."
+            ])  # fmt: skip
+        data = tomllib.loads(content.decode("utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, SpecError):
+            raise
+        raise SpecError([f"{path}: {_unreadable(error)}"]) from None
+    problems = odd_data(data)
+    if problems:
+        raise SpecError([f"{path}: {problem}" for problem in problems])
+    return data
+
+
+def _unreadable(error: Exception) -> str:
+    """Say why a file is no specification."""
+    if isinstance(error, OSError):
+        return f"cannot be read ({error.strerror or error})."
+    if isinstance(error, UnicodeDecodeError):
+        return "is not text in UTF-8; a specification is a TOML file."
+    if isinstance(error, tomllib.TOMLDecodeError):
+        return f"is not valid TOML: {error}."
+    if isinstance(error, RecursionError):
+        return (
+            f"is nested too deep; a specification has at most {MOST_DEPTH} tables and lists within another."
+        )
+    # Python's own bound on the digits of a whole number; or a path with a null character
+    return f"is not valid TOML: {str(error).partition(';')[0].partition(':')[0]}."
+
+
+def odd_data(data: Any) -> list[str]:
+    """Say what no specification can hold: data too deep, whole numbers beyond 64 bits, endless keys.
+
+    Everything behind this may walk the data by recursion, turn whole numbers into floats and repeat keys.
+    """
+    todo: list[tuple[str, Any, int]] = [("", data, 0)]
+    while todo:
+        place, value, depth = todo.pop()
+        if depth > MOST_DEPTH:
+            return [
+                f"{place[:MOST_KEY]}: is nested too deep: more than {MOST_DEPTH} tables or lists in another."
+            ]
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                if not isinstance(key, str):
+                    return [f"{place or 'specification'}: the key {key!r} is no text; keys are texts."]
+                if len(key) > MOST_KEY:
+                    return [f"{key[:40]}...: this key has {len(key)} characters; {MOST_KEY} are the most."]
+                todo.append((f"{place}.{key}" if place else key, inner, depth + 1))
+        elif isinstance(value, (list, tuple)):
+            todo += [(place, v, depth + 1) for v in value if not isinstance(v, (float, str, bool))]
+        elif isinstance(value, int) and value not in WHOLE_NUMBERS:
+            bits = value.bit_length()
+            return [
+                f"{place}: a whole number of {bits} bits is none in TOML, whose have 64; write it as 1e300."
+            ]
+    return []
 
 
 def nested(table: Mapping[str, Any]) -> dict[str, Any]:

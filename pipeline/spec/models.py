@@ -15,7 +15,7 @@ from magpend_core.models.imported import KEY, is_object_path
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import ParameterError
 from pipeline.spec.files import read_toml
-from pipeline.spec.problems import SpecError
+from pipeline.spec.problems import SpecError, shown
 from pipeline.spec.toml import table_lines, toml_value
 
 SUFFIX = ".toml"
@@ -50,7 +50,7 @@ def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model
             return load_model(reference)
         if not isinstance(reference, str):
             raise SpecError([
-                f"{at} = {reference!r}: must be a name in quotes, such as {model_names()[0]!r}, a file "
+                f"{at} = {shown(reference)}: must be a name in quotes, such as {model_names()[0]!r}, a file "
                 '"FILE.toml", a Python object "package.module:NAME", or a table [model] with states, '
                 "parameters and equations."
             ])  # fmt: skip

@@ -8,7 +8,7 @@ angles in degrees are converted once, in `pipeline.layout.cells`.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,10 +24,10 @@ from magpend_core.models.presets import Preset, is_file
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.drives import RecordedDrive
-from pipeline.spec.files import merged, nested, read_toml
+from pipeline.spec.files import merged, nested, odd_data, read_toml
 from pipeline.spec.methods import method_problems
 from pipeline.spec.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
-from pipeline.spec.problems import SpecError, problems_of, unknown_choice, unknown_key
+from pipeline.spec.problems import SpecError, problems_of, shown, unknown_choice, unknown_key
 from pipeline.spec.recorded import DriveTable, recorded, run_problems, with_drive
 from pipeline.spec.section import SectionTable, section_of, seen_through
 from pipeline.spec.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
@@ -118,6 +118,8 @@ _TABLES: dict[str, type[Table]] = {
     "section": SectionTable,
 }
 _OPTIONAL = ("drive", "section")
+MOST_RELATED = 12
+"""Axes of parameters that a model relates to each other: all corners of their box are looked at."""
 _KEYS = (
     "kind", "title", "model", "parameters", "axes", "initial_conditions", "continuation", "integration",
     "products", "execution", "drive", "section",
@@ -163,7 +165,7 @@ def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, An
         return plain
     table = data["smoke"]
     if not isinstance(table, dict):
-        raise SpecError([f"smoke = {table!r}: must be a table of keys to replace."])
+        raise SpecError([f"smoke = {shown(table)}: must be a table of keys to replace."])
     changes = nested(table)
     base = with_model_table(plain, folder) if isinstance(changes.get("model"), dict) else plain
     small = merged(base, changes)
@@ -204,6 +206,8 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     SpecError
         With all problems at once.
     """
+    if odd := odd_data(data):
+        raise SpecError(odd)
     if data.get("kind") == IDENTIFICATION:
         raise SpecError([f'kind = "{IDENTIFICATION}": is no run; use magpend identify SPEC --out DIR.'])
     if "kind" not in data and "equations" in data:
@@ -309,14 +313,16 @@ def _kind(data: Mapping[str, Any], problems: list[str]) -> str:
 def _title(data: Mapping[str, Any], problems: list[str]) -> str:
     title = data.get("title", "")
     if not isinstance(title, str):
-        problems.append(f"title = {title!r}: must be a text in quotes.")
+        problems.append(f"title = {shown(title)}: must be a text in quotes.")
+    elif not title.isprintable():
+        problems.append(f"title = {shown(title)}: has control characters or line breaks; take them out.")
     return str(title)
 
 
 def _is_table(data: Mapping[str, Any], name: str, problems: list[str]) -> bool:
     if isinstance(data.get(name, {}), dict):
         return True
-    problems.append(f"{name} = {data[name]!r}: must be a table; write [{name}].")
+    problems.append(f"{name} = {shown(data[name])}: must be a table; write [{name}].")
     return False
 
 
@@ -351,7 +357,7 @@ def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Start
         return None
     table = data["initial_conditions"]
     kind = table.get("kind")
-    if kind not in STARTS:
+    if not isinstance(kind, str) or kind not in STARTS:
         choices = list(STARTS)
         problems.append(
             'initial_conditions.kind: missing; set it to "grid", "list" or "random".'
@@ -439,11 +445,38 @@ def _axis_problems(base: Parameters, name: str, values: np.ndarray) -> list[str]
 
 
 def _corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]:
-    """Problems between parameters: bounds are intervals, so the corners of the box decide."""
-    ends = [dict.fromkeys((float(v.min()), float(v.max()))) for v in swept.values()]
-    for corner in itertools.product(*ends):
-        try:
-            base.replace(**dict(zip(swept, corner, strict=True)))
-        except ParameterError as error:
-            return list(error.problems)
-    return []
+    """Problems between parameters: bounds are intervals, so the corners of the box decide.
+
+    Only along the axes that the model looks at when it relates parameters: it is asked once, and again where
+    an answer made it look at others.
+    """
+    ends = {name: (float(v.min()), float(v.max())) for name, v in swept.items()}
+    asked = _Asked(base)
+    problems, looked_at = base.model.relations(asked), set[str]()
+    while not problems and looked_at != asked.names & set(ends):
+        looked_at = asked.names & set(ends)
+        if len(looked_at) > MOST_RELATED:
+            return [f"{base.model.name} relates more than {MOST_RELATED} of them; fix some."]
+        for corner in itertools.product(*(dict.fromkeys(ends[name]) for name in sorted(looked_at))):
+            asked.values_now = {**base, **dict(zip(sorted(looked_at), corner, strict=True))}
+            problems = base.model.relations(asked)
+            if problems:
+                return list(problems)
+    return list(problems)
+
+
+class _Asked(Mapping[str, float]):
+    """Values that note which of them are asked for."""
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        self.values_now, self.names = dict(values), set[str]()
+
+    def __getitem__(self, name: str) -> float:
+        self.names.add(name)
+        return self.values_now[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_now)
+
+    def __len__(self) -> int:
+        return len(self.values_now)

@@ -28,6 +28,19 @@ class SpecError(ValueError):
         super().__init__("\n".join(self.problems))
 
 
+SHOWN = 120
+"""Characters of a value that a sentence repeats."""
+
+
+def shown(value: Any) -> str:
+    """Spell a value for a sentence: its begin and its end, if it is long."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a whole number of thousands of digits; a list in itself
+        return f"a {type(value).__name__}"
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 40]} ... {text[-30:]}"
+
+
 def unknown_key(path: str, key: str, known: Iterable[str]) -> str:
     """Sentence for a key that does not exist, with the nearest known ones."""
     names = list(known)
@@ -38,9 +51,9 @@ def unknown_key(path: str, key: str, known: Iterable[str]) -> str:
 
 def unknown_choice(path: str, value: Any, choices: Sequence[str]) -> str:
     """Sentence for a value that is none of the choices, with the nearest one."""
-    near = difflib.get_close_matches(str(value), choices, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(value, choices, n=1, cutoff=0.5) if isinstance(value, str) else []
     hint = f" Did you mean {near[0]!r}?" if near else ""
-    return f"{path} = {value!r}: must be {' or '.join(repr(c) for c in choices)}.{hint}"
+    return f"{path} = {shown(value)}: must be {' or '.join(repr(c) for c in choices)}.{hint}"
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> str:
@@ -141,9 +154,9 @@ def _sentence(item: dict[str, Any], model: type[BaseModel], prefix: str) -> str:
         return unknown_choice(path, value, choices)
     if kind in _BOUNDS:
         name, words = _BOUNDS[kind]
-        return f"{path} = {value!r}: must be {words} {context[name]}."
+        return f"{path} = {shown(value)}: must be {words} {context[name]}."
     if kind in _TYPES:
-        return f"{path} = {value!r}: must be {_TYPES[kind]}."
+        return f"{path} = {shown(value)}: must be {_TYPES[kind]}."
     message = item["msg"].removeprefix("Value error, ")
     return f"{path}: {message}"
 

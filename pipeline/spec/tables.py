@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from fractions import Fraction
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,6 +16,8 @@ FREQUENCY = "frequency_hz"
 """The drive's frequency among the parameters."""
 
 MAX_POINTS = 10_000_000
+EXACT = 2**53
+"""Whole numbers up to here are float64 themselves."""
 
 
 class Table(BaseModel):
@@ -69,7 +72,12 @@ class Range(Table):
         else:
             step = Fraction(repr(self.step))
             num = (stop - start) // step + 1
-        return np.array([float(start + i * step) for i in range(num)], dtype=np.float64)
+        # quotients of whole numbers are rounded once, by Python and, where these are exact, by numpy
+        below = math.lcm(start.denominator, step.denominator)
+        first, each = (int(part * below) for part in (start, step))
+        if max(abs(first), abs(first + (num - 1) * each), below) <= EXACT:
+            return np.asarray((first + each * np.arange(num)) / below)
+        return np.array([(first + i * each) / below for i in range(num)], dtype=np.float64)
 
 
 class PresetTable(Table):
@@ -160,4 +168,8 @@ class Execution(Table):
 
     trajectories_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
         None, description="Cells or branches that a task takes; by default as fits its chunks and its time."
+    )
+    points_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
+        None,
+        description="Points of the path that a walk's task takes; by default as fits its time.",
     )

@@ -11,45 +11,34 @@ that stops whoever asked, so that nothing is swept on the word of a failing disk
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Container, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import zarr
-from zarr.storage import LocalStore
 
-from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import Plan
-from pipeline.store.files import (
-    COMMITS,
-    CUBE,
-    TIMINGS,
-    files_below,
-    object_entry,
-    problems_of,
-    refuse_links,
-    sync,
-    sync_folder,
-    unreadable,
-    write_atomically,
+from pipeline.store.files import COMMITS, CUBE, TIMINGS, Files, LinkError, entry_of
+from pipeline.store.keys import Owners, chunk_keys
+from pipeline.store.records import (
+    BLOCK,
+    Commit,
+    Pack,
+    Records,
+    block_of_pack,
+    line_of,
+    marker_key,
+    pack_key,
+    read_pack,
+    read_record,
+    record_text,
+    salvage,
 )
 from pipeline.store.runfile import RunInfo
-from pipeline.store.seal import seal, unseal
 
 Echo = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Commit:
-    """A valid record."""
-
-    task: int
-    status: dict[str, int]
-    objects: dict[str, dict[str, Any]]
 
 
 # ---- writing -----------------------------------------------------------------------------------
@@ -78,22 +67,32 @@ def write_task(
     ValueError
         If an array has another shape or dtype than the store, or a block cuts a chunk.
     """
-    cube = info.directory / CUBE
-    refuse_links(cube, *(cube / v.name for v in plan.variables), info.directory / COMMITS)
+    info.files.refuse_links(CUBE, *(f"{CUBE}/{v.name}" for v in plan.variables), COMMITS)
+    cube = info.files.below(CUBE)
     objects = [key for v in plan.variables for key in write_block(cube, plan, index, v.name, values[v.name])]
-    sync((cube / key for key in objects), cube)
+    cube.sync(objects)
     record = {
         "digest": info.digest,
         "task": index,
         "status": dict(counts),
-        "objects": {key: object_entry(cube / key) for key in objects},
+        "objects": {key: entry_of(cube.read(key)) for key in objects},
     }
-    write_atomically(marker_path(info.directory, index), record_text(record))
+    if not is_packed(info, index):  # else somebody has committed these very bytes before
+        info.files.write_once(marker_key(index), record_text(record).encode())
 
 
-def write_block(cube: Path, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
+def is_packed(info: RunInfo, index: int) -> bool:
+    """Whether a pack vouches for a task already: it may have been given to two workers."""
+    block = index // BLOCK
+    if not info.files.is_there(pack_key(block)):
+        return False
+    pack = read_pack(info.files.read(pack_key(block)), info.digest, block)
+    return isinstance(pack, Pack) and index not in pack.without
+
+
+def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
     """Write one variable's chunks of a task and return their keys."""
-    array = zarr.open_array(LocalStore(cube), path=name, mode="r+")
+    array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+")
     # The setting is not stored: without it a block equal to the fill value would leave no file.
     array = array.with_config({"write_empty_chunks": True})
     block = plan.task(index)
@@ -109,41 +108,19 @@ def write_block(cube: Path, plan: Plan, index: int, name: str, values: np.ndarra
     return keys
 
 
-def chunk_keys(
-    name: str, region: tuple[slice, ...], chunks: tuple[int, ...], shape: tuple[int, ...]
-) -> list[str]:
-    """Keys of the chunks in a region; a region that cuts a chunk would lose a neighbour's cells."""
-    for s, c, n in zip(region, chunks, shape, strict=True):
-        if s.start % c or (s.stop % c and s.stop != n):
-            raise ValueError(f"{name}: region {region} cuts chunks of {chunks}.")
-    places = [range(s.start // c, -(-s.stop // c)) for s, c in zip(region, chunks, strict=True)]
-    if not places:
-        return [f"{name}/c"]
-    grid = np.stack(np.meshgrid(*places, indexing="ij"), axis=-1).reshape(-1, len(places))
-    return [f"{name}/c." + ".".join(map(str, place)) for place in grid]
-
-
-def record_text(record: Mapping[str, Any]) -> str:
-    """A commit record as it is stored: one line, the same for equal records, under its own checksum."""
-    return seal(json.dumps(record, sort_keys=True, allow_nan=False, ensure_ascii=False))
-
-
-def marker_path(directory: Path, index: int) -> Path:
-    """Where a task's record lies."""
-    return directory / COMMITS / f"{index:06d}.json"
-
-
-def log_timing(directory: Path, entry: Mapping[str, Any]) -> None:
+def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
     """Append what a task took to ``timings.jsonl``; no part of the result, not synced."""
-    with (directory / TIMINGS).open("a", encoding="utf-8") as file:
-        file.write(json.dumps(entry, sort_keys=True) + "\n")
+    info.files.append(TIMINGS, json.dumps(entry, sort_keys=True))
 
 
 # ---- reading -----------------------------------------------------------------------------------
 
 
-def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> dict[int, Commit]:
-    """Return the valid records by task: right digest, and all objects there in their size.
+def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records:
+    """Return the valid records by task: whole, of this run and of a task that it has.
+
+    As long as no record is packed, the objects of each are there in their size, too. In larger runs that is
+    left to who reads them, to `verify`, and to `pipeline.runs.run`: it would take as long as reading.
 
     Parameters
     ----------
@@ -159,95 +136,166 @@ def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> dict[in
     RefusedError
         If a folder is a link.
     """
-    whole, rejected = _read_records(info, plan)
-    # taken after the records: a chunk is there before its record is
-    sizes = _sizes(info.directory / CUBE)
+    records, rejected = scan(info, plan)
+    problems = [f"{COMMITS}/{name}: {problem}; it does not count" for name, problem in rejected.items()]
+    if not records.packs:
+        absent = absent_objects(info, records)
+        whole = {index: commit for index, commit in records.items() if index not in absent}
+        records = Records(info.files, info.digest, whole)
+        problems = [f"task {i}: {problem}; it is computed again" for i, problem in absent.items()] + problems
+    for problem in problems if echo else ():
+        echo(problem)  # type: ignore[misc]
+    return records
+
+
+def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, str]:
+    """What is missing or has another size, by task; a chunk is there before its record is."""
+    sizes = info.files.below(CUBE).sizes() if records else {}
     found = {}
-    for commit in whole.values():
-        absent = [key for key, entry in commit.objects.items() if sizes.get(key) != entry["size"]]
-        if not absent:
-            found[commit.task] = commit
-        elif echo:
-            echo(f"task {commit.task}: {absent[0]} is missing or has another size; it is computed again")
-    if echo:
-        for name, problem in rejected.items():
-            echo(f"{COMMITS}/{name}: {problem}; it does not count")
+    for index, commit in records.items():
+        keys = (key for key, entry in commit.objects.items() if sizes.get(key) != entry["size"])
+        key = next(keys, None)
+        if key is not None:
+            found[index] = f"{key} is missing or has another size"
     return found
 
 
-def _read_records(info: RunInfo, plan: Plan) -> tuple[dict[str, Commit], dict[str, str]]:
-    """Return the whole records of the run, and the problems of the others, both by file name."""
-    folder = info.directory / COMMITS
-    refuse_links(folder)
-    whole, rejected = {}, {}
-    try:
-        with unreadable(folder), os.scandir(folder) as entries:
-            names = sorted(entry.name for entry in entries if entry.name.endswith(".json"))
-    except FileNotFoundError:
-        return {}, {}
-    for name in names:
-        found = _read_record(folder / name, info, plan)
-        if isinstance(found, Commit):
-            whole[name] = found
-        elif found:
-            rejected[name] = found
-    return whole, rejected
+def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
+    """Return the record of one task, None if it has no valid one; its objects are not looked at.
+
+    Raises
+    ------
+    UnreadableError
+        If it is there and cannot be read.
+    """
+    return scan(info, plan, (index // BLOCK,))[0].get(index)
 
 
-def _read_record(path: Path, info: RunInfo, plan: Plan) -> Commit | str:
-    """Return a record if it is whole, of this run and of this task; else what is wrong with it."""
-    if path.is_symlink():
-        return "is a link"
+def scan(info: RunInfo, plan: Plan, blocks: Container[int] | None = None) -> tuple[Records, dict[str, str]]:
+    """Return the whole records of the run, and the problems of the others by file name.
+
+    Parameters
+    ----------
+    info, plan
+        The run.
+    blocks
+        Those to look at; by default all.
+    """
+    info.files.refuse_links(COMMITS)
+    folder = info.files.below(COMMITS)
+    names = _names(folder)
+    while True:
+        found = _Scan(info, plan, blocks)
+        vanished = found.read(folder, names)
+        before, names = names, _names(folder)
+        # while this was reading, the records of a block may have moved into their pack
+        if not vanished and _packs(before) == _packs(names):
+            return Records(info.files, info.digest, found.singles, found.packs), found.rejected
+
+
+def _names(folder: Files) -> list[str]:
     try:
-        with unreadable(path):
-            content = path.read_bytes()
+        return folder.names()
     except FileNotFoundError:
+        return []
+
+
+def _packs(names: Iterable[str]) -> list[str]:
+    return [name for name in names if block_of_pack(name) is not None]
+
+
+class _Scan:
+    """What lies in ``commits``."""
+
+    def __init__(self, info: RunInfo, plan: Plan, blocks: Container[int] | None) -> None:
+        self._info = info
+        self._plan = plan
+        self._blocks = blocks
+        self.singles: dict[int, Commit] = {}
+        self.packs: dict[int, Pack] = {}
+        self.rejected: dict[str, str] = {}
+
+    def read(self, folder: Files, names: list[str]) -> bool:
+        """Read all records; returns whether some were gone when they were to be read."""
+        vanished = False
+        blocks = {name: block_of_pack(name) for name in _packs(names)}
+        for name, content in folder.read_each(n for n, block in blocks.items() if self._asked(block)):
+            vanished |= self._take(name, content, self._pack)
+        for name, content in folder.read_each(n for n in names if n.endswith(".json") and self._alone(n)):
+            vanished |= self._take(name, content, self._single)
+        return vanished
+
+    def _asked(self, block: int | None) -> bool:
+        return block is not None and (self._blocks is None or block in self._blocks)
+
+    def _alone(self, name: str) -> bool:
+        """Whether a record has to be read: it is not one that has been packed and not yet removed."""
+        stem = name.removesuffix(".json")
+        if not stem.isdecimal():
+            return self._blocks is None
+        pack = self.packs.get(int(stem) // BLOCK)
+        return self._asked(int(stem) // BLOCK) and (pack is None or int(stem) in pack.without)
+
+    def _take(self, name: str, content: bytes | FileNotFoundError, read: Callable[[str, bytes], str]) -> bool:
+        if isinstance(content, LinkError):
+            self.rejected[name] = "is a link"
+        elif isinstance(content, FileNotFoundError):
+            return True
+        elif problem := read(name, content):
+            self.rejected[name] = problem
+        return False
+
+    def _pack(self, name: str, content: bytes) -> str:
+        block = int(name.partition("-")[0]) // BLOCK
+        found = read_pack(content, self._info.digest, block)
+        is_inside = (block + 1) * BLOCK <= self._plan.n_tasks
+        if isinstance(found, Pack) and is_inside:
+            self.packs[block] = found
+            return ""
+        saved = salvage(content, self._info.digest, block) if is_inside else {}
+        self.singles |= saved
+        problem = found if isinstance(found, str) else "of no tasks of this run"
+        return f"{problem}, with {len(saved)} whole records"
+
+    def _single(self, name: str, content: bytes) -> str:
+        found = read_record(content, self._info.digest)
+        if isinstance(found, str):
+            return found
+        if not 0 <= found.task < self._plan.n_tasks or marker_key(found.task) != f"{COMMITS}/{name}":
+            return "torn or damaged"
+        self.singles[found.task] = found
         return ""
-    try:
-        data = unseal(content)
-        commit = Commit(int(data["task"]), dict(data["status"]), dict(data["objects"]))
-        digest = data["digest"]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return "torn or damaged"
-    if digest != info.digest:
-        return "of another run"
-    named = 0 <= commit.task < plan.n_tasks and path.name == marker_path(info.directory, commit.task).name
-    inside = all(key.partition("/")[0] in {v.name for v in plan.variables} for key in commit.objects)
-    return commit if named and inside and not _climbs(commit) else "torn or damaged"
-
-
-def _climbs(commit: Commit) -> bool:
-    return any(".." in Path(key).parts for key in commit.objects)
-
-
-def _sizes(cube: Path) -> dict[str, int]:
-    """Size of every plain file of the cube by key."""
-    refuse_links(cube)
-    found: dict[str, int] = {}
-    try:
-        with unreadable(cube), os.scandir(cube) as arrays:
-            folders = [Path(a.path) for a in arrays if a.is_dir()]
-    except FileNotFoundError:
-        return found
-    refuse_links(*folders)
-    for folder in folders:
-        with unreadable(folder), os.scandir(folder) as entries:
-            for entry in entries:
-                if entry.is_file(follow_symlinks=False):
-                    found[f"{folder.name}/{entry.name}"] = entry.stat(follow_symlinks=False).st_size
-    return found
 
 
 def cube_digest(info: RunInfo, commits: Mapping[int, Commit]) -> str:
-    """Digest of what is committed of a run: its identity, and the sha256 of every committed object."""
-    objects = {str(index): commits[index].objects for index in sorted(commits)}
-    return digest_of({"run": info.digest, "commits": objects})
+    """Digest of what is committed of a run: its identity, and all records."""
+    own = isinstance(commits, Records)
+    lines = commits.lines() if own else (line_of(commits[i], info.digest) for i in sorted(commits))  # type: ignore[attr-defined]
+    digest = hashlib.sha256(info.digest.encode())
+    for line in lines:
+        digest.update(line)
+    return digest.hexdigest()[:32]
 
 
 # ---- what nothing vouches for ------------------------------------------------------------------
 
 
-def sweep(info: RunInfo, commits: Mapping[int, Commit], echo: Echo | None = None) -> int:
+def leftover_keys(info: RunInfo, plan: Plan, commits: Records) -> list[str]:
+    """Files in ``cube.zarr`` and ``commits`` that no valid record vouches for, by key."""
+    info.files.refuse_links(CUBE, COMMITS)
+    owners = Owners(plan)
+
+    def is_kept(key: str) -> bool:
+        owner = owners.task(key)
+        return key in info.skeleton or (owner is not None and owner in commits)
+
+    chunks = [f"{CUBE}/{key}" for key in info.files.below(CUBE).everything() if not is_kept(key)]
+    own = {marker_key(i) for i in commits.singles} | {pack_key(block) for block in commits.packs}
+    records = (f"{COMMITS}/{key}" for key in info.files.below(COMMITS).everything())
+    return chunks + [key for key in records if key not in own]
+
+
+def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None) -> int:
     """Remove leftovers: chunk files and records that no valid record vouches for. Returns how many.
 
     Only for the holder of the lock. Nothing outside ``cube.zarr`` and ``commits`` is touched: a link in
@@ -255,92 +303,19 @@ def sweep(info: RunInfo, commits: Mapping[int, Commit], echo: Echo | None = None
 
     Parameters
     ----------
-    info
+    info, plan
         The run.
     commits
         All its valid records, as `read_commits` has just returned them.
     echo
         Prints a line; says what is removed.
     """
-    cube, folder = info.directory / CUBE, info.directory / COMMITS
-    refuse_links(cube, folder)
-    keep = {cube / key for key in info.skeleton}
-    keep |= {cube / key for commit in commits.values() for key in commit.objects}
-    keep |= {marker_path(info.directory, index) for index in commits}
-    with unreadable(info.directory):
-        leftovers = [file for top in (cube, folder) for file in files_below(top) if file not in keep]
-    for file in leftovers:
-        file.unlink()
+    leftovers = leftover_keys(info, plan, commits)
+    info.files.remove(leftovers)
     if leftovers and echo:
-        names = [file.relative_to(info.directory).as_posix() for file in leftovers]
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        echo(f"removed {len(names)} files that no commit record vouches for: {', '.join(names[:3])}{more}")
+        more = f" and {len(leftovers) - 3} more" if len(leftovers) > 3 else ""
+        echo(
+            f"removed {len(leftovers)} files that no commit record vouches for: "
+            f"{', '.join(leftovers[:3])}{more}"
+        )
     return len(leftovers)
-
-
-@dataclass(frozen=True)
-class Verification:
-    """What `verify` found.
-
-    Attributes
-    ----------
-    n_tasks, n_committed : int
-        Tasks of the run, and those that are committed and intact.
-    damaged : dict
-        Problem by the file name of the commit record.
-    skeleton : list of str
-        Problems of metadata and coordinates.
-    leftovers : list of str
-        Files that nothing vouches for; harmless, swept by the next run.
-    rebuilt : list of str
-        Problems of the skeleton that have been mended.
-    """
-
-    n_tasks: int
-    n_committed: int
-    damaged: dict[str, str]
-    skeleton: list[str]
-    leftovers: list[str]
-    rebuilt: list[str] = field(default_factory=list)
-
-    @property
-    def sound(self) -> bool:
-        """Whether all that is committed is intact."""
-        return not self.damaged and not self.skeleton
-
-
-def verify(info: RunInfo, plan: Plan) -> Verification:
-    """Read every committed file and compare its sha256 with its record.
-
-    Raises
-    ------
-    UnreadableError
-        If a file is there and cannot be read.
-    """
-    cube = info.directory / CUBE
-    refuse_links(cube)
-    whole, rejected = _read_records(info, plan)
-    damaged = {name: f"{COMMITS}/{name}: {problem}" for name, problem in rejected.items()}
-    vouched = set(info.skeleton)
-    for name, commit in whole.items():
-        vouched.update(commit.objects)
-        problems = problems_of(cube, commit.objects)
-        if problems:
-            damaged[name] = "; ".join(problems)
-    found = [f.relative_to(cube).as_posix() for f in files_below(cube)] if cube.is_dir() else []
-    return Verification(
-        n_tasks=plan.n_tasks,
-        n_committed=len(whole) + len(rejected) - len(damaged),
-        damaged=dict(sorted(damaged.items())),
-        skeleton=problems_of(cube, info.skeleton),
-        leftovers=sorted(key for key in found if key not in vouched),
-    )
-
-
-def withdraw(info: RunInfo, names: Iterable[str]) -> None:
-    """Remove commit records by file name, so that the next run computes their tasks again."""
-    folder = info.directory / COMMITS
-    refuse_links(folder)
-    for name in names:
-        (folder / name).unlink(missing_ok=True)
-    sync_folder(folder)

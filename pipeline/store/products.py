@@ -22,10 +22,9 @@ from zarr.storage import LocalStore
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.store.arrays import create_array
 from pipeline.store.errors import DamagedError
-from pipeline.store.files import (
-    TEMPORARY,
+from pipeline.store.files import TEMPORARY, entry_of
+from pipeline.store.local import (
     files_below,
-    object_entry,
     refuse_links,
     remove_tree,
     sync,
@@ -188,7 +187,9 @@ def _seal(folder: Path, attrs: Mapping[str, Any]) -> str:
     """Digest of a product's attributes and files."""
     digest = hashlib.sha256(json.dumps(_own(attrs), sort_keys=True).encode())
     for file in sorted(f for f in files_below(folder) if f != folder / "zarr.json"):
-        digest.update(f"\n{file.relative_to(folder).as_posix()} {object_entry(file)['sha256']}".encode())
+        digest.update(
+            f"\n{file.relative_to(folder).as_posix()} {entry_of(file.read_bytes())['sha256']}".encode()
+        )
     return digest.hexdigest()
 
 

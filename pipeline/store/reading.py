@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
 from pipeline.layout.vocabulary import model_attribute, section_attributes
+from pipeline.store.quick import quick_reading
 from pipeline.store.run import Run
 from pipeline.store.view import committed_view
 
@@ -61,8 +62,9 @@ def cube_of(run: Run, *, chunks: Any = None, check: bool | None = None) -> xr.Da
     """The cube of an opened run, showing what its commits vouch for."""
     import xarray as xr
 
-    view: Any = committed_view(run.info, run.commits, check=check)
-    ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
+    view: Any = committed_view(run.info, run.plan, run.commits, check=check)
+    with quick_reading():
+        ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
     ds = ds[[v.name for v in run.plan.variables]]
     words = {str(name): _texts(ds[name]) for name in ds.coords if ds[name].dtype.kind not in "biuf"}
     ds = ds.assign_coords(words)

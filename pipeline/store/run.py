@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.spec.parsing import Spec, kept_spec
-from pipeline.store.commits import Commit, cube_digest, read_commits
+from pipeline.store.commits import cube_digest, read_commits
+from pipeline.store.files import Files
+from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo, read_run
 from pipeline.store.skeleton import check_skeleton
 
@@ -31,17 +32,17 @@ class Run:
         What ``run.json`` holds.
     spec : Spec
     plan : Plan
-    commits : dict
+    commits : Records
         Valid commit records by task.
     """
 
     info: RunInfo
     spec: Spec
     plan: Plan
-    commits: Mapping[int, Commit]
+    commits: Records
 
     @classmethod
-    def open(cls, source: str | Path | Run) -> Run:
+    def open(cls, source: str | Path | Files | Run) -> Run:
         """Return what stands in a run directory now; an opened run is returned as it is.
 
         Metadata and coordinates are compared with the digests in ``run.json``; no cell is read.
@@ -70,8 +71,13 @@ class Run:
 
     @property
     def directory(self) -> Path:
-        """Where it is."""
+        """Where it is, if that is a folder of this machine."""
         return self.info.directory
+
+    @property
+    def name(self) -> str:
+        """What people call the directory."""
+        return self.info.name
 
     @property
     def model(self) -> Model:

@@ -13,7 +13,7 @@ from pipeline.layout.schema import FORMAT
 from pipeline.spec.parsing import Spec
 from pipeline.spec.recorded import is_whole
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.files import RUN_FILE, is_there, local_path, unreadable, write_atomically
+from pipeline.store.files import RUN_FILE, Files, open_files
 from pipeline.store.provenance import provenance, versions
 from pipeline.store.seal import CHECKSUM, fits, has_seal, seal
 
@@ -24,7 +24,8 @@ class RunInfo:
 
     Attributes
     ----------
-    directory : Path
+    files : Files
+        Of the run directory.
     digest : str
         Of `identity`.
     identity : dict
@@ -42,7 +43,7 @@ class RunInfo:
         Size and sha256 of the files written by the set-up.
     """
 
-    directory: Path
+    files: Files
     digest: str
     identity: dict[str, Any]
     title: str
@@ -52,13 +53,25 @@ class RunInfo:
     provenance: dict[str, str]
     skeleton: dict[str, dict[str, Any]]
 
+    @property
+    def name(self) -> str:
+        """What people call the directory."""
+        return self.files.name
 
-def is_run(directory: Path) -> bool:
+    @property
+    def directory(self) -> Path:
+        """The run directory, where it is a folder of this machine."""
+        if self.files.local is None:
+            raise RefusedError(f"{self.name}: is no folder of this machine, which this needs.")
+        return self.files.local
+
+
+def is_run(files: Files) -> bool:
     """Whether a run has been set up there."""
-    return is_there(directory / RUN_FILE)
+    return files.is_there(RUN_FILE)
 
 
-def read_run(directory: str | Path) -> RunInfo:
+def read_run(place: str | Path | Files) -> RunInfo:
     """Read ``run.json``.
 
     Raises
@@ -68,17 +81,16 @@ def read_run(directory: str | Path) -> RunInfo:
     DamagedError
         If it is not what was written.
     """
-    directory = local_path(directory)
-    path = directory / RUN_FILE
-    if not is_run(directory):
+    files = open_files(place)
+    directory, path = files.name, files.below(RUN_FILE).name
+    if not is_run(files):
         raise RefusedError(f"{directory}: no run directory (it has no {RUN_FILE}).")
-    with unreadable(path):
-        content = path.read_bytes()
+    content = files.read(RUN_FILE)
     try:
         data = json.loads(content)
         _refuse_format(path, data, content)
         whole = fits(content) and data.pop(CHECKSUM) is not None
-        info = RunInfo(directory=directory, **data) if whole else None
+        info = RunInfo(files=files, **data) if whole else None
         whole = (
             info is not None and digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
         )
@@ -89,7 +101,7 @@ def read_run(directory: str | Path) -> RunInfo:
     return info
 
 
-def _refuse_format(path: Path, data: Mapping[str, Any], content: bytes) -> None:
+def _refuse_format(path: str, data: Mapping[str, Any], content: bytes) -> None:
     """Refuse another format, unless the number is what is damaged: the file then contradicts its checksum."""
     found = data["identity"]["format"]
     if isinstance(found, (int, float)) and found != FORMAT and (fits(content) or not has_seal(content)):
@@ -100,7 +112,7 @@ def _refuse_format(path: Path, data: Mapping[str, Any], content: bytes) -> None:
         )
 
 
-def _remedy(directory: Path) -> str:
+def _remedy(directory: str) -> str:
     return (
         f"give the command that made it again (magpend run SPEC --out {directory}): "
         "it is rebuilt, and what is committed stays."
@@ -108,7 +120,7 @@ def _remedy(directory: Path) -> str:
 
 
 def write_run(
-    directory: Path,
+    files: Files,
     spec: Spec,
     identity: Mapping[str, Any],
     spec_text: str,
@@ -127,5 +139,5 @@ def write_run(
     }
     # not sorted: the order of the axes is that of the cube's dims
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
-    write_atomically(directory / RUN_FILE, seal(text))
-    return read_run(directory)
+    files.write(RUN_FILE, seal(text).encode())
+    return read_run(files)

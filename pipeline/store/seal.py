@@ -19,13 +19,13 @@ class SealError(ValueError):
     """A text is not what was sealed; the message says how it can be seen."""
 
 
-def seal(text: str) -> str:
-    """Append the checksum to a text that ends in a JSON object with at least one member."""
+def seal(text: str, before: bytes = b"") -> str:
+    """Append the checksum to a JSON object that is not empty; `before` is what precedes it in its file."""
     body = text.rstrip()
     if not body.endswith("}"):
-        raise ValueError("only a text that ends in a JSON object can be sealed.")
+        raise ValueError("only a JSON object can be sealed.")
     body = body[:-1].rstrip() + _MARK
-    return body + hashlib.sha256(body.encode()).hexdigest() + _END
+    return body + hashlib.sha256(before + body.encode()).hexdigest() + _END
 
 
 def has_seal(content: bytes) -> bool:

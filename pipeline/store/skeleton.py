@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec
 from pipeline.store.arrays import create_array, write_whole
 from pipeline.store.errors import DamagedError
-from pipeline.store.files import CUBE, entry_of, problems_of, refuse_links, sync, write_atomically
+from pipeline.store.files import CUBE, Files, entry_of, problems_of
 from pipeline.store.runfile import RunInfo
 
 GROUP_KEY = "zarr.json"
@@ -91,24 +90,20 @@ def entries_of(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
     return {key: entry_of(content) for key, content in files.items()}
 
 
-def write_skeleton(directory: Path, files: Mapping[str, bytes], keys: Iterable[str]) -> None:
+def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[str]) -> None:
     """Write some of the skeleton's files, each whole or not at all, in the order given."""
-    cube = directory / CUBE
-    cube.mkdir(parents=True, exist_ok=True)
-    written = []
-    for key in keys:
-        path = cube / key
-        path.parent.mkdir(exist_ok=True)
-        write_atomically(path, files[key])
-        written.append(path)
-    sync(written, directory)
+    files.prepare(CUBE)
+    written = [f"{CUBE}/{key}" for key in keys]
+    for key in written:
+        files.write(key, contents[key.removeprefix(f"{CUBE}/")])
+    files.sync(written)
 
 
 def skeleton_problems(info: RunInfo) -> list[str]:
     """A line per file of the set-up that is not what was written."""
-    cube = info.directory / CUBE
-    refuse_links(cube, *(cube / folder for folder in {key.partition("/")[0] for key in info.skeleton}))
-    return problems_of(cube, info.skeleton)
+    folders = {key.partition("/")[0] for key in info.skeleton if "/" in key}
+    info.files.refuse_links(CUBE, *(f"{CUBE}/{folder}" for folder in folders))
+    return problems_of(info.files.below(CUBE), info.skeleton)
 
 
 def check_skeleton(info: RunInfo) -> None:
@@ -123,6 +118,6 @@ def check_skeleton(info: RunInfo) -> None:
     if problems:
         more = f" (and {len(problems) - 3} more)" if len(problems) > 3 else ""
         raise DamagedError(
-            f"{info.directory / CUBE}: {'; '.join(problems[:3])}{more}. These files follow from the "
-            f"specification: rebuild them with: magpend verify --repair {info.directory}"
+            f"{info.files.below(CUBE).name}: {'; '.join(problems[:3])}{more}. These files follow from the "
+            f"specification: rebuild them with: magpend verify --repair {info.name}"
         )

@@ -10,23 +10,25 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import os
-from collections.abc import AsyncGenerator, Iterable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping
 from typing import Any
 
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import LocalStore, WrapperStore
+from zarr.storage import WrapperStore
 
-from pipeline.store.commits import Commit
+from pipeline.layout.plan import Plan
 from pipeline.store.errors import DamagedError
-from pipeline.store.files import CUBE
+from pipeline.store.files import CUBE, Files
+from pipeline.store.keys import Owners
+from pipeline.store.records import Commit
 from pipeline.store.runfile import RunInfo
 
 VERIFY = "MAGPEND_VERIFY"
 """Environment variable; ``0`` reads chunks without comparing them with their records."""
 
-_LARGE = 1_000_000
-"""Chunks of so many bytes are hashed in a thread of their own, so that others are read meanwhile."""
+SMALL = 200_000
+"""Chunks of so many bytes are read by `pipeline.store.quick`; larger ones are hashed in threads."""
 
 
 def checks_chunks() -> bool:
@@ -34,23 +36,54 @@ def checks_chunks() -> bool:
     return os.environ.get(VERIFY, "1").strip().lower() not in ("0", "no", "false", "off")
 
 
+class Shown:
+    """Size and sha256 of what a reader sees, by key: the set-up's files, and what commits vouch for."""
+
+    def __init__(self, info: RunInfo, plan: Plan, commits: Mapping[int, Commit]) -> None:
+        self._skeleton = info.skeleton
+        self._owners = Owners(plan)
+        self._commits = commits
+
+    def arrays(self) -> list[str]:
+        """Names of what lies in the cube."""
+        return sorted({key.partition("/")[0] for key in self._skeleton})
+
+    def entry(self, key: str) -> Mapping[str, Any] | None:
+        """Size and sha256 of a file; None if readers do not see it."""
+        if key in self._skeleton:
+            return self._skeleton[key]
+        task = self._owners.task(key)
+        if task is None or task not in self._commits:
+            return None
+        return self._commits[task].objects.get(key)
+
+
 class CommittedStore(WrapperStore[Store]):
     """A read-only view of the cube in which a chunk without a valid record does not exist.
 
     zarr then reads it as the fill value: pending. A chunk that has a record and is absent or not what was
     written raises `DamagedError`.
+
+    Parameters
+    ----------
+    store
+        Where the cube lies.
+    files
+        Of the run.
+    shown
+        What is seen of it.
+    checks
+        Whether contents are compared with their records.
     """
 
-    def __init__(
-        self, store: Store, entries: Mapping[str, Mapping[str, Any]], name: str, checks: bool = True
-    ) -> None:
+    def __init__(self, store: Store, files: Files, shown: Shown, checks: bool = True) -> None:
         super().__init__(store)
-        self._entries = entries
-        self._name = name
+        self._files = files
+        self._shown = shown
         self._checks = checks
 
     def _with_store(self, store: Store) -> CommittedStore:
-        return type(self)(store, self._entries, self._name, self._checks)
+        return type(self)(store, self._files, self._shown, self._checks)
 
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
@@ -62,7 +95,7 @@ class CommittedStore(WrapperStore[Store]):
         DamagedError
             If what is there is not what was written.
         """
-        entry = self._entries.get(key)
+        entry = self._shown.entry(key)
         if entry is None:
             return None
         whole = await self._store.get(key, prototype)
@@ -74,15 +107,44 @@ class CommittedStore(WrapperStore[Store]):
                 raise self._damaged(key, "is not what was written: its content has changed")
         return whole if byte_range is None else whole[_slice(byte_range, len(whole))]
 
+    def small_chunk(self, key: str) -> bytes | None:
+        """Content of a small chunk in a local folder, compared with its record; None for anything else.
+
+        Raises
+        ------
+        DamagedError
+            If what is there is not what was written.
+        """
+        entry = self._shown.entry(key) if self._checks and self._files.local is not None else None
+        if entry is None or entry["size"] > SMALL:
+            return None
+        try:
+            content = self._files.read(f"{CUBE}/{key}")
+        except FileNotFoundError:
+            raise self._damaged(key, "is missing") from None
+        if len(content) != entry["size"] or hashlib.sha256(content).hexdigest() != entry["sha256"]:
+            raise self._damaged(key, "is not what was written: its content has changed")
+        return content
+
     def _damaged(self, key: str, problem: str) -> DamagedError:
+        name = self._files.name
         return DamagedError(
-            f"{self._name}/{CUBE}/{key}: {problem}. Give the command that made the run again: it computes "
-            f"what is damaged; or look at all of it with: magpend verify {self._name}"
+            f"{name}/{CUBE}/{key}: {problem}. Give the command that made the run again: it computes "
+            f"what is damaged; or look at all of it with: magpend verify {name}"
         )
 
     async def exists(self, key: str) -> bool:
         """As in zarr, without what is not committed."""
-        return key in self._entries
+        return self._shown.entry(key) is not None
+
+    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
+        """As in zarr; of the cube itself, what the set-up has put there."""
+        if prefix.strip("/"):
+            async for name in self._store.list_dir(prefix):
+                yield name
+        else:
+            for name in self._shown.arrays():
+                yield name
 
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
@@ -98,7 +160,7 @@ class CommittedStore(WrapperStore[Store]):
 
 
 async def _sha256(content: Any, size: int) -> str:
-    if size >= _LARGE:
+    if size > SMALL:  # others are read meanwhile
         return await asyncio.to_thread(lambda: hashlib.sha256(content).hexdigest())
     return hashlib.sha256(content).hexdigest()
 
@@ -112,19 +174,17 @@ def _slice(byte_range: ByteRequest, size: int) -> slice:
 
 
 def committed_view(
-    info: RunInfo, commits: Mapping[int, Commit], *, check: bool | None = None
+    info: RunInfo, plan: Plan, commits: Mapping[int, Commit], *, check: bool | None = None
 ) -> CommittedStore:
     """Return the store to read from; it shows the skeleton and what `commits` vouch for.
 
     Parameters
     ----------
-    info, commits
+    info, plan, commits
         The run, and its valid records.
     check
         Whether to compare what is read with its record; by default as the environment says.
     """
-    entries: dict[str, Mapping[str, Any]] = dict(info.skeleton)
-    for commit in commits.values():
-        entries |= commit.objects
-    store = LocalStore(info.directory / CUBE, read_only=True)
-    return CommittedStore(store, entries, str(info.directory), checks_chunks() if check is None else check)
+    store = info.files.below(CUBE).zarr(read_only=True)
+    shown = Shown(info, plan, commits)
+    return CommittedStore(store, info.files, shown, checks_chunks() if check is None else check)

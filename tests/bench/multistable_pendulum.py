@@ -249,9 +249,9 @@ def run_until_certain(starts: np.ndarray, duration: float, threads: int) -> tupl
             states, TORQUE, n_sections=1, section_time=LOOK_TIME, n_keep=1, threads=threads, step_size=step
         )
         attempts += int(found.n_steps.sum() + found.n_rejected.sum())
-        label[rest] = regions.certain(found.final_state)
+        label[rest] = regions.certain(found.final_state[:, 0])
         going = label[rest] == UNDECIDED
-        rest, states, step = rest[going], found.final_state[going], found.step_size[going]
+        rest, states, step = rest[going], found.final_state[going, 0], found.step_size[going, 0]
     return label, attempts
 
 

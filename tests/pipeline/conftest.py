@@ -56,7 +56,8 @@ atol = 1e-6
 n_transient = 4
 n_keep = 3
 [execution]
-trajectories_per_task = 2
+trajectories_per_task = 5
+points_per_task = 4
 """
 
 

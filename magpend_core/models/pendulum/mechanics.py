@@ -66,7 +66,7 @@ def accelerations(
     Raises
     ------
     ValueError
-        If a state is not finite or has the wrong shape, or the frequency is not positive.
+        If a time or a state is not finite or has the wrong shape, or the frequency is not positive.
 
     Notes
     -----

@@ -110,7 +110,7 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
             n_transient=0, n_keep=1, rtol=RTOL, atol=RTOL, system=system,
         )  # fmt: skip
         waits = result.status[:, 0] == Status.NO_RETURN
-        states[far] = np.where(waits[:, None], result.final_state, np.nan)
+        states[far] = np.where(waits[:, None], result.final_state[:, 0], np.nan)
         far = far[waits]
     return states
 

@@ -80,7 +80,7 @@ class Engine:
             self._point_packed[owner][:, None], self._point_frequency[owner][:, None], self._state[rows],
             step_size=self._step[rows], **self._options,
         )  # fmt: skip
-        self._state[rows], self._step[rows] = result.final_state, result.step_size
+        self._state[rows], self._step[rows] = result.final_state[:, 0], result.step_size[:, 0]
         return result.section[:, 0], result.status[:, 0], result.orbit_period[:, 0]
 
     def jump(self, rows: np.ndarray, states: np.ndarray) -> None:

@@ -39,6 +39,7 @@ _HOMES = {
     "pipeline.compute.simulate": ("simulate",),
     "pipeline.runs.run": ("run", "state"),
     "pipeline.runs.verify": ("verify_run",),
+    "pipeline.runs.extend": ("extend",),
     "pipeline.runs.zoom": ("zoom",),
     "pipeline.runs.derive": ("derive", "prune"),
     "pipeline.runs.drawing": ("figure",),

@@ -34,15 +34,13 @@ from pipeline.store.files import (
     FIGURES,
     LOCK,
     RUN_FILE,
+    entry_of,
     is_temporary,
-    is_there,
     local_path,
-    object_entry,
+    open_files,
     problems_of,
-    sync_folder,
-    unreadable,
-    write_atomically,
 )
+from pipeline.store.local import is_there, sync_folder, unreadable, write_atomically
 from pipeline.store.provenance import provenance, versions
 
 T = TypeVar("T")
@@ -293,7 +291,7 @@ class Outcomes:
 
 def write_result(directory: Path, result: Mapping[str, Any], files: Sequence[str]) -> None:
     """Write ``result.json``, which says that everything is there, with the digests of the other files."""
-    entries = {name: object_entry(directory / name) for name in sorted(files)}
+    entries = {name: entry_of((directory / name).read_bytes()) for name in sorted(files)}
     write_atomically(directory / RESULT, canonical({**result, "files": entries}))
 
 
@@ -329,4 +327,4 @@ def is_complete(directory: Path) -> bool:
         result = read_result(directory)
     except DamagedError:
         return False
-    return not problems_of(directory, result.get("files", {}))
+    return not problems_of(open_files(directory), result.get("files", {}))

@@ -29,7 +29,8 @@ from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_
 from pipeline.runs.stopping import stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.problems import SpecError
-from pipeline.store.files import FIGURES, local_path, writer_lock
+from pipeline.store.files import FIGURES, local_path
+from pipeline.store.local import writer_lock
 
 Echo = Callable[[str], None]
 

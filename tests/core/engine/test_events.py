@@ -202,8 +202,9 @@ def test_section__continues_from_its_final_state():
     whole = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], section, n_keep=6, rtol=1e-8)
     first = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], section, n_keep=2, rtol=1e-8)
     second = returns(
-        VAN_DER_POL, [1.0], first.final_state, section, n_keep=4, rtol=1e-8, step_size=first.step_size
-    )
+        VAN_DER_POL, [1.0], first.final_state[:, 0], section, n_keep=4, rtol=1e-8,
+        step_size=first.step_size[:, 0],
+    )  # fmt: skip
     together = np.concatenate([first.section, second.section], axis=2)
     assert together.tobytes() == whole.section.tobytes()
 

@@ -173,7 +173,7 @@ def test_run__status__verify__plot(main, write_spec, walk_text, tmp_path):
     code, out, _ = main("status", directory)
     assert code == 0
     assert "complete" in out
-    assert "24 of 24 cells (100.0 %), 2 of 2 tasks" in out
+    assert "24 of 24 cells (100.0 %), 4 of 4 tasks" in out
     assert re.search(r"bounded +\d+ ", out)
 
     assert main("verify", directory)[0] == 0

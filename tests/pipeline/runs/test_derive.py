@@ -17,8 +17,8 @@ from pipeline.runs import derive as deriving
 from pipeline.runs import versions
 from pipeline.runs.derive import AnalysedRun, derive
 from pipeline.spec.problems import SpecError
-from pipeline.store.commits import withdraw
 from pipeline.store.errors import DamagedError
+from pipeline.store.packing import withdraw
 from pipeline.store.run import Run
 
 QUICK = {"polish": False, "rule_n_anchors": 16}

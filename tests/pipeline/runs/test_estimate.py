@@ -70,7 +70,7 @@ def test_points__pairs_are_neighbours():
 def test_sample__cells_of_the_run(walk_text, sweep_text):
     spec, plan = read(walk_text)
     inputs = _sample(spec, plan, np.random.default_rng(0), 32, pairs=False)
-    assert inputs.initial_states.shape == (2, 4)  # what a task has
+    assert inputs.initial_states.shape == (5, 4)  # what a task has
     assert set(inputs.frequency_hz.ravel()) <= set(spec.axes["frequency_hz"].array())
     spec, plan = read(sweep_text)
     inputs = _sample(spec, plan, np.random.default_rng(0), 32, pairs=True)

@@ -34,7 +34,7 @@ n_keep = 4
 """
 EIGHT = "[execution]\ntrajectories_per_task = 8"
 MANY_SWEEP = f'kind = "sweep"\n{MANY}\n{EIGHT}'
-MANY_WALK = f'kind = "continuation"\n{MANY}\n[continuation]\ndirection = "both"\n{EIGHT}'
+MANY_WALK = f'kind = "continuation"\n{MANY}\n[continuation]\ndirection = "both"\n{EIGHT}\npoints_per_task = 1'
 
 
 def silent(line):

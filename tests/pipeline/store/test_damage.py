@@ -21,9 +21,11 @@ from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
 from pipeline.runs.zoom import read_source
-from pipeline.store.commits import marker_path, read_commits, sweep
+from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import DamagedError, IncompleteError, RefusedError, UnreadableError
 from pipeline.store.files import local_path
+from pipeline.store.local import LocalFiles
+from pipeline.store.records import Records
 from pipeline.store.run import Run
 from pipeline.store.seal import seal, unseal
 from pipeline.store.setup import check, create, establish
@@ -108,13 +110,13 @@ def test_run__unreadable_record_removes_nothing(write_spec, sweep_text, tmp_path
 
 
 def test_sweep__says_what_it_removes(whole):
-    marker_path(whole.info.directory, 1).write_text("{")
+    (whole.info.directory / marker_key(1)).write_text("{")
     said = []
     commits = read_commits(whole.info, whole.plan, said.append)
     assert said == ["commits/000001.json: torn or damaged; it does not count"]
-    n = sweep(whole.info, commits, said.append)
+    n = sweep(whole.info, whole.plan, commits, said.append)
     assert f"removed {n} files that no commit record vouches for: cube.zarr/" in said[1]
-    assert sweep(whole.info, commits, said.append) == 0
+    assert sweep(whole.info, whole.plan, commits, said.append) == 0
     assert len(said) == 2
 
 
@@ -171,7 +173,7 @@ def test_run__links_are_not_followed(whole, tmp_path, name):
             use()
     if name != "cube.zarr/section":
         with pytest.raises(RefusedError, match="is a link"):
-            sweep(whole.info, {})
+            sweep(whole.info, whole.plan, Records(whole.info.files, whole.info.digest, {}))
     assert everything(target) == before
 
 
@@ -184,7 +186,7 @@ def test_sweep__removes_a_link_and_not_what_it_leads_to(whole, tmp_path):
     (cube / "status/c.link").symlink_to(file)
     (cube / "status/folder").symlink_to(folder)
     assert verify_run(whole.info.directory).leftovers == ["status/c.link", "status/folder"]
-    assert sweep(whole.info, read_commits(whole.info, whole.plan)) == 2
+    assert sweep(whole.info, whole.plan, read_commits(whole.info, whole.plan)) == 2
     assert (folder / "kept").read_text() == file.read_text() == "x"
 
 
@@ -339,28 +341,26 @@ def test_skeleton_files__same_bytes_again(made):
 
 
 def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
-    from pipeline.store import skeleton
-
     n_files = len(made.info.skeleton)
     for n in (0, 1, n_files // 2, n_files - 1):
         directory, calls = tmp_path / f"again{n}", []
-        original = skeleton.write_atomically
+        original = LocalFiles.write
 
-        def crash(path, content, calls=calls, n=n, original=original):
+        def crash(self, key, content, calls=calls, n=n, original=original):
             if len(calls) == n:
                 raise KeyboardInterrupt
-            calls.append(path)
-            original(path, content)
+            calls.append(key)
+            original(self, key, content)
 
         with monkeypatch.context() as patch:
-            patch.setattr(skeleton, "write_atomically", crash)
+            patch.setattr(LocalFiles, "write", crash)
             with pytest.raises(KeyboardInterrupt):
                 create(directory, made.spec, made.plan, made.identity, "text")
         (directory / "cube.zarr/.zarr.json.abc.tmp").write_text("{")  # what a power cut leaves
         (directory / ".run.json.abc.tmp").write_text("{")
         assert check(directory, made.identity) is None
         info = establish(directory, made.spec, made.plan, made.identity, "text", silent)
-        sweep(info, {})
+        sweep(info, made.plan, Records(info.files, info.digest, {}))
         assert verify_run(directory).sound
         assert not list(directory.rglob("*.tmp"))
 
@@ -394,7 +394,7 @@ def test_run__a_record_that_vanished(write_spec, sweep_text, tmp_path, monkeypat
 
     def losing(job, indices, **options):
         yield from original(job, indices, **options)
-        marker_path(tmp_path / "run", 2).unlink()
+        (tmp_path / "run" / marker_key(2)).unlink()
 
     with monkeypatch.context() as patch:
         patch.setattr(execute, "run_tasks", losing)

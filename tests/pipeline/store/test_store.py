@@ -15,10 +15,11 @@ from pipeline import open_run
 from pipeline.layout.schema import base_variables
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store import commits as store_commits
-from pipeline.store import files, runfile
-from pipeline.store.commits import marker_path, read_commits, sweep, write_task
+from pipeline.store import local
+from pipeline.store.commits import marker_key, read_commits, sweep, write_task
 from pipeline.store.errors import DamagedError, LockedError, RefusedError
-from pipeline.store.files import writer_lock
+from pipeline.store.local import LocalFiles, writer_lock
+from pipeline.store.records import Records
 from pipeline.store.run import Run
 from pipeline.store.runfile import read_run
 from pipeline.store.setup import check, create
@@ -32,6 +33,11 @@ def read_all(directory):
     """Every variable as `open_run` shows it."""
     ds = open_run(directory)
     return {v.name: ds[v.name].values for v in VARIABLES}
+
+
+def none_of(info):
+    """No record at all."""
+    return Records(info.files, info.digest, {})
 
 
 def assert_pending(directory, plan, index):
@@ -69,7 +75,7 @@ def test_write_task__reads_back(made):
 
 def test_write_task__fill_values_leave_files(made):
     made.commit(0)
-    marker = json.loads(marker_path(made.info.directory, 0).read_text())
+    marker = json.loads((made.info.directory / marker_key(0)).read_text())
     assert sorted({key.split("/")[0] for key in marker["objects"]}) == sorted(v.name for v in VARIABLES)
     for key in marker["objects"]:
         assert (made.info.directory / "cube.zarr" / key).is_file()
@@ -108,12 +114,12 @@ def crash_at(monkeypatch, module, name, n):
 
 STEPS = [
     *((store_commits, "write_block", n) for n in range(1, CUBE_WRITES + 1)),
-    (store_commits, "sync", 1),
-    *((files, "sync_file", n) for n in (1, CUBE_WRITES)),
-    (files, "sync_folder", 1),
-    (store_commits, "object_entry", 1),
-    (store_commits, "object_entry", CUBE_WRITES),
-    (store_commits, "write_atomically", 1),
+    (LocalFiles, "sync", 1),
+    *((local, "sync_file", n) for n in (1, CUBE_WRITES)),
+    (local, "sync_folder", 1),
+    (LocalFiles, "read", 1),
+    (LocalFiles, "read", CUBE_WRITES),
+    (LocalFiles, "write_once", 1),
 ]
 
 
@@ -127,7 +133,7 @@ def test_write_task__crash_between_steps_leaves_pending(made, monkeypatch, modul
     assert_pending(made.info.directory, made.plan, 0)
     commits = read_commits(made.info, made.plan)
     assert set(commits) == {1}
-    sweep(made.info, commits)
+    sweep(made.info, made.plan, commits)
     assert_data(made.info.directory, made, 1)
     made.commit(0)
     assert_data(made.info.directory, made, 0)
@@ -149,7 +155,7 @@ def test_write_task__crash_before_the_marker_is_renamed(made, monkeypatch):
     leftovers = list((made.info.directory / "commits").iterdir())
     assert len(leftovers) == 1
     assert_pending(made.info.directory, made.plan, 0)
-    assert sweep(made.info, {}) == 1 + CUBE_WRITES
+    assert sweep(made.info, made.plan, none_of(made.info)) == 1 + CUBE_WRITES
     assert list((made.info.directory / "commits").iterdir()) == []
 
 
@@ -183,7 +189,7 @@ def test_write_task__order_of_syncs(made, monkeypatch):
 
 def test_read__leftover_chunk_is_not_data(made):
     made.commit(0)
-    marker_path(made.info.directory, 0).unlink()
+    (made.info.directory / marker_key(0)).unlink()
     assert_pending(made.info.directory, made.plan, 0)
     ds = open_run(made.info.directory, chunks={})
     assert (ds.status.compute() == 0).all()
@@ -204,7 +210,7 @@ def test_read__leftover_chunk_is_not_data(made):
 )
 def test_read_commits__invalid_markers_do_not_count(made, change):
     made.commit(0)
-    path = marker_path(made.info.directory, 0)
+    path = made.info.directory / marker_key(0)
     changed = change(path.read_text())
     assert changed != path.read_text()
     path.write_text(changed)
@@ -280,7 +286,7 @@ def test_sweep__touches_nothing_else(made):
         (directory / name / "kept.txt").write_text("x")
     (directory / "cube.zarr/section/c.0.0.abc.partial").write_bytes(b"x")
     before = sorted(p for p in directory.rglob("*") if p.is_file() and not p.name.endswith("partial"))
-    assert sweep(made.info, read_commits(made.info, made.plan)) == 1
+    assert sweep(made.info, made.plan, read_commits(made.info, made.plan)) == 1
     assert sorted(p for p in directory.rglob("*") if p.is_file()) == before
 
 
@@ -305,7 +311,7 @@ def test_check__directories_that_are_not_empty_are_refused(made, tmp_path):
 def test_create__crash_during_set_up_starts_again(made, monkeypatch, tmp_path):
     directory = tmp_path / "again"
     with monkeypatch.context() as patch:
-        crash_at(patch, runfile, "write_atomically", 1)
+        crash_at(patch, LocalFiles, "write", 1 + len(made.info.skeleton))
         with pytest.raises(CrashError):
             create(directory, made.spec, made.plan, made.identity, "text")
     with pytest.raises(RefusedError, match="no run directory"):

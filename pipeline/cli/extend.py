@@ -1,0 +1,117 @@
+"""``magpend extend``: a run grows, with every cell that is computed already."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipeline.cli.common import Directory
+from pipeline.cli.options import completing
+from pipeline.cli.running import ClusterFile, Dashboard, DryRun, Scheduler, Workers, workflow_names
+
+
+def extend(
+    directory: Directory,
+    spec: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[SPEC]",
+            help="The wider specification; without it that of DIR, with the options' changes.",
+            autocompletion=completing(workflow_names),
+        ),
+    ] = None,
+    axis: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=LOW:HIGH:NUM", help="New range of the frequency, a parameter or a state."),
+    ] = None,
+    starts: Annotated[int | None, typer.Option(min=1, help="Number of random initial states.")] = None,
+    keep: Annotated[int | None, typer.Option(min=1, help="Number of kept sections.")] = None,
+    product: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME[={...}]",
+            help="Compute this besides, with options as in a specification's [products].",
+        ),
+    ] = None,
+    also: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="DIR", help="A further run that holds cells, such as another half."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Directory of the wider run. Default: it takes the place of DIR when it is complete."
+        ),
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    cluster: ClusterFile = None,
+    dashboard: Dashboard = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Widen a run; every cell that is computed already is taken over, not integrated again.
+
+    The files are the same as those of a fresh run of the wider specification. Stop it whenever you like:
+    the same command goes on where it was. Without --out the run as it was stays beside, as DIR.before.
+    """
+    from pipeline.cli import console
+    from pipeline.runs import extend as extending
+    from pipeline.runs.widen import Widening
+
+    changes: dict[str, Any] = {
+        "axes": _axes(axis or []), "starts": starts, "keep": keep, "products": _products(product or []),
+    }  # fmt: skip
+    if dry_run:
+        found = extending.plan_extension((directory, *(also or ())), spec, Widening(**changes))
+        for line in extending.describe_extension(found, workers=workers):
+            console.result(line)
+        return
+    state = extending.extend(
+        directory, spec, out, also=also or (), **changes, workers=workers, scheduler=scheduler,
+        cluster=cluster, dashboard=dashboard, echo=console.note,
+    )  # fmt: skip
+    console.result(f"cube: {state.directory / 'cube.zarr'}")
+
+
+def _axes(texts: list[str]) -> dict[str, dict[str, Any]]:
+    """Read ``NAME=LOW:HIGH:NUM``."""
+    from pipeline.layout.vocabulary import parameter_name
+    from pipeline.spec.problems import SpecError
+
+    found, problems = {}, []
+    for text in texts:
+        name, _, values = text.partition("=")
+        try:
+            low, high, num = values.split(":")
+            found[parameter_name(name.strip())] = {"start": float(low), "stop": float(high), "num": int(num)}
+        except ValueError:
+            problems.append(f"--axis {text}: must be NAME=LOW:HIGH:NUM, as in frequency_hz=2:3:201.")
+    if problems:
+        raise SpecError(problems)
+    return found
+
+
+def _products(texts: list[str]) -> dict[str, dict[str, Any]]:
+    """Read ``NAME`` and ``NAME={key = value, ...}``."""
+    import tomllib
+
+    from pipeline.spec.problems import SpecError
+
+    found, problems = {}, []
+    for text in texts:
+        name, _, options = text.partition("=")
+        try:
+            value = tomllib.loads(f"options = {options or '{}'}")["options"]
+        except tomllib.TOMLDecodeError:
+            value = None
+        if isinstance(value, dict):
+            found[name.strip()] = value
+        else:
+            problems.append(
+                f"--product {text}: must be NAME or NAME={{...}}, as in 'lyapunov={{n_periods = 800}}'."
+            )
+    if problems:
+        raise SpecError(problems)
+    return found

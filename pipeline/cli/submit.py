@@ -1,0 +1,38 @@
+"""``magpend submit``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.running import ClusterFile, Spec
+
+
+def submit(
+    spec: Spec,
+    out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
+    cluster: ClusterFile = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the batch script; create and send nothing.")
+    ] = False,
+    smoke: Annotated[
+        bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")
+    ] = False,
+) -> None:
+    """Run a specification as a job of SLURM, PBS, Grid Engine or LSF, and say how to follow it.
+
+    The job goes on where an earlier one was stopped.
+    """
+    from pipeline.cli import console
+    from pipeline.runs.submit import prepare, send
+
+    prepared = prepare(spec, out, cluster, smoke=smoke)
+    if dry_run:
+        console.result(prepared.script.rstrip("\n"))
+    elif prepared.complete:
+        console.result(f"{prepared.directory} is complete; nothing to send.")
+    else:
+        for line in send(prepared).lines():
+            console.result(line)

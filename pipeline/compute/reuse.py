@@ -1,0 +1,272 @@
+"""Cells taken from other runs instead of integrated: what went in is the same, so what comes out is.
+
+A worker opens the runs that cells are taken from once. For each task it looks up which of its cells they
+hold, reads these from their committed chunks, compared with the records, and integrates the rest. What a run
+holds but for a product is taken, and the product computed from its sections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+
+from magpend_core import Sections, Status
+from pipeline.compute.task import Integrate, Job, integrate
+from pipeline.compute.walking import WALKED, going_on
+from pipeline.layout.cells import CellMap, Inputs
+from pipeline.layout.identity import code_version
+from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
+from pipeline.layout.schema import base_variables
+from pipeline.products.product import function_of
+from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.spec.parsing import Spec, kept_spec
+from pipeline.store.cells import read_block
+from pipeline.store.errors import DamagedError, RefusedError
+from pipeline.store.run import Run
+from pipeline.store.runfile import read_run
+
+Origin = tuple[str, str]
+"""Directory and digest of a run that cells are taken from."""
+
+Values = dict[str, np.ndarray]
+
+ABSENT = (Status.PENDING, Status.INFERRED)
+"""What a committed cell can be without having been integrated."""
+
+
+@dataclass
+class Source:
+    """A run that holds cells of another.
+
+    Attributes
+    ----------
+    run : Run
+        It, with what was committed when it was opened.
+    wanted : Spec
+        Of the run that takes its cells.
+    """
+
+    run: Run
+    wanted: Spec
+    finder: Finder = field(init=False)
+    names: list[str] = field(init=False)
+    missing: list[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.finder = Finder(self.run.spec)
+        same = same_products(self.run, self.wanted)
+        self.missing = [name for name in self.wanted.products if name not in same]
+        model = self.wanted.model
+        products = [CELL_PRODUCTS[n].variables(self.wanted.products[n], model) for n in same]
+        own = [*base_variables(model), *(v for variables in products for v in variables)]
+        self.names = [variable.name for variable in own]
+        self._read = lru_cache(maxsize=2)(partial(read_block, self.run, names=tuple(self.names)))
+
+    def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
+        """Return the flat index of each cell that is committed, `NOWHERE` for the others.
+
+        In a refined grid some of these were inferred, which `take` leaves out.
+        """
+        place = self.finder.find(inputs, way)
+        is_committed = np.zeros(self.run.plan.n_tasks + 1, bool)
+        is_committed[list(self.run.commits)] = True
+        return np.where(is_committed[self._task(place)], place, NOWHERE)
+
+    def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
+        """Return which of some cells were integrated and are whole, and these cells' variables."""
+        taken = np.zeros(len(place), bool)
+        values: Values = {}
+        tasks = self._task(place)
+        for task in np.unique(tasks[place != NOWHERE]):
+            rows = np.flatnonzero(tasks == task)
+            try:
+                block = self._read(int(task))
+            except DamagedError:
+                continue
+            inside = self._inside(int(task), place[rows])
+            is_whole = ~np.isin(block["status"][inside], ABSENT)
+            rows, inside = rows[is_whole], tuple(i[is_whole] for i in inside)
+            taken[rows] = True
+            for name, array in block.items():
+                if name not in values:
+                    values[name] = np.zeros((len(place), *array.shape[len(inside) :]), array.dtype)
+                values[name][rows] = array[inside]
+        return taken, {name: array[taken] for name, array in values.items()}
+
+    def _task(self, place: np.ndarray) -> np.ndarray:
+        """Task that each cell belongs to; the number of tasks for `NOWHERE`."""
+        plan = self.run.plan
+        steps = np.unravel_index(np.maximum(place, 0), plan.shape)
+        places = tuple(step // b for step, b in zip(steps, plan.block, strict=True))
+        tasks = np.ravel_multi_index(places, plan.task_grid) if places else np.zeros(place.shape, np.int64)
+        return np.where(place == NOWHERE, plan.n_tasks, tasks)
+
+    def _inside(self, task: int, place: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Indices of cells within their task's block."""
+        steps = np.unravel_index(place, self.run.plan.shape)
+        return tuple(step - s.start for step, s in zip(steps, self.run.plan.task(task), strict=True))
+
+
+def same_products(run: Run, wanted: Spec) -> list[str]:
+    """Products that a run has computed as another one wants them: same options, same code."""
+    code = run.info.identity["code"]
+    return [
+        name
+        for name, options in wanted.products.items()
+        if run.spec.products.get(name) == options and code.get(_module(name)) == code_version(_module(name))
+    ]
+
+
+def _module(product: str) -> str:
+    """Module that computes a product, as `layout.identity` names it."""
+    return CELL_PRODUCTS[product].compute.partition(":")[0].removeprefix("pipeline.")
+
+
+def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
+    """Say what keeps the cells of a run from being those of another; nothing if they can be.
+
+    Parameters
+    ----------
+    run
+        That has cells.
+    wanted, identity
+        Specification and identity of the run that would take them.
+    """
+    lines = unlike(run.info.identity, identity)
+    old, new = run.spec.integration.n_keep, wanted.integration.n_keep
+    if old != new:
+        lines.append(f"integration.n_keep: {old} in the directory, {new} now")
+    same = same_products(run, wanted)
+    return lines + [
+        f"products.{name}: is watched while cells are integrated, and not as asked for in the directory"
+        for name, options in wanted.products.items()
+        if name not in same and CELL_PRODUCTS[name].integrate(options)
+    ]
+
+
+class Pool:
+    """The cells that some runs hold of one.
+
+    Parameters
+    ----------
+    spec
+        Of the run that takes them.
+    runs
+        Those that hold them; of a cell that several hold the first one's is taken.
+    """
+
+    def __init__(self, spec: Spec, runs: Sequence[Run]) -> None:
+        self.spec = spec
+        self.sources = [Source(run, spec) for run in runs]
+
+    def count(self, inputs: Inputs, way: Way | None) -> list[int]:
+        """Return how many of some cells are taken from each source, as they begin and what they walk."""
+        counts, rest = [], np.arange(len(inputs.initial_states))
+        for source in self.sources:
+            place = source.find(inputs.take(rest), way)
+            found = place != NOWHERE
+            if source.run.spec.refine is not None:  # what was inferred is not taken
+                found[found] = source.take(place[found])[0]
+            n_taken = _leading(found)
+            counts.append(int(n_taken.sum()))
+            rest = rest[n_taken == 0]
+        return counts
+
+    def integrator(self, cells: CellMap, block: tuple[slice, ...], tally: list[int]) -> Integrate:
+        """Return what gives the cells of a block as `task.integrate` does, bit for bit, with less work.
+
+        The numbers of cells that were taken are appended to `tally`.
+        """
+        way = way_of(self.spec, block)
+        if way is None:
+            return lambda spec, inputs: self._give(spec, inputs, inputs, None, tally)
+        return lambda spec, inputs: self._give(spec, inputs, cells.inputs(block), way, tally)
+
+    def _give(self, spec: Spec, inputs: Inputs, begin: Inputs, way: Way | None, tally: list[int]) -> Values:
+        """Take cells, go on from those where a walk goes on, and integrate the rest."""
+        values: Values = {}
+        n_branches, n_points = inputs.frequency_hz.shape
+        rest = np.arange(n_branches)
+        for source in self.sources:
+            place = source.find(begin.take(rest), way)
+            taken, stored = source.take(place.ravel())
+            n_taken = _leading(taken.reshape(place.shape))
+            order = np.cumsum(taken).reshape(place.shape) - 1
+            for n in np.unique(n_taken[n_taken > 0]):
+                own = np.flatnonzero(n_taken == n)
+                part = {name: array[order[own, :n]] for name, array in stored.items()}
+                rows = rest[own]
+                part |= _products(spec, _points(inputs.take(rows), slice(0, n)), part, source.missing)
+                if n < n_points:
+                    tail = _points(inputs.take(rows), slice(n, n_points))
+                    more = integrate(spec, going_on(tail, {k: part[k][:, -1] for k in WALKED if k in part}))
+                    part = {name: np.concatenate([part[name], more[name]], axis=1) for name in more}
+                _put(values, rows, part, n_branches)
+                tally.append(int(n) * len(rows))
+            rest = rest[n_taken == 0]
+        if len(rest):
+            _put(values, rest, integrate(spec, inputs.take(rest)), n_branches)
+        return values
+
+
+def _leading(taken: np.ndarray) -> np.ndarray:
+    """Points at the begin of each branch that are taken: a walk needs all before a point."""
+    return np.asarray(np.cumprod(taken, axis=1).sum(axis=1))
+
+
+def _points(inputs: Inputs, part: slice) -> Inputs:
+    """Some of the points of branches."""
+    return replace(inputs, parameters=inputs.parameters[:, part], frequency_hz=inputs.frequency_hz[:, part])
+
+
+def _put(values: Values, rows: np.ndarray, part: Mapping[str, np.ndarray], n: int) -> None:
+    for name, array in part.items():
+        if name not in values:
+            values[name] = np.zeros((n, *array.shape[1:]), array.dtype)
+        values[name][rows] = array
+
+
+def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], names: Sequence[str]) -> Values:
+    """Compute products of cells that are known but for these."""
+    if not names:
+        return {}
+    no_turns = np.zeros((*inputs.frequency_hz.shape, 0), np.int32)
+    cells = Sections(
+        section=values["section"], turns=values.get("turns", no_turns), status=values["status"],
+        orbit_period=values["orbit_period"], n_periods=values["n_periods"], n_steps=values["n_steps"],
+        n_rejected=values["n_rejected"], final_state=values["section"][:, :, -1],
+        step_size=values["step_size"], return_time=values.get("return_time"),
+    )  # fmt: skip
+    found: Values = {}
+    for name in names:
+        found |= function_of(CELL_PRODUCTS[name].compute)(Job(spec, inputs, cells), spec.products[name])
+    return found
+
+
+@lru_cache(maxsize=2)
+def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
+    """Open the runs that a run takes cells from, once per worker.
+
+    Parameters
+    ----------
+    directory, digest
+        The run that takes them.
+    sources
+        The others.
+
+    Raises
+    ------
+    RefusedError
+        If a directory holds another run now.
+    """
+    runs = []
+    for place, expected in sources:
+        run = Run.open(place)
+        if run.info.digest != expected:
+            raise RefusedError(f"{place}: another run stands there than when its cells were looked up.")
+        runs.append(run)
+    return Pool(kept_spec(read_run(directory).spec), runs)

@@ -1,0 +1,66 @@
+"""Branches that go on where another task has left them, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from magpend_core import Sections, Status, run_branches
+from pipeline.layout.cells import Inputs
+
+WALKED = ("section", "rest_state", "status", "step_size")
+"""Variables that say where a branch was left; the last kept section is the state at the cell's end."""
+
+
+def going_on(inputs: Inputs, before: Mapping[str, np.ndarray]) -> Inputs:
+    """Let branches start where they were left.
+
+    Parameters
+    ----------
+    inputs
+        Branches as if they began here.
+    before
+        Variables `WALKED` of the cell before each branch's first one, in the order of the branches: any
+        leading dims, a point of the path among them, then the variable's own.
+    """
+    n_branches, n_states = inputs.initial_states.shape
+    section = before["section"]
+    states = section.reshape(n_branches, -1, n_states)[:, -1]
+    if "rest_state" in before:  # a branch goes on from where it did not come back to the section
+        is_left = before["status"].reshape(n_branches, 1) == Status.NO_RETURN
+        states = np.where(is_left, before["rest_state"].reshape(n_branches, n_states), states)
+    return replace(inputs, initial_states=states, step_size=before["step_size"].reshape(n_branches))
+
+
+def walk(inputs: Inputs, **keywords: Any) -> Sections:
+    """Return what `magpend_core.run_branches` says of branches, those that have ended before among them.
+
+    Parameters
+    ----------
+    inputs
+        The branches.
+    keywords
+        As for `magpend_core.run_branches`.
+    """
+    if inputs.step_size is None:
+        return run_branches(inputs.parameters, inputs.frequency_hz, inputs.initial_states, **keywords)
+    alive = np.isfinite(inputs.step_size)
+    some = inputs.take(alive)
+    cells = run_branches(
+        some.parameters, some.frequency_hz, some.initial_states, step_size=some.step_size, **keywords
+    )
+    found: dict[str, Any] = {f.name: getattr(cells, f.name) for f in fields(cells)}
+    return Sections(**{name: _spread(name, array, alive) for name, array in found.items()})
+
+
+def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
+    """Put what was found of some branches among those that are not reached."""
+    if found is None:
+        return None
+    fill = int(Status.UNREACHED) if name == "status" else np.nan if found.dtype.kind == "f" else 0
+    whole = np.full((len(alive), *found.shape[1:]), fill, found.dtype)
+    whole[alive] = found
+    return whole

@@ -1,0 +1,163 @@
+"""Batch scripts as text, and the words of each batch system: to send, ask after and cancel a job."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipeline.spec.clusters import Cluster, bytes_of, clock, hours_and_minutes, seconds_of
+
+
+@dataclass(frozen=True)
+class Words:
+    """Commands of a batch system.
+
+    Attributes
+    ----------
+    send : tuple of str
+        Reads a script, by its name or from its standard input, and prints the job's number.
+    ask : tuple of str
+        With a job's number behind it, prints the job's state while there is one.
+    follow, cancel : str
+        For people, with the job's number behind it.
+    over : str
+        Regular expression of states that a job does not leave.
+    number : str
+        Regular expression of the job's number in what `send` prints.
+    """
+
+    send: tuple[str, ...]
+    ask: tuple[str, ...]
+    follow: str
+    cancel: str
+    over: str = r"(?!)"
+    number: str = r"(?P<job>\d+)"
+
+    def job(self, output: str) -> str | None:
+        """A job's number in what `send` printed."""
+        match = re.search(self.number, output)
+        return match["job"] if match else None
+
+
+WORDS = {
+    "slurm": Words(("sbatch", "--parsable"), ("squeue", "-h", "-o", "%T", "-j"), "squeue -j", "scancel"),
+    "pbs": Words(("qsub",), ("qstat",), "qstat", "qdel", number=r"(?P<job>\d+[\w.\[\]-]*)"),
+    "sge": Words(("qsub", "-terse"), ("qstat", "-j"), "qstat -j", "qdel"),
+    "lsf": Words(
+        ("bsub",), ("bjobs", "-noheader", "-o", "stat"), "bjobs", "bkill", r"DONE|EXIT", r"<(?P<job>\d+)>"
+    ),
+}
+
+
+def is_whole(cluster: Cluster) -> bool:
+    """Whether one job holds all: the coordinator and its workers."""
+    return cluster.max_jobs == 1
+
+
+def coordinator_script(cluster: Cluster, name: str, log: str, folder: str, command: Sequence[str]) -> str:
+    """Batch script of the job in which the coordinator lives.
+
+    Parameters
+    ----------
+    cluster
+        What a job is.
+    name
+        Of the job.
+    log
+        Path of what the job says, without what the batch system adds to it.
+    folder
+        Where the command is given.
+    command
+        Its words.
+    """
+    whole = is_whole(cluster)
+    cores = cluster.cores if whole else 1
+    memory = cluster.memory_bytes if whole else bytes_of(cluster.coordinator_memory)
+    time_s = cluster.walltime_s
+    if not whole and cluster.coordinator_walltime is not None:
+        time_s = seconds_of(cluster.coordinator_walltime)
+    lines = [
+        "#!/usr/bin/env bash",
+        *_HEADS[cluster.kind](cluster, name, log, cores, memory, time_s),
+        *(f"{_MARKS[cluster.kind]} {line}" for line in _directives(cluster)),
+        "",
+        "set -eo pipefail",
+        f"cd {shlex.quote(folder)}",
+        *cluster.prologue,
+        # in the shell's place: the batch system's signals reach it, and its exit code is the job's
+        f"exec {shlex.join(command)}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _slurm(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s: int) -> list[str]:
+    return [
+        f"#SBATCH --job-name={name}",
+        f"#SBATCH --output={log}-%j.out",
+        *_given("#SBATCH --partition={}", cluster.queue),
+        *_given("#SBATCH --account={}", cluster.account),
+        "#SBATCH --nodes=1",
+        "#SBATCH --ntasks=1",
+        f"#SBATCH --cpus-per-task={cores}",
+        f"#SBATCH --mem={_upwards(memory, 2**20)}M",
+        f"#SBATCH --time={clock(time_s)}",
+    ]
+
+
+def _pbs(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s: int) -> list[str]:
+    return [
+        f"#PBS -N {name[:15]}",
+        f"#PBS -o {log}.out",
+        "#PBS -j oe",
+        "#PBS -V",
+        *_given("#PBS -q {}", cluster.queue),
+        *_given("#PBS -A {}", cluster.account),
+        f"#PBS -l select=1:ncpus={cores}:mem={_upwards(memory, 2**20)}mb",
+        f"#PBS -l walltime={clock(time_s)}",
+    ]
+
+
+def _sge(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s: int) -> list[str]:
+    # cores come with the parallel environment among the directives; memory has a name of each site's own
+    return [
+        f"#$ -N {name}",
+        f"#$ -o {log}.out",
+        "#$ -j y",
+        "#$ -V",
+        "#$ -S /bin/bash",
+        *_given("#$ -q {}", cluster.queue),
+        *_given("#$ -P {}", cluster.account),
+        f"#$ -l h_rt={clock(time_s)}",
+    ]
+
+
+def _lsf(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s: int) -> list[str]:
+    return [
+        f"#BSUB -J {name}",
+        f"#BSUB -o {log}-%J.out",
+        *_given("#BSUB -q {}", cluster.queue),
+        *_given('#BSUB -P "{}"', cluster.account),
+        f"#BSUB -n {cores}",
+        *(['#BSUB -R "span[hosts=1]"'] if cores > 1 else []),
+        f"#BSUB -M {_upwards(memory, 10**6)}",
+        f"#BSUB -W {hours_and_minutes(time_s)}",
+    ]
+
+
+_HEADS = {"slurm": _slurm, "pbs": _pbs, "sge": _sge, "lsf": _lsf}
+_MARKS = {"slurm": "#SBATCH", "pbs": "#PBS", "sge": "#$", "lsf": "#BSUB"}
+
+
+def _directives(cluster: Cluster) -> list[str]:
+    """Lines of one's own; a job of one core needs no parallel environment."""
+    return [line for line in cluster.directives if is_whole(cluster) or not line.strip().startswith("-pe")]
+
+
+def _given(line: str, value: str | None) -> list[str]:
+    return [] if value is None else [line.format(value)]
+
+
+def _upwards(number: int, unit: int) -> int:
+    return -(-number // unit)

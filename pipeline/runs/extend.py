@@ -1,0 +1,371 @@
+"""A run grows: a wider one takes every cell that is computed already, and integrates the rest.
+
+A cell's numbers depend on what it is integrated from alone, bit for bit. So the run of a wider specification
+has the same bytes whether it begins from nothing, or takes the cells that other runs hold; only the latter
+is quicker. It is a run like any other, with a digest of its own, written by the same protocol.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.layout.cells import CellMap
+from pipeline.layout.domains import check_starts
+from pipeline.layout.identity import canonical, digest_of
+from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
+from pipeline.layout.plan import Plan, make_plan
+from pipeline.runs.preview import time_line
+from pipeline.runs.progress import size
+from pipeline.runs.run import Echo, carry_out, identity_here
+from pipeline.runs.status import State, state
+from pipeline.runs.widen import Widening, widened
+from pipeline.runs.workflows import find_spec
+from pipeline.runs.zoom import to_toml
+from pipeline.spec.parsing import Spec, load_spec
+from pipeline.spec.problems import SpecError
+from pipeline.store.errors import RefusedError
+from pipeline.store.files import EXTENDED, TIMINGS, Files, open_files
+from pipeline.store.local import sync_folder
+from pipeline.store.run import Run
+from pipeline.store.runfile import is_run
+
+
+@dataclass(frozen=True)
+class Extension:
+    """What an extension takes, and what is left to integrate.
+
+    Attributes
+    ----------
+    spec, text, plan, identity
+        The wider run.
+    runs : tuple of Run
+        Those that it takes cells from.
+    counts : tuple of int
+        Cells that it takes from each.
+    notes : tuple of str
+        What is worth knowing of them: runs that are not complete, or that have nothing to give.
+    """
+
+    spec: Spec
+    text: str
+    plan: Plan
+    identity: Mapping[str, Any]
+    runs: tuple[Run, ...]
+    counts: tuple[int, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def reused(self) -> int:
+        """Cells that are taken."""
+        return sum(self.counts)
+
+    @property
+    def digest(self) -> str:
+        """Digest of the wider run."""
+        return digest_of(self.identity)
+
+    def lines(self) -> Iterator[str]:
+        """Say what is taken from where."""
+        yield from self.notes
+        n = self.plan.n_cells
+        for run, count in zip(self.runs, self.counts, strict=True):
+            yield f"{count} of {n} cells are taken from {run.name}"
+        bound = "at most " if self.spec.refine is not None else ""
+        yield f"{bound}{n - self.reused} cells are left to integrate"
+
+
+def plan_extension(
+    sources: Sequence[str | Path], spec: str | Path | None = None, widening: Widening | None = None
+) -> Extension:
+    """Say what a wider run would take from others; changes nothing.
+
+    Parameters
+    ----------
+    sources
+        Run directories, complete or not. The first is the one that is widened.
+    spec
+        The wider specification: a TOML file, or the name of a shipped workflow.
+    widening
+        Changes of the first run's own specification, or of `spec` if that is given.
+
+    Raises
+    ------
+    SpecError
+        If there is no wider specification, or it is not valid.
+    RefusedError
+        If nothing can be taken, with the reasons.
+    """
+    runs = [Run.open(source) for source in sources]
+    wide, text = _wide(runs[0], spec, widening or Widening())
+    check_starts(wide)
+    plan = make_plan(wide)
+    identity = identity_here(wide, plan)
+    fitting, notes = _fitting(runs, wide, identity)
+    counts = _census(wide, plan, fitting)
+    if not sum(counts):
+        reasons = notes + [line for run in fitting for line in _strangers(run, wide)]
+        raise RefusedError(
+            "no cell is there to be taken, so a run of its own is as quick (magpend run SPEC --out NEW). "
+            "What differs:\n  " + "\n  ".join(reasons)
+        )
+    return Extension(wide, text, plan, identity, tuple(fitting), tuple(counts), tuple(notes))
+
+
+def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
+    """The wider specification and its text."""
+    if spec is None and not widening:
+        raise SpecError([
+            "extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM."
+        ])  # fmt: skip
+    if spec is not None:
+        path = find_spec(spec)
+        parsed = load_spec(path)
+        if not widening:
+            return parsed, path.read_text("utf-8")
+        wide, origin = widened(parsed, widening), f"specification {path.name}"
+    else:
+        wide = widened(run.spec, widening)
+        origin = f"run {Path(run.info.files.place).name}, digest {run.info.digest}"
+    return wide, f"# Extended. Derived from {_printable(origin)}.\n{to_toml(wide)}"
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tuple[list[Run], list[str]]:
+    """Those runs whose cells can be the wider run's, and notes on the others."""
+    from pipeline.compute.reuse import obstacles
+
+    fitting, notes = [], []
+    for run in runs:
+        lines = obstacles(run, wide, identity)
+        if lines:
+            notes.append(f"{run.name}: none of its cells can be taken ({'; '.join(lines)})")
+            continue
+        fitting.append(run)
+        if not run.complete:
+            done = sum(run.plan.cells_in(i) for i in run.commits)
+            notes.append(
+                f"{run.name}: is not complete; {done} of {run.plan.n_cells} cells are committed, and "
+                "these alone are taken"
+            )
+    return fitting, notes
+
+
+def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
+    """Cells of the wider run that each run has, each cell counted once."""
+    from pipeline.compute.reuse import Pool
+
+    pool, cells = Pool(wide, runs), CellMap(wide)
+    counts = [0] * len(runs)
+    for block in plan.tasks() if runs else ():
+        for i, n in enumerate(pool.count(cells.inputs(block), way_of(wide, block))):
+            counts[i] += n
+    return counts
+
+
+def _strangers(run: Run, wide: Spec) -> list[str]:
+    """Why a run that fits has no cell of the wider one."""
+    if not run.commits:
+        return [f"{run.name}: nothing of it is committed"]
+    return [f"{run.name}: {line}" for line in apart(run.spec, wide)]
+
+
+def describe_extension(extension: Extension, *, workers: int | None = None) -> Iterator[str]:
+    """Yield the lines of a dry run; the time is measured, after the lines that cost nothing."""
+    spec, plan = extension.spec, extension.plan
+    if spec.title:
+        yield spec.title
+    dims = ", ".join(f"{d} {n}" for d, n in zip(plan.dims, plan.shape, strict=True))
+    yield f"{spec.kind}: {plan.n_cells} cells ({dims or 'one cell'}) in {plan.n_tasks} tasks"
+    yield from extension.lines()
+    yield f"cube: {size(plan.n_bytes)} before compression"
+    yield time_line(spec, plan, 1 - extension.reused / plan.n_cells, plan.n_tasks, workers)
+
+
+def extend(
+    source: str | Path,
+    spec: str | Path | None = None,
+    out: str | Path | None = None,
+    *,
+    also: Sequence[str | Path] = (),
+    axes: Mapping[str, Mapping[str, Any]] | None = None,
+    starts: int | None = None,
+    keep: int | None = None,
+    products: Mapping[str, Mapping[str, Any]] | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    cluster: str | Path | None = None,
+    dashboard: bool = False,
+    echo: Echo = print,
+) -> State:
+    """Widen a run, with every cell that is computed already.
+
+    The files of the result have the bytes of a run of the wider specification that began from nothing.
+    Killed at any moment, the same call goes on. The runs that cells are taken from are only read, and what
+    is damaged in them is integrated instead.
+
+    Parameters
+    ----------
+    source
+        Run directory, complete or not.
+    spec
+        The wider specification: a TOML file, or the name of a shipped workflow. By default that of the run,
+        with the changes that follow.
+    out
+        Directory of the wider run. By default it takes the place of `source` when it is complete, and the old
+        one is renamed to ``SOURCE.before``.
+    also
+        Further run directories that hold cells, such as another half that was computed elsewhere.
+    axes
+        New ranges by ``frequency_hz``, parameter, or state of a grid:
+        ``{"frequency_hz": {"start": 2.0, "stop": 3.0, "num": 201}}``.
+    starts
+        Number of random initial states.
+    keep
+        Kept sections.
+    products
+        Products to compute besides, with their options: ``{"lyapunov": {}}``.
+    workers, scheduler, cluster, dashboard, echo
+        As for `pipeline.runs.run.run`.
+
+    Returns
+    -------
+    State
+        Of the wider run.
+
+    Raises
+    ------
+    SpecError, RefusedError
+        Before anything is created: if nothing can be taken, with the reasons, or if cells would be lost.
+    Exception
+        As `pipeline.runs.run.run`.
+    """
+    from pipeline.compute.clients import Where
+
+    widening = Widening(axes or {}, starts, keep, products or {})
+    first = open_files(source)
+    in_place = out is None or open_files(out).place == first.place
+    built = open_files(_beside(_folder(first)) if in_place else str(out))
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, built.local)
+    where.resolved()
+    how: dict[str, Any] = {"workers": workers, "where": where, "echo": echo}
+    if in_place:
+        _finish_exchange(_folder(first), echo)
+    extension = plan_extension((source, *also), spec, widening)
+    if not in_place:
+        return _build(extension, built, **how)
+    old = Run.open(first)
+    if extension.digest == old.info.digest:
+        return _as_it_is(old, echo)
+    _refuse_loss(old, extension.spec)
+    with first.lock():
+        _build(extension, built, **how)
+        _exchange(_folder(first), _folder(built), echo)
+    return state(first)
+
+
+def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> State:
+    """Make the wider run in a directory of its own, or go on with it."""
+    for line in extension.lines():
+        echo(line)
+    sources = [(run.info.files.place, run.info.digest) for run in extension.runs]
+    carry_out(extension.spec, extension.text, files, echo=echo, sources=sources, **how)
+    _record(extension, files)
+    return state(files)
+
+
+def _record(extension: Extension, files: Files) -> None:
+    """Write down where cells come from; no part of the result."""
+    taken: dict[int, int] = {}
+    with contextlib.suppress(FileNotFoundError):
+        for line in files.read(TIMINGS).decode().splitlines():
+            entry = json.loads(line)
+            taken[entry["task"]] = entry.get("reused", 0)
+    runs = zip(extension.runs, extension.counts, strict=True)
+    content = {
+        "sources": [
+            {"directory": run.info.files.place, "digest": run.info.digest, "cells": count}
+            for run, count in runs
+        ],
+        "cells": extension.plan.n_cells,
+        "reused": sum(taken.values()),
+    }
+    files.write(EXTENDED, canonical(content).encode())
+
+
+# ---- in place ----------------------------------------------------------------------------------
+
+
+def _folder(files: Files) -> Path:
+    """The folder of a run, which a wider one can take the place of."""
+    if files.local is None:
+        raise RefusedError(f"{files.name}: is no folder of this machine, which can be renamed; give --out.")
+    return files.local
+
+
+def _beside(directory: Path) -> Path:
+    """Where the wider run is made that will take a directory's place."""
+    real = directory.resolve()
+    return real.with_name(f"{real.name}.extending")
+
+
+def _aside(directory: Path) -> Path:
+    """A free name for the old run."""
+    real = directory.resolve()
+    names = (real.with_name(f"{real.name}.before{i}") for i in ("", *(f".{n}" for n in range(2, 10_000))))
+    return next(name for name in names if not name.exists())
+
+
+def _as_it_is(run: Run, echo: Echo) -> State:
+    if not run.complete:
+        raise RefusedError(
+            f"{run.name}: this is its own specification, and it is not complete; complete it with: "
+            f"magpend run SPEC --out {run.name}"
+        )
+    echo(f"{run.name} holds all this already; nothing to do.")
+    return state(run)
+
+
+def _refuse_loss(run: Run, wide: Spec) -> None:
+    """Refuse to put a run in the place of one that holds more than it does."""
+    cells, finder, lost = CellMap(run.spec), Finder(wide), 0
+    for index in run.commits:
+        block = run.plan.task(index)
+        lost += int((finder.find(cells.inputs(block), way_of(run.spec, block)) == NOWHERE).sum())
+    absent = [name for name in run.spec.products if name not in wide.products]
+    what = [f"{lost} of its cells"] if lost else []
+    what += [f"its product {name}" for name in absent]
+    if what:
+        raise RefusedError(
+            f"{run.name}: {' and '.join(what)} would not be in the wider run, which would take its "
+            "place; give another directory with --out, or a specification that has them all."
+        )
+
+
+def _exchange(directory: Path, built: Path, echo: Echo) -> None:
+    """Put a finished run in a directory's place; at no moment is either of the two gone."""
+    real, aside = directory.resolve(), _aside(directory)
+    real.rename(aside)
+    sync_folder(real.parent)
+    built.rename(real)
+    sync_folder(real.parent)
+    echo(f"the run as it was lies in {aside}; remove it when nobody needs it any more")
+
+
+def _finish_exchange(directory: Path, echo: Echo) -> None:
+    """Rename the finished run if the process was killed between the two renames of an exchange."""
+    built = _beside(directory)
+    if directory.exists() or not is_run(open_files(built)):
+        return
+    if not state(built).complete:
+        raise RefusedError(f"{directory}: is not there, and {built} is not complete; put one in its place.")
+    built.rename(directory)
+    sync_folder(directory.parent)
+    echo(f"{directory}: the extension was complete and has taken its place")

@@ -1,0 +1,202 @@
+"""Send a run to a batch system: ``magpend submit``."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.compute.jobqueue import jobs_folder
+from pipeline.layout.domains import check_starts
+from pipeline.layout.plan import make_plan
+from pipeline.runs.batch import WORDS, coordinator_script, is_whole
+from pipeline.runs.run import identity_here
+from pipeline.runs.workflows import default_directory, find_spec
+from pipeline.spec.clusters import Cluster, load_cluster
+from pipeline.spec.parsing import load_spec
+from pipeline.spec.problems import SpecError
+from pipeline.store.commits import read_commits
+from pipeline.store.errors import LockedError
+from pipeline.store.files import local_path
+from pipeline.store.local import write_atomically
+from pipeline.store.setup import check
+
+CLUSTER_FILE = "MAGPEND_CLUSTER"
+SCRIPT, SENT = "job.sh", "job.json"
+_ANSWER_S = 60.0
+_AWKWARD = re.compile(r"[^\w./+,:=@-]")
+"""What batch systems do not take, or read as something else, in the path of a log."""
+
+
+class SubmitError(Exception):
+    """The batch system did not take a job; the message has its words."""
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A run as a job.
+
+    Attributes
+    ----------
+    directory, folder : Path
+        Of the run, and of its job: script, number, and what is said in it.
+    cluster : Cluster
+        What a job is.
+    script : str
+        The batch script.
+    complete : bool
+        Whether there is nothing left to compute.
+    job : str, optional
+        Its number, once it is sent.
+    """
+
+    directory: Path
+    folder: Path
+    cluster: Cluster
+    script: str
+    complete: bool
+    job: str | None = None
+
+    def lines(self) -> list[str]:
+        """How to follow, cancel and go on."""
+        words = WORDS[self.cluster.kind]
+        return [
+            f"sent: job {self.job}",
+            f"follow: magpend status {shlex.quote(str(self.directory))}; {words.follow} {self.job}; "
+            f"tail -F {self.folder}/coordinator*",
+            f"cancel: {words.cancel} {self.job}",
+            "after a cancel, or where time ran out: give this command again, and it goes on",
+        ]
+
+
+def prepare(
+    spec: str | Path, out: str | Path | None, cluster_file: str | Path | None, *, smoke: bool = False
+) -> Submission:
+    """Write the script of a run's job, as text; nothing is created or sent.
+
+    Parameters
+    ----------
+    spec, out, smoke
+        See `run.run`.
+    cluster_file
+        With the ``[cluster]`` table; by default what ``MAGPEND_CLUSTER`` says.
+
+    Raises
+    ------
+    SpecError
+        If one of the files is not in order, or a path is nothing for a batch system.
+    RefusedError, DamagedError, UnreadableError
+        If the run cannot be done in the directory.
+    """
+    path = find_spec(spec)
+    parsed = load_spec(path, smoke=smoke)
+    file = cluster_file or os.environ.get(CLUSTER_FILE)
+    if not file:
+        raise SpecError([
+            f"what is a job? Say it in a file with a [cluster] table and give --cluster FILE, or set "
+            f"{CLUSTER_FILE}; docs/clusters.md has an example."
+        ])  # fmt: skip
+    cluster = load_cluster(file)
+    directory = local_path(out) if out is not None else default_directory(path, smoke)
+    folder = jobs_folder(directory)
+    if _AWKWARD.search(str(folder)):
+        raise SpecError([
+            f"{folder}: batch systems do not take this path for what a job says; give an --out of letters, "
+            "digits, and . _ - + , : = @ alone."
+        ])  # fmt: skip
+    check_starts(parsed)
+    plan = make_plan(parsed)
+    info = check(directory, identity_here(parsed, plan))
+    complete = info is not None and len(read_commits(info, plan)) == plan.n_tasks
+    command = _command(cluster, Path(file), path, directory, smoke)
+    name = f"magpend-{re.sub(r'[^A-Za-z0-9_.-]', '-', directory.absolute().name)}"
+    script = coordinator_script(cluster, name, f"{folder}/coordinator", str(Path.cwd()), command)
+    return Submission(directory, folder, cluster, script, complete)
+
+
+def _command(cluster: Cluster, file: Path, spec: Path, directory: Path, smoke: bool) -> list[str]:
+    """``magpend run``, as the job gives it."""
+    where = ["--scheduler", "local", "--workers", str(cluster.cores)]
+    if not is_whole(cluster):
+        where = ["--scheduler", cluster.kind, "--cluster", str(file.absolute())]
+    python = cluster.python or sys.executable
+    return [
+        python, "-m", "pipeline.cli.main", "run", str(spec.absolute()), "--out", str(directory.absolute()),
+        *where, *(["--smoke"] if smoke else []),
+    ]  # fmt: skip
+
+
+def send(submission: Submission) -> Submission:
+    """Send the job, and keep its script and its number beside the run directory.
+
+    Raises
+    ------
+    LockedError
+        If a job of this run waits or runs already.
+    SpecError
+        If there is no such batch system here.
+    SubmitError
+        If it does not take the job.
+    """
+    kind = submission.cluster.kind
+    words = WORDS[kind]
+    if not shutil.which(words.send[0]):
+        raise SpecError([
+            f"{kind}: there is no command {words.send[0]!r} here; give the command on a machine that sends "
+            "jobs, such as the login node, or --dry-run to see the script."
+        ])  # fmt: skip
+    _refuse_second(submission)
+    submission.folder.mkdir(parents=True, exist_ok=True)
+    script = submission.folder / SCRIPT
+    write_atomically(script, submission.script)
+    by_name, as_input = ([], submission.script) if kind == "lsf" else ([str(script)], None)
+    done = _ask([*words.send, *by_name], as_input)
+    job = words.job(done.stdout) if done.returncode == 0 else None
+    if job is None:
+        said = " ".join((done.stderr or done.stdout).split()) or f"exit code {done.returncode}"
+        raise SubmitError(f"{words.send[0]} did not take the job: {said}. The script is {script}.")
+    write_atomically(submission.folder / SENT, json.dumps({"kind": kind, "job": job}) + "\n")
+    return Submission(
+        submission.directory,
+        submission.folder,
+        submission.cluster,
+        submission.script,
+        submission.complete,
+        job,
+    )
+
+
+def _refuse_second(submission: Submission) -> None:
+    """Two jobs of a run would wait for each other's lock."""
+    try:
+        sent = json.loads((submission.folder / SENT).read_text("utf-8"))
+        kind, job = sent["kind"], sent["job"]
+        words = WORDS[kind]
+    except (OSError, ValueError, TypeError, KeyError):
+        return  # none was sent, or the note of it is gone: the run's lock keeps two from computing
+    if not (isinstance(job, str) and words.job(f"<{job}>")) or not shutil.which(words.ask[0]):
+        return
+    done = _ask([*words.ask, job])
+    state = done.stdout.strip()
+    if done.returncode == 0 and state and not re.fullmatch(words.over, state):
+        named = f" ({state})" if "\n" not in state else ""
+        raise LockedError(
+            f"{submission.directory}: job {job} of this run is there already{named}; wait for it "
+            f"({words.follow} {job}) or cancel it ({words.cancel} {job})."
+        )
+
+
+def _ask(command: Sequence[str], text: str | None = None) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(
+            list(command), input=text, capture_output=True, text=True, timeout=_ANSWER_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise SubmitError(f"{command[0]}: no answer within {_ANSWER_S:.0f} s; try again.") from None

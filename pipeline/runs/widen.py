@@ -1,0 +1,78 @@
+"""A wider specification from a run's own: longer axes, more starts, more kept sections, more products."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pipeline.runs.zoom import put_value
+from pipeline.spec.parsing import Spec, kept_spec
+from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.spec.starts import GridStarts, RandomStarts, state_keys, state_of_key
+from pipeline.spec.tables import FREQUENCY
+
+
+@dataclass(frozen=True)
+class Widening:
+    """What differs from the old specification; everything else stays as it was.
+
+    Attributes
+    ----------
+    axes : dict
+        New ranges, as the tables of ``[axes]``, by ``frequency_hz``, parameter, or state of a grid.
+    starts : int or None
+        Number of random initial states.
+    keep : int or None
+        Kept sections.
+    products : dict
+        Options by name of products to compute besides, as the tables of ``[products]``.
+    """
+
+    axes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    starts: int | None = None
+    keep: int | None = None
+    products: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.axes or self.products) or self.starts is not None or self.keep is not None
+
+
+def widened(spec: Spec, widening: Widening) -> Spec:
+    """Return the changed specification.
+
+    Raises
+    ------
+    SpecError
+        If a change does not fit, or the result is no valid specification.
+    """
+    problems = _problems(spec, widening)
+    if problems:
+        raise SpecError(problems)
+    data = spec.as_dict()
+    for name, table in widening.axes.items():
+        put_value(spec, data, name, dict(table))
+    if widening.starts is not None:
+        data["initial_conditions"]["n"] = widening.starts
+    if widening.keep is not None:
+        data["integration"]["n_keep"] = widening.keep
+    data["products"] |= {name: dict(options) for name, options in widening.products.items()}
+    return kept_spec(data)
+
+
+def _problems(spec: Spec, widening: Widening) -> list[str]:
+    known = (FREQUENCY, *spec.model.parameter_names, *state_keys(spec.model))
+    problems = [f"extend: {unknown_name('axis', name, known)}" for name in widening.axes if name not in known]
+    states = [name for name in widening.axes if state_of_key(name, spec.model)]
+    kind = spec.initial_conditions.kind
+    if states and not isinstance(spec.initial_conditions, GridStarts):
+        problems.append(
+            f"axis {states[0]}: the initial conditions are a {kind} and no grid, which a range could widen; "
+            "give a SPEC with the starts that are wanted."
+        )
+    if widening.starts is not None and not isinstance(spec.initial_conditions, RandomStarts):
+        problems.append(
+            f"starts = {widening.starts}: the initial conditions are a {kind}, not random samples; "
+            + ("widen a state's range instead." if kind == "grid" else "give a SPEC with more rows.")
+        )
+    return problems

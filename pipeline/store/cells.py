@@ -1,0 +1,70 @@
+"""Cells of one committed task, compared with its record: for whoever goes on from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import zarr
+
+from pipeline.layout.plan import Plan
+from pipeline.store.commits import read_commit
+from pipeline.store.errors import IncompleteError
+from pipeline.store.records import Commit
+from pipeline.store.run import Run
+from pipeline.store.runfile import RunInfo
+from pipeline.store.view import committed_view
+
+
+def read_cells(
+    info: RunInfo, plan: Plan, index: int, region: tuple[slice, ...], names: Iterable[str]
+) -> dict[str, np.ndarray]:
+    """Read variables of some cells of a task, as they were committed.
+
+    Parameters
+    ----------
+    info, plan
+        The run.
+    index
+        The task.
+    region
+        Some of its cells.
+    names
+        Variables of the cube.
+
+    Raises
+    ------
+    IncompleteError
+        If the task is not committed here.
+    UnreadableError
+        If its record is there and cannot be read.
+    DamagedError
+        If what is read is not what was written.
+    """
+    commit = read_commit(info, plan, index)
+    if commit is None:
+        raise IncompleteError(
+            f"{info.name}: task {index}, from which another goes on, is not committed here. Every "
+            "worker must see this very folder, by this path; then give the same command again."
+        )
+    return _read(info, plan, index, commit, region, names)
+
+
+def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Read variables of a task of an opened run, in the shape of its block followed by their own dims.
+
+    Raises
+    ------
+    DamagedError
+        If what is read is not what was written.
+    KeyError
+        If the task is not committed.
+    """
+    return _read(run.info, run.plan, index, run.commits[index], run.plan.task(index), names)
+
+
+def _read(
+    info: RunInfo, plan: Plan, index: int, commit: Commit, region: tuple[slice, ...], names: Iterable[str]
+) -> dict[str, np.ndarray]:
+    view = committed_view(info, plan, {index: commit}, check=True)
+    return {name: np.asarray(zarr.open_array(view, path=name, mode="r")[region]) for name in names}

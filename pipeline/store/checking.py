@@ -1,0 +1,121 @@
+"""Comparing what is stored with what was written: every byte, or every size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from pipeline.layout.plan import Plan
+from pipeline.products.reporting import report
+from pipeline.store.commits import absent_objects, leftover_keys, scan
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import COMMITS, CUBE, DERIVED, problems_of
+from pipeline.store.products import product_paths, read_product_attrs
+from pipeline.store.records import Records, marker_key
+from pipeline.store.runfile import RunInfo
+
+_TASKS_PER_REPORT = 50
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What `verify` found.
+
+    Attributes
+    ----------
+    n_tasks, n_committed : int
+        Tasks of the run, and those that are committed and intact.
+    damaged : dict
+        Problem by the file name of the commit record; see `packing.withdraw`.
+    skeleton : list of str
+        Problems of metadata and coordinates.
+    leftovers : list of str
+        Files that nothing vouches for; harmless, swept by the next run.
+    derived : dict
+        Problem by name of products that are not what was written.
+    rebuilt : list of str
+        Problems of the skeleton that have been mended.
+    """
+
+    n_tasks: int
+    n_committed: int
+    damaged: dict[str, str]
+    skeleton: list[str]
+    leftovers: list[str]
+    derived: dict[str, str] = field(default_factory=dict)
+    rebuilt: list[str] = field(default_factory=list)
+
+    @property
+    def sound(self) -> bool:
+        """Whether all that is committed is intact, and all products are."""
+        return not self.damaged and not self.skeleton and not self.derived
+
+
+def verify(info: RunInfo, plan: Plan) -> Verification:
+    """Read every committed file and compare its sha256 with its record.
+
+    Raises
+    ------
+    UnreadableError
+        If a file is there and cannot be read.
+    """
+    info.files.refuse_links(CUBE)
+    records, damaged = damaged_records(info, plan, contents=True)
+    n_whole = sum(name_of(index) not in damaged for index in records)
+    leftovers = [key.removeprefix(f"{CUBE}/") for key in leftover_keys(info, plan, records)]
+    named = {f"{COMMITS}/{name}" for name in damaged}
+    return Verification(
+        n_tasks=plan.n_tasks,
+        n_committed=n_whole,
+        damaged=dict(sorted(damaged.items())),
+        skeleton=problems_of(info.files.below(CUBE), info.skeleton),
+        leftovers=sorted(key for key in leftovers if key not in named),
+        derived=damaged_products(info),
+    )
+
+
+def name_of(index: int) -> str:
+    """Name of a task's record; it may lie in a pack."""
+    return marker_key(index).removeprefix(f"{COMMITS}/")
+
+
+def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Records, dict[str, str]]:
+    """Return the whole records; and by name what is wrong with others, or with what records vouch for.
+
+    Parameters
+    ----------
+    info, plan
+        The run.
+    contents
+        Whether to compare contents; else sizes alone.
+    """
+    records, rejected = scan(info, plan)
+    damaged = {name: f"{COMMITS}/{name}: {problem}" for name, problem in rejected.items()}
+    found = _changed_objects(info, records) if contents else absent_objects(info, records)
+    return records, damaged | {name_of(index): problem for index, problem in found.items()}
+
+
+def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
+    """What is not what was written, by task."""
+    cube, found = info.files.below(CUBE), {}
+    for n, index in enumerate(records):
+        if n % _TASKS_PER_REPORT == 0:
+            report("comparing what is committed with its records", n, len(records))
+        problems = problems_of(cube, records[index].objects)
+        if problems:
+            found[index] = "; ".join(problems)
+    return found
+
+
+def damaged_products(info: RunInfo) -> dict[str, str]:
+    """Products in ``derived`` that are not what was written, by name."""
+    found: dict[str, str] = {}
+    if info.files.local is None:
+        return found
+    for path in product_paths(info.directory / DERIVED):
+        try:
+            read_product_attrs(path)
+        except FileNotFoundError:
+            continue
+        except DamagedError as error:
+            found[path.name] = str(error).removeprefix(f"{info.directory}/")
+    return found

@@ -1,0 +1,63 @@
+"""Which chunk belongs to which task: keys such as ``section/c.0.3.0.0`` follow from the plan, and back."""
+
+from __future__ import annotations
+
+import itertools
+
+from pipeline.layout.plan import Plan
+
+
+def chunk_keys(
+    name: str, region: tuple[slice, ...], chunks: tuple[int, ...], shape: tuple[int, ...]
+) -> list[str]:
+    """Keys of the chunks in a region; a region that cuts a chunk would lose a neighbour's cells."""
+    for s, c, n in zip(region, chunks, shape, strict=True):
+        if s.start % c or (s.stop % c and s.stop != n):
+            raise ValueError(f"{name}: region {region} cuts chunks of {chunks}.")
+    places = [range(s.start // c, -(-s.stop // c)) for s, c in zip(region, chunks, strict=True)]
+    return [".".join((f"{name}/c", *map(str, place))) for place in itertools.product(*places)]
+
+
+def keys_of(plan: Plan, index: int) -> list[str]:
+    """Keys of all chunks of a task."""
+    block, found = plan.task(index), []
+    for variable in plan.variables:
+        own = tuple(plan.sizes[dim] for dim in variable.own_dims)
+        region = (*block, *(slice(0, n) for n in own))
+        found += chunk_keys(variable.name, region, plan.chunks(variable), (*plan.shape, *own))
+    return found
+
+
+class Owners:
+    """The task that a chunk belongs to.
+
+    Parameters
+    ----------
+    plan
+        Of the run.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self._block, self._grid = plan.block, plan.task_grid
+        self._chunks: dict[str, tuple[int, ...]] = {}
+        self._counts: dict[str, tuple[int, ...]] = {}
+        for variable in plan.variables:
+            chunks = plan.chunks(variable)
+            shape = (*plan.shape, *(plan.sizes[dim] for dim in variable.own_dims))
+            self._chunks[variable.name] = chunks
+            self._counts[variable.name] = tuple(-(-n // c) for n, c in zip(shape, chunks, strict=True))
+
+    def task(self, key: str) -> int | None:
+        """Return the task of a chunk's key; None for what is no chunk of a cell."""
+        name, _, rest = key.partition("/")
+        mark, *words = rest.split(".")
+        counts = self._counts.get(name)
+        if counts is None or mark != "c" or len(words) != len(counts):
+            return None
+        places = [int(word) if word.isdecimal() and len(word) < 12 else -1 for word in words]
+        if any(not 0 <= p < n or str(p) != w for p, n, w in zip(places, counts, words, strict=True)):
+            return None
+        index = 0
+        for place, c, b, n in zip(places, self._chunks[name], self._block, self._grid, strict=False):
+            index = index * n + place * c // b
+        return index

@@ -1,0 +1,297 @@
+"""The files of a run in a folder of this machine: written whole, synced in order, no link followed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import stat
+import uuid
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+from zarr.abc.store import Store
+from zarr.storage import LocalStore
+
+from pipeline.store.errors import LockedError, RefusedError, UnreadableError
+from pipeline.store.files import LOCK, TEMPORARY, LinkError
+
+
+@dataclass(frozen=True)
+class LocalFiles:
+    """Files of a folder by key, such as ``commits/000001.json``; see `pipeline.store.files.Files`."""
+
+    root: Path
+
+    @property
+    def name(self) -> str:
+        """The folder, as it was given."""
+        return str(self.root)
+
+    @property
+    def place(self) -> str:
+        """The folder, for other processes of this machine and its file systems."""
+        return str(self.root.absolute())
+
+    @property
+    def local(self) -> Path:
+        """The folder."""
+        return self.root
+
+    def below(self, prefix: str) -> LocalFiles:
+        """Files of a folder in this one."""
+        return LocalFiles(self.root / prefix)
+
+    def names(self) -> list[str]:
+        """Names of all that is in the folder, sorted."""
+        with unreadable(self.root), os.scandir(self.root) as entries:
+            return sorted(entry.name for entry in entries)
+
+    def is_there(self, key: str) -> bool:
+        """Whether a plain file is there."""
+        return is_there(self.root / key)
+
+    def read(self, key: str) -> bytes:
+        """Content of a plain file."""
+        path = self.root / key
+        with unreadable(path):
+            mode = path.lstat().st_mode
+            if stat.S_ISLNK(mode):
+                raise LinkError(f"{path}: is a link")
+            if not stat.S_ISREG(mode):
+                raise FileNotFoundError(f"{path}: is no file")
+            return path.read_bytes()
+
+    def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
+        """Contents, or why there is none, in the order of the keys."""
+        for key in keys:
+            try:
+                yield key, self.read(key)
+            except FileNotFoundError as error:
+                yield key, error
+
+    def write(self, key: str, content: bytes) -> None:
+        """Write a file whole or not at all, durable when this returns."""
+        path = self.root / key
+        make_folder(path.parent)
+        write_atomically(path, content)
+
+    def write_once(self, key: str, content: bytes) -> None:
+        """As `write`: a rename leaves one of two equal contents, whole."""
+        self.write(key, content)
+
+    def append(self, key: str, line: str) -> None:
+        """Add a line to a file that is no part of the result; not synced."""
+        with (self.root / key).open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+
+    def sizes(self) -> dict[str, int]:
+        """Size of every plain file below by key; nothing if there is no folder."""
+        self.refuse_links("")
+        found: dict[str, int] = {}
+        with contextlib.suppress(FileNotFoundError):
+            _measure(self.root, "", found)
+        return found
+
+    def everything(self) -> list[str]:
+        """Keys of all that is below and is no folder, links too; nothing if there is no folder."""
+        with unreadable(self.root), contextlib.suppress(FileNotFoundError):
+            return [path.relative_to(self.root).as_posix() for path in files_below(self.root)]
+        return []
+
+    def remove(self, keys: Iterable[str]) -> None:
+        """Remove files and links, not what these lead to; one that is gone already is no error."""
+        paths = [self.root / key for key in keys]
+        for path in paths:
+            path.unlink(missing_ok=True)
+        for folder in sorted({path.parent for path in paths}):
+            with contextlib.suppress(FileNotFoundError):
+                sync_folder(folder)
+
+    def sync(self, keys: Iterable[str]) -> None:
+        """Have files on the disk, then their folders, from theirs up to this one."""
+        sync((self.root / key for key in keys), self.root)
+
+    def prepare(self, prefix: str) -> None:
+        """Make a folder if it is not there; it and this one are durable then."""
+        make_folder(self.root / prefix)
+        sync_folder(self.root.parent)
+
+    def refuse_links(self, *prefixes: str) -> None:
+        """Refuse folders that are links."""
+        refuse_links(*(self.root / prefix for prefix in prefixes))
+
+    def zarr(self, *, read_only: bool) -> Store:
+        """The folder as zarr takes it."""
+        return LocalStore(self.root, read_only=read_only)
+
+    def lock(self) -> AbstractContextManager[None]:
+        """Hold the folder's lock."""
+        return writer_lock(self.root)
+
+
+def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
+    """Add the sizes of the plain files below a folder; a link to a folder in the topmost is refused."""
+    with unreadable(folder), os.scandir(folder) as entries:
+        below = list(entries)
+    for entry in below:
+        if entry.is_file(follow_symlinks=False):
+            with unreadable(folder):
+                found[prefix + entry.name] = entry.stat(follow_symlinks=False).st_size
+        elif entry.is_dir(follow_symlinks=bool(not prefix)):
+            refuse_links(Path(entry.path))
+            _measure(Path(entry.path), f"{prefix}{entry.name}/", found)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, and those that it lies in, and have their entries on the disk."""
+    if path.is_dir():
+        return
+    make_folder(path.parent)
+    path.mkdir(exist_ok=True)
+    sync_folder(path.parent)
+
+
+def sync_file(path: Path) -> None:
+    """Have a file's content on the disk."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def sync_folder(path: Path) -> None:
+    """Have a folder's entries on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sync(files: Iterable[Path], top: Path) -> None:
+    """Sync files, then every folder from theirs up to `top`."""
+    folders: set[Path] = set()
+    for file in files:
+        sync_file(file)
+        folders.update(p for p in file.parents if p == top or top in p.parents)
+    for folder in sorted(folders, key=lambda p: -len(p.parts)):
+        sync_folder(folder)
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a small file so that after a crash it is there whole or not at all."""
+    temporary = temporary_beside(path)
+    with temporary.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    sync_folder(path.parent)
+
+
+def temporary_beside(path: Path) -> Path:
+    """A name that nobody else has, in the same folder."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """All that is below a folder and is no folder; a link is an entry, wherever it leads."""
+    with os.scandir(folder) as entries:
+        found = sorted(entries, key=lambda entry: entry.name)
+    for entry in found:
+        if entry.is_dir(follow_symlinks=False):
+            yield from files_below(Path(entry.path))
+        else:
+            yield Path(entry.path)
+
+
+def is_there(path: Path) -> bool:
+    """Whether a plain file is there; a link, or a folder, is none.
+
+    Raises
+    ------
+    UnreadableError
+        If the file system does not say.
+    """
+    try:
+        with unreadable(path):
+            return stat.S_ISREG(path.lstat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+
+
+@contextlib.contextmanager
+def unreadable(path: Path) -> Iterator[None]:
+    """Turn an error of the file system into one that stops the run; that something is absent is none.
+
+    Raises
+    ------
+    UnreadableError
+        For any `OSError` but `FileNotFoundError` and `NotADirectoryError`.
+    """
+    try:
+        yield
+    except (FileNotFoundError, NotADirectoryError):
+        raise
+    except OSError as error:
+        raise UnreadableError(
+            f"{error.filename or path}: cannot be read ({error.strerror or error}), so whether it is there "
+            "and whole is not known. Nothing was removed; mend the file system or the access rights, then "
+            "give the same command again."
+        ) from error
+
+
+def refuse_links(*folders: Path) -> None:
+    """Refuse to work below a link: what it leads to is not the run's own.
+
+    Raises
+    ------
+    RefusedError
+        Naming the link.
+    """
+    for folder in folders:
+        if folder.is_symlink():
+            raise RefusedError(
+                f"{folder}: is a link, which magpend does not follow inside of a run directory; put the "
+                "folder itself there. The run directory as a whole may be a link."
+            )
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a file, a link (not what it leads to) or a folder; one that is gone already is no error."""
+    with contextlib.suppress(FileNotFoundError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+
+
+@contextlib.contextmanager
+def writer_lock(directory: Path) -> Iterator[None]:
+    """Hold the directory's lock: a courtesy between people, the commit protocol does not rest on it.
+
+    Raises
+    ------
+    LockedError
+        If another process holds it.
+    """
+    from filelock import FileLock, Timeout
+
+    directory.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(directory / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise LockedError(
+            f"{directory}: another magpend run is writing here. Wait for it or stop it, then run again."
+        ) from None
+    except (NotImplementedError, OSError) as error:
+        warnings.warn(f"{directory}: no file lock here ({error}); start one run at a time.", stacklevel=3)
+        yield
+        return
+    try:
+        yield
+    finally:
+        lock.release()

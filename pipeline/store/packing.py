@@ -1,0 +1,109 @@
+"""Packs of commit records: written once a block of tasks is whole, mended where records are withdrawn.
+
+All of it is for the holder of the lock. A pack is durable before the single records that it replaces are
+removed, so that a crash at any moment leaves every record somewhere.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+
+from pipeline.layout.plan import Plan
+from pipeline.store.commits import scan
+from pipeline.store.files import COMMITS
+from pipeline.store.records import (
+    BLOCK,
+    Commit,
+    Records,
+    block_of_pack,
+    marker_key,
+    pack_key,
+    pack_text,
+    salvage,
+)
+from pipeline.store.runfile import RunInfo
+
+
+class Packer:
+    """Packs the records of a run as its blocks become whole.
+
+    Parameters
+    ----------
+    info, plan
+        The run.
+    commits
+        What is committed of it already.
+    """
+
+    def __init__(self, info: RunInfo, plan: Plan, commits: Records) -> None:
+        self._info = info
+        self._plan = plan
+        self._n_whole = plan.n_tasks // BLOCK
+        self._counts = Counter(i // BLOCK for i in commits)
+        packed = {block for block, pack in commits.packs.items() if not pack.without}
+        for block in sorted(set(self._counts) - packed):
+            self._pack_if_whole(block)
+
+    def add(self, index: int) -> None:
+        """Take that a task has been committed, for the first time."""
+        self._counts[index // BLOCK] += 1
+        self._pack_if_whole(index // BLOCK)
+
+    def _pack_if_whole(self, block: int) -> None:
+        if block < self._n_whole and self._counts[block] >= BLOCK:
+            pack_block(self._info, self._plan, block)
+
+
+def pack_block(info: RunInfo, plan: Plan, block: int) -> bool:
+    """Put the records of a block into one file if all of them are valid; returns whether they are."""
+    tasks = range(block * BLOCK, (block + 1) * BLOCK)
+    commits, _ = scan(info, plan, blocks={block})
+    if not all(index in commits for index in tasks):
+        return False
+    pack = commits.packs.get(block)
+    if pack is None or pack.without:
+        info.files.write(pack_key(block), pack_text(commits, info.digest, block))
+    info.files.remove([marker_key(index) for index in tasks])
+    return True
+
+
+def withdraw(info: RunInfo, names: Iterable[str]) -> None:
+    """Remove commit records, so that the next run computes their tasks again.
+
+    Parameters
+    ----------
+    info
+        The run.
+    names
+        Their file names, as if every record had a file of its own; or the name of a pack that is damaged:
+        what is whole in it stays.
+    """
+    info.files.refuse_links(COMMITS)
+    folder = info.files.below(COMMITS)
+    blocks: dict[int, set[int]] = {}
+    for name in names:
+        block = block_of_pack(name)
+        stem = name.removesuffix(".json")
+        if block is not None:
+            blocks.setdefault(block, set())
+        elif stem.isdecimal() and marker_key(int(stem)) == f"{COMMITS}/{name}":
+            blocks.setdefault(int(stem) // BLOCK, set()).add(int(stem))
+        folder.remove([name] if block is None else [])
+    for block, tasks in blocks.items():
+        _rewrite(info, block, tasks)
+
+
+def _rewrite(info: RunInfo, block: int, tasks: set[int]) -> None:
+    """Write a pack again with those of its records that are whole, but for some tasks'."""
+    try:
+        content = info.files.read(pack_key(block))
+    except FileNotFoundError:
+        return
+    kept: Mapping[int, Commit] = {
+        index: commit for index, commit in salvage(content, info.digest, block).items() if index not in tasks
+    }
+    if kept:
+        info.files.write(pack_key(block), pack_text(kept, info.digest, block))
+    else:
+        info.files.remove([pack_key(block)])

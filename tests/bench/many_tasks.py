@@ -1,0 +1,151 @@
+"""What a run of very many tasks costs to look at: opening, status, loading, verifying.
+
+    python tests/bench/many_tasks.py 10000 [100000 ...]
+
+The runs are made without the kernel: one cell a task, made-up numbers, whole files and true records.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import zarr
+from zarr.storage import MemoryStore
+
+SPEC = """
+kind = "sweep"
+title = "many tasks"
+model = "duffing"
+[axes]
+frequency_hz = {{ start = 0.15, stop = 0.25, num = {n} }}
+[initial_conditions]
+kind = "grid"
+x = 0.1
+v = 0.1
+[integration]
+n_transient = 2
+n_keep = 3
+[execution]
+trajectories_per_task = 1
+"""
+
+N_DIFFERENT = 500
+
+
+def make(directory: Path, n_tasks: int, *, packed: bool = True) -> None:
+    """Make a finished run of one-cell tasks."""
+    from magpend_core import kernel_version
+    from pipeline.layout.identity import identity_of
+    from pipeline.layout.plan import make_plan
+    from pipeline.spec.parsing import load_spec
+    from pipeline.store.files import entry_of
+    from pipeline.store.keys import keys_of
+    from pipeline.store.records import BLOCK, marker_key, pack_key, pack_text, record_text
+    from pipeline.store.setup import create
+
+    directory.mkdir(parents=True)
+    path = directory.with_suffix(".toml")
+    path.write_text(SPEC.format(n=n_tasks))
+    spec = load_spec(path)
+    plan = make_plan(spec)
+    info = create(directory, spec, plan, identity_of(spec, plan, kernel_version()), path.read_text())
+    chunks = different_chunks(directory / "cube.zarr", plan)
+    lines: list[bytes] = []
+    for index in range(n_tasks):
+        objects = {}
+        for key, content in zip(keys_of(plan, index), chunks[index % N_DIFFERENT], strict=True):
+            (directory / "cube.zarr" / key).write_bytes(content)
+            objects[key] = entry_of(content)
+        record = {"digest": info.digest, "task": index, "status": {"bounded": 1}, "objects": objects}
+        lines.append(record_text(record).encode())
+        if packed and len(lines) == BLOCK:
+            (directory / pack_key(index // BLOCK)).write_bytes(pack_text(lines, info.digest, index // BLOCK))
+            lines.clear()
+        elif not packed:
+            (directory / marker_key(index)).write_bytes(lines.pop())
+    for place, line in enumerate(lines):
+        (directory / marker_key(n_tasks - len(lines) + place)).write_bytes(line)
+
+
+def different_chunks(cube: Path, plan) -> list[list[bytes]]:
+    """Contents of all chunks of some tasks, by task."""
+    rng = np.random.default_rng(0)
+    found: list[list[bytes]] = [[] for _ in range(N_DIFFERENT)]
+    for variable in plan.variables:
+        written: dict = {}
+        metadata = (cube / variable.name / "zarr.json").read_bytes()
+        store = MemoryStore(written)
+        store_key = zarr.core.buffer.default_buffer_prototype().buffer.from_bytes(metadata)
+        written["zarr.json"] = store_key
+        array = zarr.open_array(store, mode="r+").with_config({"write_empty_chunks": True})
+        shape = (N_DIFFERENT, *array.shape[1:])
+        numbers = rng.uniform(1, 5, shape).astype(array.dtype)
+        if variable.name == "status":
+            numbers[...] = 2
+        array[:N_DIFFERENT] = numbers
+        rest = ".".join("0" for _ in array.shape[1:])
+        for i in range(N_DIFFERENT):
+            found[i].append(written[f"c.{i}.{rest}" if rest else f"c.{i}"].to_bytes())
+    return found
+
+
+PROBE = """
+import sys, time, resource
+from pathlib import Path
+from pipeline import open_run
+from pipeline.runs.status import describe_state, state
+from pipeline.runs.verify import verify_run
+directory, what = sys.argv[1:]
+started = time.perf_counter()
+if what == "status":
+    found = state(directory); describe_state(found); assert found.complete
+elif what == "open_run":
+    open_run(directory)
+elif what == "load":
+    ds = open_run(directory).load(); assert (ds.status == 2).all()
+elif what == "load_unchecked":
+    open_run(directory, check=False).load()
+elif what == "verify":
+    assert verify_run(directory).sound
+print(f"{time.perf_counter() - started:.2f} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}")
+"""
+
+
+def measure(directory: Path, what: str) -> str:
+    """Seconds, without the imports, and the peak of memory of a fresh process."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE, str(directory), what], capture_output=True, text=True, env=os.environ
+    )
+    if done.returncode:
+        return done.stderr.strip().splitlines()[-1]
+    seconds, megabytes = done.stdout.split()
+    return f"{seconds:>8s} s {megabytes:>6s} MB"
+
+
+def main() -> None:
+    folder = Path(tempfile.mkdtemp(prefix="many-"))
+    try:
+        for n in map(int, sys.argv[1:]):
+            started = time.perf_counter()
+            make(folder / f"run{n}", n)
+            print(f"{n} tasks made in {time.perf_counter() - started:.1f} s", flush=True)
+            for what in ("nothing", "status", "open_run", "verify", "load", "load_unchecked"):
+                if n > 20_000 and what.startswith("load"):
+                    continue
+                print(f"  {what:16s} {measure(folder / f'run{n}', what)}", flush=True)
+            shutil.rmtree(folder / f"run{n}")
+        print(f"peak here {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    main()

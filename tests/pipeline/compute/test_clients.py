@@ -1,0 +1,284 @@
+"""Schedulers and workers as processes of their own, on loopback: they come, go, differ and see other "
+"files."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from pipeline.compute import probe
+from pipeline.compute.addresses import SchedulerError
+from pipeline.compute.clients import Where, connected
+from pipeline.compute.jobqueue import settings, worker_script
+from pipeline.runs.progress import Progress
+from pipeline.runs.run import run
+from pipeline.spec.clusters import load_cluster
+
+SPEC = """
+kind = "sweep"
+title = "small Duffing sweep"
+model = "duffing"
+[axes]
+frequency_hz = { start = 0.15, stop = 0.25, num = 12 }
+[initial_conditions]
+kind = "random"
+n = 16
+seed = 1
+x = [-1, 1]
+v = [-1, 1]
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 1000
+n_keep = 4
+[execution]
+trajectories_per_task = 16
+"""
+PATIENCE_S = 90.0
+
+
+def silent(line):
+    pass
+
+
+@pytest.fixture
+def processes(tmp_path, environment):
+    """Starts processes; all are gone at the end."""
+    started = []
+
+    def begin(*words, before=(), **variables):
+        log = (tmp_path / f"process-{len(started)}.log").open("wb")
+        process = subprocess.Popen(
+            [*before, sys.executable, "-m", *map(str, words)],
+            cwd=tmp_path, env={**environment, **variables}, stdout=log, stderr=log, start_new_session=True,
+        )  # fmt: skip
+        log.close()
+        started.append(process)
+        return process
+
+    yield begin
+    for process in started:
+        end(process)
+
+
+def end(process):
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@pytest.fixture
+def scheduler_file(tmp_path, processes):
+    path = tmp_path / "scheduler.json"
+    processes(
+        "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+        "--dashboard-address", "127.0.0.1:0", "--scheduler-file", path,
+    )  # fmt: skip
+    until(lambda: path.exists() and "address" in json.loads(path.read_text() or "{}"))
+    return path
+
+
+@pytest.fixture
+def worker(processes, scheduler_file, tmp_path):
+    def begin(**options):
+        return processes(
+            "distributed.cli.dask_worker", "--scheduler-file", scheduler_file, "--host", "127.0.0.1",
+            "--nthreads", "1", "--no-dashboard", "--dashboard-address", "127.0.0.1:0",
+            "--local-directory", tmp_path / "scratch", **options,
+        )  # fmt: skip
+
+    return begin
+
+
+def until(true):
+    deadline = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+# ---- coming and going ----------------------------------------------------------------------------------
+
+
+def test_workers__come_and_go(tmp_path, write_spec, scheduler_file, worker, bytes_of, monkeypatch):
+    """None is there at first; the first one is killed in the middle, after another has come."""
+    path, commits = write_spec(SPEC), tmp_path / "out" / "commits"
+    run(path, tmp_path / "alone", workers=0, echo=silent)
+    lines, kept = [], []
+
+    def echo(line):
+        lines.append(line)
+        if "no workers yet" in line:
+            kept.append(worker())
+
+    def add(self, cells):
+        added(self, cells)
+        done = len(list(commits.glob("*.json")))
+        if done >= 2 and len(kept) == 1:
+            kept.append(worker())
+        if done >= 4 and kept[0].poll() is None:
+            end(kept[0])
+
+    added = Progress.add
+    monkeypatch.setattr(Progress, "add", add)
+    assert run(path, tmp_path / "out", scheduler=str(scheduler_file), echo=echo).complete
+    (said,) = [line for line in lines if "no workers yet" in line]
+    assert f"(from {scheduler_file}): no workers yet; waiting up to 00:10:00" in said
+    assert kept[0].poll() == -signal.SIGKILL
+    assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "alone")
+
+
+def test_workers__none(main, write_spec, scheduler_file, monkeypatch):
+    monkeypatch.setenv("MAGPEND_WAIT_FOR_WORKERS", "00:00:01")
+    code, _, errors = main("run", write_spec(SPEC), "--out", "out", "--scheduler", scheduler_file)
+    assert code == 4
+    assert "no workers yet; waiting up to 00:00:01" in errors
+    assert "no worker came within 00:00:01, so nothing was computed; start workers" in errors
+    assert "Traceback" not in errors
+    monkeypatch.setenv("MAGPEND_WAIT_FOR_WORKERS", "soon")
+    code, _, errors = main("run", write_spec(SPEC), "--out", "out", "--scheduler", scheduler_file)
+    assert "MAGPEND_WAIT_FOR_WORKERS = 'soon': must be hours, minutes and seconds" in errors
+
+
+# ---- other programs, other files -----------------------------------------------------------------------
+
+
+def refusal(where):
+    with pytest.raises(SchedulerError) as refused, connected(where, 1, silent):
+        pass
+    text = str(refused.value)
+    assert "\n" not in text
+    return text
+
+
+def test_workers__other_versions(tmp_path, environment, scheduler_file, worker):
+    """One has another numba, and one no magpend at all."""
+    (tmp_path / "other" / "numba-0.0.1.dist-info").mkdir(parents=True)
+    (tmp_path / "other" / "numba-0.0.1.dist-info" / "METADATA").write_text("Name: numba\nVersion: 0.0.1\n")
+    paths = os.pathsep.join([str(tmp_path / "other"), environment["PYTHONPATH"]])
+    first = worker(PYTHONPATH=paths)
+    where = Where(str(scheduler_file))
+    text = refusal(where)
+    here = probe.installation()["numba"]
+    assert "1 of 1 workers have other programs than this process: tcp://127.0.0.1:" in text
+    assert f"numba 0.0.1, here {here}. Install the same versions everywhere" in text
+    end(first)
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none" / "pipeline.py").touch()  # a module, so that nothing is found in it
+    worker(PYTHONPATH=str(tmp_path / "none"))
+    assert "has no magpend, or one of another version" in refusal(where)
+
+
+def test_late_worker__other_versions():
+    """One that comes later, when nobody asks it any more, refuses its tasks itself."""
+    task = probe.Fitting(lambda index: {"task": index})
+    assert task(3) == {"task": 3}
+    other = probe.Fitting(task.task, {**probe.installation(), "magpend's kernel": "another"})
+    with pytest.raises(probe.MisfitError, match=r"this worker has other programs .*magpend's kernel"):
+        other(3)
+
+
+def test_workers__other_files(tmp_path, scheduler_file, worker, processes):
+    """One sees another folder by the same name: an empty disk is mounted there, for it alone."""
+    out = tmp_path / "out"
+    out.mkdir()
+    before = ("unshare", "--mount", "--", "sh", "-c", f'mount -t tmpfs none {out} && exec "$@"', "sh")
+    able = shutil.which("unshare") and subprocess.run(
+        [*before, "true"], capture_output=True, check=False
+    )  # fmt: skip
+    if not able or able.returncode:
+        pytest.skip("file systems cannot be mounted for one process here (root is needed)")
+    worker(before=before)
+    text = refusal(Where(str(scheduler_file), directory=out))
+    assert f"1 of 1 workers cannot use {out}: tcp://127.0.0.1:" in text
+    assert "does not see it (No such file or directory). Workers write" in text
+    assert not list((out / "commits").iterdir())
+
+
+def test_sees(tmp_path, monkeypatch):
+    monkeypatch.setattr(probe, "_LATE_S", 0.3)
+    file = tmp_path / "file"
+    assert probe.sees(str(file), "token") == "does not see it (No such file or directory)"
+    file.write_text("another")
+    assert probe.sees(str(file), "token") == "sees another one by that name"
+    file.write_text("token")
+    assert probe.sees(str(file), "token") == ""
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert probe.sees(str(file), "token") == "may not write to it"
+
+
+# ---- the dashboard -------------------------------------------------------------------------------------
+
+
+def test_dashboard__on_loopback():
+    import urllib.request
+
+    lines = []
+    with connected(Where("local", dashboard=True), 1, lines.append):
+        (line,) = [line for line in lines if line.startswith("dashboard: ")]
+        address = line.removeprefix("dashboard: ")
+        assert address.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(address, timeout=30) as page:
+            assert "Dask" in page.read().decode()
+
+
+# ---- scripts of worker jobs ----------------------------------------------------------------------------
+
+CLUSTER = """
+[cluster]
+kind = "KIND"
+queue = "short"
+account = "p-42"
+cores = 4
+memory = "8 GB"
+walltime = "04:00:00"
+prologue = ["module load python/3.12"]
+directives = ["-pe smp 4"]
+interface = "ib0"
+scratch = "$TMPDIR"
+python = "/opt/python"
+"""
+HEADS = {
+    "slurm": ("#SBATCH -p short", "#SBATCH -A p-42", "#SBATCH --cpus-per-task=4", "#SBATCH --mem=8G",
+              "#SBATCH -t 04:00:00", "#SBATCH -pe smp 4"),
+    "pbs": ("#PBS -q short", "#PBS -A p-42", "#PBS -l select=1:ncpus=4:mem=7630MB",
+            "#PBS -l walltime=04:00:00", "#PBS -pe smp 4"),
+    "sge": ("#$ -q short", "#$ -P p-42", "#$ -l h_rt=04:00:00", "#$ -pe smp 4"),
+    "lsf": ("#BSUB -q short", '#BSUB -P "p-42"', "#BSUB -n 4", "#BSUB -M 8000", "#BSUB -W 04:00"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", HEADS)
+def test_worker_script(tmp_path, kind):
+    path = tmp_path / "cluster.toml"
+    path.write_text(CLUSTER.replace("KIND", kind))
+    script = worker_script(load_cluster(path), tmp_path / "logs")
+    assert script.startswith("#!")
+    for line in HEADS[kind]:
+        assert line in script.splitlines(), script
+    command = next(line for line in script.splitlines() if line.startswith("/opt/python"))
+    # one process for each core, which leave before the job ends
+    for words in (
+        "-m distributed.cli.dask_worker tls://SCHEDULER:PORT", "--nthreads 1", "--nworkers 4",
+        "--memory-limit 1.86GiB", "--local-directory $TMPDIR", "--interface ib0", "--lifetime 13200s",
+        "--lifetime-stagger 300s",
+    ):  # fmt: skip
+        assert words in command
+    assert script.index("export NUMBA_NUM_THREADS=1") < script.index("module load python/3.12")
+    assert script.index("module load python/3.12") < script.index("/opt/python")
+
+
+def test_settings__leave_the_rest_to_the_site(tmp_path):
+    path = tmp_path / "cluster.toml"
+    path.write_text('[cluster]\nkind = "lsf"\ncores = 1\nmemory = "1 GB"\nwalltime = "00:00:30"\n')
+    found = settings(load_cluster(path), tmp_path)
+    assert "queue" not in found
+    assert found["walltime"] == "00:01"

@@ -1,0 +1,354 @@
+"""Runs that grow: the bytes of a fresh run of the wider one, with the cells that are there."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+
+import pytest
+
+from pipeline import open_run
+from pipeline.compute import exponents, task, walking
+from pipeline.compute.execute import TaskFailedError
+from pipeline.runs import extend as extending
+from pipeline.runs.extend import extend
+from pipeline.runs.run import run
+from pipeline.spec.problems import SpecError
+from pipeline.store.errors import RefusedError
+from pipeline.store.run import Run
+
+BASE = """
+kind = "sweep"
+model = "duffing"
+title = "small"
+[axes]
+frequency_hz = { start = 0.10, stop = 0.14, num = 5 }
+[initial_conditions]
+kind = "grid"
+x = { start = -1.0, stop = 1.0, num = 5 }
+v = 0.1
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 3
+n_keep = 4
+[execution]
+trajectories_per_task = 7
+"""
+RANDOM = BASE.replace(
+    """kind = "grid"
+x = { start = -1.0, stop = 1.0, num = 5 }
+v = 0.1
+""",
+    """kind = "random"
+n = 6
+seed = 4
+x = [-1.0, 1.0]
+""",
+)
+
+
+def silent(line):
+    pass
+
+
+class Count:
+    """Cells that went through the kernel, those that warm it up aside, and those that products took."""
+
+    def __init__(self, monkeypatch):
+        self.cells, self.tangents = 0, 0
+        branches, tangents = walking.run_branches, exponents.lyapunov_exponents
+
+        def run_branches(parameters, frequency, states, **options):
+            self.cells += parameters.shape[0] * parameters.shape[1]
+            return branches(parameters, frequency, states, **options)
+
+        def lyapunov_exponents(parameters, *words, **options):
+            self.tangents += len(parameters)
+            return tangents(parameters, *words, **options)
+
+        monkeypatch.setattr(walking, "run_branches", run_branches)
+        monkeypatch.setattr(exponents, "lyapunov_exponents", lyapunov_exponents)
+        monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
+
+
+@pytest.fixture
+def count(monkeypatch):
+    return Count(monkeypatch)
+
+
+@pytest.fixture
+def grown(write_spec, tmp_path, bytes_of, count):
+    """Run one text, widen it to another, and hold that against a fresh run; returns the cells integrated."""
+
+    def grow(old, new, **more):
+        run(write_spec(old, "old.toml"), tmp_path / "old", workers=0, echo=silent)
+        before = bytes_of(tmp_path / "old")
+        path = write_spec(new, "new.toml")
+        run(path, tmp_path / "fresh", workers=0, echo=silent)
+        count.cells = count.tangents = 0
+        found = extend(tmp_path / "old", path, tmp_path / "new", workers=0, echo=silent, **more)
+        assert found.complete
+        assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")
+        assert bytes_of(tmp_path / "old") == before
+        return count.cells
+
+    return grow
+
+
+WIDER = {
+    "a finer axis": (BASE, BASE.replace("num = 5 }\n[init", "num = 9 }\n[init"), 20),
+    "a longer axis": (BASE, BASE.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7"), 10),
+    "a finer and longer grid": (
+        BASE,
+        BASE.replace(
+            "x = { start = -1.0, stop = 1.0, num = 5 }", "x = { start = -1.0, stop = 1.5, num = 11 }"
+        ),
+        30,
+    ),
+    "a grid of another state": (BASE, BASE.replace("v = 0.1", "v = { values = [0.0, 0.1] }"), 25),
+    "a further parameter": (
+        BASE.replace("[axes]", "[parameters]\noverrides = { amplitude = 0.3 }\n[axes]"),
+        BASE.replace("[axes]", "[axes]\namplitude = { values = [0.2, 0.3] }"),
+        25,
+    ),
+    "more samples": (RANDOM, RANDOM.replace("n = 6", "n = 10"), 20),
+    "a list of some of the grid": (
+        BASE,
+        BASE.replace(
+            'kind = "grid"\nx = { start = -1.0, stop = 1.0, num = 5 }\nv = 0.1',
+            'kind = "list"\npoints = [[0.5, 0.1], [0.25, 0.1], [-1.0, 0.1], [0.5, 0.1]]',
+        ),
+        5,
+    ),
+    "other tasks": (BASE, BASE.replace("task = 7", "task = 4"), 0),
+    "less": (BASE, BASE.replace("stop = 0.14, num = 5", "stop = 0.12, num = 3"), 0),
+}
+
+
+@pytest.mark.parametrize("what", WIDER)
+def test_extend__integrates_what_is_new_alone(grown, what):
+    old, new, expected = WIDER[what]
+    assert grown(old, new) == expected
+
+
+WALK = (
+    BASE.replace('"sweep"', '"continuation"')
+    .replace("[integration]", '[continuation]\ndirection = "both"\n[integration]')
+    .replace("task = 7", "task = 5\npoints_per_task = 2")
+)
+WALKS = {
+    "a longer path": (WALK, WALK.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7"), 10 + 35),
+    "a longer path the other way": (
+        WALK,
+        WALK.replace("start = 0.10, stop = 0.14, num = 5", "start = 0.08, stop = 0.14, num = 7"),
+        10 + 35,
+    ),
+    "more seeds": (WALK, WALK.replace("stop = 1.0, num = 5", "stop = 1.5, num = 6"), 10),
+    "the other direction": (WALK.replace('"both"', '"down"'), WALK, 25),
+    "a further parameter": (
+        WALK.replace("[axes]", "[parameters]\noverrides = { amplitude = 0.3 }\n[axes]"),
+        WALK.replace("[axes]", "[axes]\namplitude = { values = [0.2, 0.3] }"),
+        50,
+    ),
+    "other tasks": (WALK, WALK.replace("points_per_task = 2", "points_per_task = 3"), 0),
+}
+
+
+@pytest.mark.parametrize("what", WALKS)
+def test_walk__goes_on_where_it_ended(grown, what):
+    old, new, expected = WALKS[what]
+    assert grown(old, new) == expected
+
+
+def test_walk__new_products(grown, count):
+    lyapunov = "[products]\nlyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }\n[execution]"
+    new = WALK.replace("[execution]", lyapunov).replace("stop = 0.14, num = 5", "stop = 0.15, num = 6")
+    assert grown(WALK.replace('"both"', '"up"'), new.replace('"both"', '"up"')) == 5
+    assert count.tangents == 30
+
+
+def test_extend__new_products_go_on_from_the_sections(grown, count):
+    lyapunov = "[products]\nlyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }\n[execution]"
+    assert grown(BASE, BASE.replace("[execution]", lyapunov)) == 0
+    assert count.tangents == 25
+
+
+def test_extend__same_products_are_taken(grown, count):
+    lyapunov = "[products]\nlyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }\n[execution]"
+    old = BASE.replace("[execution]", lyapunov)
+    assert grown(old, old.replace("stop = 0.14, num = 5", "stop = 0.15, num = 6")) == 5
+    assert count.tangents == 5
+
+
+def test_extend__damaged_cells_are_integrated(grown, tmp_path, write_spec, bytes_of, count):
+    path = write_spec(BASE)
+    run(path, tmp_path / "old", workers=0, echo=silent)
+    chunk = next((tmp_path / "old" / "cube.zarr" / "section").glob("c.1.*"))
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
+    count.cells = 0
+    extend(tmp_path / "old", path, tmp_path / "new", workers=0, echo=silent)
+    assert count.cells == 5
+    run(path, tmp_path / "fresh", workers=0, echo=silent)
+    assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")
+
+
+def test_extend__two_halves(tmp_path, write_spec, bytes_of, count):
+    """What merging is for: two halves that were computed apart."""
+    low = write_spec(BASE.replace("stop = 0.14, num = 5", "stop = 0.12, num = 3"), "low.toml")
+    high = write_spec(
+        BASE.replace("start = 0.10, stop = 0.14, num = 5", "values = [0.12, 0.13, 0.14]"), "high.toml"
+    )
+    run(low, tmp_path / "low", workers=0, echo=silent)
+    run(high, tmp_path / "high", workers=0, echo=silent)
+    whole = write_spec(BASE, "whole.toml")
+    count.cells = 0
+    extend(tmp_path / "low", whole, tmp_path / "new", also=[tmp_path / "high"], workers=0, echo=silent)
+    assert count.cells == 0
+    run(whole, tmp_path / "fresh", workers=0, echo=silent)
+    assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")
+    record = json.loads((tmp_path / "new" / "extended.json").read_text())
+    assert [s["cells"] for s in record["sources"]] == [15, 10]
+    assert record["reused"] == 25
+
+
+def test_extend__says_why_nothing_is_taken(tmp_path, write_spec):
+    run(write_spec(BASE), tmp_path / "old", workers=0, echo=silent)
+    other = write_spec(BASE.replace("rtol = 1e-6", "rtol = 1e-7"), "other.toml")
+    with pytest.raises(RefusedError, match=r"integration\.rtol: 1e-06 in the directory, 1e-07 now"):
+        extend(tmp_path / "old", other, tmp_path / "new", echo=silent)
+    off = write_spec(BASE.replace("v = 0.1", "v = 0.2"), "off.toml")
+    with pytest.raises(RefusedError, match="no initial state is the same"):
+        extend(tmp_path / "old", off, tmp_path / "new", echo=silent)
+    with pytest.raises(SpecError, match="nothing to change"):
+        extend(tmp_path / "old", None, tmp_path / "new", echo=silent)
+    assert not (tmp_path / "new").exists()
+
+
+LONGER = BASE.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7")
+
+
+@pytest.fixture
+def place(tmp_path, write_spec, count):
+    """A finished run, a wider specification, and a fresh run of that."""
+    run(write_spec(BASE, "old.toml"), tmp_path / "runs" / "mine", workers=0, echo=silent)
+    wide = write_spec(LONGER, "new.toml")
+    run(wide, tmp_path / "fresh", workers=0, echo=silent)
+    count.cells = 0
+    return tmp_path / "runs" / "mine", wide, tmp_path / "fresh"
+
+
+def test_in_place__the_old_run_stays_beside(place, bytes_of, count):
+    mine, wide, fresh = place
+    before = bytes_of(mine)
+    assert extend(mine, wide, workers=0, echo=silent).directory == mine
+    assert bytes_of(mine) == bytes_of(fresh)
+    assert bytes_of(mine.with_name("mine.before")) == before
+    assert sorted(p.name for p in mine.parent.iterdir()) == ["mine", "mine.before"]
+    lines = []
+    extend(mine, wide, workers=0, echo=lines.append)
+    assert lines == [f"{mine} holds all this already; nothing to do."]
+    assert count.cells == 10
+
+
+@pytest.mark.parametrize("crash", ["cells", "first rename", "second rename"])
+def test_in_place__the_same_command_goes_on(place, bytes_of, monkeypatch, count, crash):
+    mine, wide, fresh = place
+    before = bytes_of(mine)
+    calls = []
+
+    def fail_at(n, original):
+        def call(*words, **options):
+            calls.append(1)
+            if len(calls) == n:
+                raise OSError("the power went")
+            return original(*words, **options)
+
+        return call
+
+    with monkeypatch.context() as broken:
+        if crash == "cells":
+            broken.setattr(task, "write_task", fail_at(4, task.write_task))
+        else:
+            n = 1 if crash == "first rename" else 2
+            broken.setattr(extending, "sync_folder", fail_at(n, extending.sync_folder))
+        with pytest.raises((OSError, TaskFailedError), match="the power went"):
+            extend(mine, wide, workers=0, echo=silent)
+    assert bytes_of(mine if crash == "cells" else mine.with_name("mine.before")) == before
+    extend(mine, wide, workers=0, echo=silent)
+    assert bytes_of(mine) == bytes_of(fresh)
+    assert bytes_of(mine.with_name("mine.before")) == before
+    assert not mine.with_name("mine.extending").exists()
+    if crash != "cells":
+        assert count.cells == 10
+
+
+def test_in_place__nothing_is_lost(place, write_spec):
+    mine, *_ = place
+    moved = write_spec(BASE.replace("start = 0.10, stop = 0.14", "start = 0.12, stop = 0.16"), "moved.toml")
+    with pytest.raises(RefusedError, match="10 of its cells would not be in the wider run"):
+        extend(mine, moved, echo=silent)
+    assert [p.name for p in mine.parent.iterdir()] == ["mine"]
+
+
+def test_incomplete__what_is_committed_is_taken(place, tmp_path, monkeypatch, bytes_of, count):
+    mine, wide, fresh = place
+    for record in sorted((mine / "commits").iterdir())[:2]:
+        record.unlink()
+    lines = []
+    extend(mine, wide, tmp_path / "new", workers=0, echo=lines.append)
+    assert f"{mine}: is not complete; 15 of 25 cells are committed, and these alone are taken" in lines
+    assert f"15 of 35 cells are taken from {mine}" in lines
+    assert count.cells == 20
+    assert bytes_of(tmp_path / "new") == bytes_of(fresh)
+
+
+def test_kill__extended_run_has_the_same_bytes(place, start, tmp_path, bytes_of):
+    mine, wide, fresh = place
+    process = start("extend", mine, wide, "--out", "new", "--workers", 2)
+    while process.poll() is None and not list((tmp_path / "new" / "commits").glob("0*.json")):
+        time.sleep(0.002)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    extend(mine, wide, tmp_path / "new", workers=0, echo=silent)
+    assert bytes_of(tmp_path / "new") == bytes_of(fresh)
+
+
+def test_command__says_what_is_taken(place, main, bytes_of, tmp_path):
+    mine, _, fresh = place
+    words = ("extend", mine, "--axis", "frequency=0.1:0.16:7")
+    code, out, err = main(*words, "--dry-run")
+    assert code == 0, err
+    assert f"25 of 35 cells are taken from {mine}\n10 cells are left to integrate\n" in out
+    assert "time: about" in out
+    assert [p.name for p in mine.parent.iterdir()] == ["mine"]
+    code, out, err = main(*words, "--workers", 0)
+    assert code == 0, err
+    assert f"the run as it was lies in {mine}.before" in err
+    assert open_run(mine).section.equals(open_run(fresh).section)
+    # the text that was written is a specification like any other
+    text = tmp_path / "again.toml"
+    text.write_text(Run.open(mine).info.spec_text)
+    run(text, tmp_path / "again", workers=0, echo=silent)
+    assert bytes_of(tmp_path / "again") == bytes_of(mine)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--axis", "frequency=1:2"], "must be NAME=LOW:HIGH:NUM"),
+        (["--axis", "q=1:2:3"], "unknown axis"),
+        (["--product", "lyapunov=3"], "must be NAME or NAME="),
+        (["--product", "liapunov"], "did you mean lyapunov"),
+        (["--starts", "9"], "not random samples; widen a state's range"),
+        ([], "nothing to change"),
+    ],
+)
+def test_command__refuses(place, main, words, message):
+    code, _, err = main("extend", place[0], *words)
+    assert code == 2
+    assert message in err

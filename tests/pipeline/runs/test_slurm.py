@@ -1,0 +1,144 @@
+"""A run sent to a real SLURM: followed, cancelled mid-way, gone on with, and the same bytes as without it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.runs.run import run
+from pipeline.runs.status import state
+
+SPEC = """
+kind = "sweep"
+title = "small Duffing sweep"
+model = "duffing"
+[axes]
+frequency_hz = { start = 0.15, stop = 0.25, num = 12 }
+[initial_conditions]
+kind = "grid"
+x = { start = -1, stop = 1, num = 8 }
+v = { start = -1, stop = 1, num = 8 }
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 2000
+n_keep = 4
+[execution]
+trajectories_per_task = 64
+"""
+ONE_JOB = """
+[cluster]
+kind = "slurm"
+queue = "short"
+cores = 2
+memory = "1 GB"
+walltime = "00:10:00"
+"""
+SEVERAL_JOBS = """
+[cluster]
+kind = "slurm"
+cores = 1
+memory = "1 GB"
+walltime = "00:10:00"
+min_jobs = 2
+max_jobs = 2
+coordinator_memory = "1 GB"
+interface = "lo"
+prologue = ["export PROLOGUE=read"]
+directives = ["--nice=1"]
+"""
+PATIENCE_S = 120.0
+
+
+def load(name):
+    """A module of this folder, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+slurm = load("slurm")
+pytestmark = [pytest.mark.skipif(bool(slurm.why_not()), reason=slurm.why_not() or "SLURM can be had")]
+
+
+@pytest.fixture
+def variables(tmp_path, environment):
+    """A SLURM that runs, and the variables of a shell in which it can be used."""
+    folder = tmp_path / "slurm"
+    folder.mkdir()
+    with slurm.running(folder) as found:
+        yield {**environment, **found, "MAGPEND_CLUSTER": ""}
+
+
+@pytest.fixture
+def shell(tmp_path, variables):
+    def call(*words, code=0):
+        done = subprocess.run(
+            [str(w) for w in words],
+            cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+        assert done.returncode == code, done.stdout + done.stderr
+        return done.stdout if code == 0 else done.stderr
+
+    return call
+
+
+@pytest.fixture
+def magpend(shell):
+    return lambda *words, code=0: shell(sys.executable, "-m", "pipeline.cli.main", *words, code=code)
+
+
+def wait(for_what, logs):
+    deadline = time.monotonic() + PATIENCE_S
+    while not for_what():
+        said = "\n".join(f"{file}:\n{file.read_text()}" for file in logs.rglob("*.out"))
+        assert time.monotonic() < deadline, said
+        time.sleep(0.1)
+
+
+def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
+    for name, text in (("spec", SPEC), ("one", ONE_JOB), ("several", SEVERAL_JOBS)):
+        (tmp_path / f"{name}.toml").write_text(text)
+    run(tmp_path / "spec.toml", tmp_path / "laptop", workers=0, echo=lambda line: None)
+    out, logs = tmp_path / "out", tmp_path / "out.jobs"
+    commits = out / "commits"
+
+    # one job holds all; it is cancelled when some tasks are committed and some are not
+    said = magpend("submit", "spec.toml", "--cluster", "one.toml", "--out", "out")
+    job = json.loads((logs / "job.json").read_text())["job"]
+    assert f"sent: job {job}" in said
+    assert f"magpend status out; squeue -j {job}; tail -F {logs}/coordinator*" in said
+    assert job in shell("squeue", "-h", "-o", "%i")
+    refused = magpend("submit", "spec.toml", "--cluster", "one.toml", "--out", "out", code=3)
+    assert f"job {job} of this run is there already" in refused
+    wait(lambda: commits.is_dir() and len(list(commits.glob("*.json"))) >= 2, logs)
+    shell(*f"scancel {job}".split())
+    wait(lambda: not shell("squeue", "-h"), logs)
+    assert "incomplete" in magpend("status", "out")
+    assert "Stopped. What is committed" in (logs / f"coordinator-{job}.out").read_text()
+    assert 2 <= len(state(out).done) < 12
+
+    # gone on with by a coordinator in a job, with workers in jobs of their own
+    said = magpend("submit", "spec.toml", "--cluster", "several.toml", "--out", "out")
+    job = json.loads((logs / "job.json").read_text())["job"]
+    wait(lambda: not shell("squeue", "-h", "-j", job), logs)
+    told = (logs / f"coordinator-{job}.out").read_text()
+    assert "Traceback" not in told
+    assert "cells done before" in told
+    assert "workers come in slurm jobs" in told
+    assert len(list(logs.glob("magpend-worker-*.out"))) == 2
+    assert bytes_of(out) == bytes_of(tmp_path / "laptop")
+    assert "complete; nothing to send" in magpend(
+        "submit", "spec.toml", "--cluster", "one.toml", "--out", "out"
+    )
+
+    # nothing is left: no job, no keys
+    wait(lambda: not shell("squeue", "-h"), logs)
+    assert not list(logs.glob(".keys-*"))
