@@ -27,6 +27,9 @@ WINDOW = 3
 TICK_S = 1.0
 """The workers are looked at so often [s]."""
 
+MOST_LOOKED_AT = 100
+"""Workers that are looked at in a second: more of them are looked at less often."""
+
 ANSWER_S = 30.0
 """A scheduler that does not answer for so long is taken for gone [s]."""
 
@@ -260,7 +263,7 @@ class Watch:
 
     def due(self) -> bool:
         """Whether it is time to look again."""
-        return self.now - self._looked >= TICK_S
+        return self.now - self._looked >= max(TICK_S, len(self._heard) / MOST_LOOKED_AT)
 
     def look(self, workers: dict[str, Any]) -> list[str]:
         """Take what the scheduler knows of its workers, and return those that have fallen silent."""

@@ -84,7 +84,7 @@ def first_signal() -> int | None:
 def leave(number: int) -> NoReturn:
     """End this process now, and what it started."""
     local = sys.modules.get("pipeline.compute.local")
-    if hasattr(local, "abandon"):
+    if local is not None and hasattr(local, "abandon"):
         local.abandon()
     shown = "\x1b[?25h" if sys.stderr.isatty() else ""
     how = "stopped" if _listener.first is None else "stopped at once; what is committed stays"
