@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.layout.cells import CellMap
+from pipeline.layout.limits import MOST_TASKS
 from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.registry import CELL_PRODUCTS
@@ -261,6 +262,8 @@ def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: flo
     per_cell = _bytes_per_cell(spec)
     limit = CHUNK_BYTES if n_points == 1 else TASK_BYTES
     n = min(wanted_seconds / (seconds_per_cell * n_points), limit / (per_cell * n_points))
+    # blocks are filled dim by dim, which can take twice as many
+    n = max(n, 2 * n_cells / n_points / MOST_TASKS)
     return max(1, round(n / LANES)) * LANES
 
 
@@ -278,7 +281,9 @@ def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float
     largest = max(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
     n_seeds = cells.shape[-1] // len(directions)
     if len(directions) > 1:
+        # fewer than such a group would put branches of both directions into one task
         n_seeds = _group(n_seeds, wanted, TASK_BYTES // _bytes_per_cell(spec))
+        wanted = max(wanted, n_seeds)
     block = list(_block((*cells.shape[:-1], n_seeds), cells.path, wanted))
     n_branches = math.prod(block) // n_points
     points = spec.execution.points_per_task

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from magpend_core.models.imported import origin
 from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
+from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.products.reporting import report
 from pipeline.runs.mending import sound_commits
@@ -31,7 +32,7 @@ from pipeline.store.setup import check, establish
 if TYPE_CHECKING:
     from pipeline.compute.clients import Where
 
-__all__ = ["InterruptedRunError", "identity_here", "run"]
+__all__ = ["InterruptedRunError", "carry_out", "identity_here", "run"]
 
 Echo = Callable[[str], None]
 Sources = Sequence[tuple[str, str]]
@@ -94,7 +95,7 @@ def run(
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     files = open_files(out if out is not None else default_directory(path, smoke))
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.local)
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)
     carry_out(parsed, path.read_text("utf-8"), files, workers=workers, where=where, echo=echo)
@@ -133,16 +134,24 @@ def carry_out(
     """
     plan = make_plan(spec)
     identity = identity_here(spec, plan)
-    check(files, identity)
+    if check(files, identity) is None:
+        check_space(plan, files.local)
     with stoppable(files.name), files.lock():
         info = establish(files, spec, plan, identity, text, echo)
         _complete(info, spec, plan, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """What makes a run this one, with the numerical core that is installed here."""
+    """What makes a run this one, with the numerical core that is installed here.
+
+    Raises
+    ------
+    SpecError
+        If it is too large to be laid out, see `limits.check_plan`.
+    """
     from magpend_core import kernel_version
 
+    check_plan(plan)
     return identity_of(spec, plan, kernel_version())
 
 
@@ -165,6 +174,7 @@ def _complete(
         echo(f"{info.name} is complete; nothing to do.")
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
+    check_space(plan, info.files.local, plan.n_cells - before)
     echo(
         f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
     )

@@ -83,8 +83,8 @@ def first_signal() -> int | None:
 
 def leave(number: int) -> NoReturn:
     """End this process now, and what it started."""
-    local = sys.modules.get("pipeline.compute.local")
-    if local is not None and hasattr(local, "abandon"):
+    local: Any = sys.modules.get("pipeline.compute.local")
+    if hasattr(local, "abandon"):  # not while it is being imported
         local.abandon()
     shown = "\x1b[?25h" if sys.stderr.isatty() else ""
     how = "stopped" if _listener.first is None else "stopped at once; what is committed stays"

@@ -62,6 +62,14 @@ class Range(Table):
                 raise ValueError(f"step = {self.step!r} makes more than {MAX_POINTS} points; make it larger.")
         return self
 
+    @property
+    def n(self) -> int:
+        """Number of values, without making them."""
+        if self.values is not None or self.num is not None:
+            return self.num or len(self.values or ())
+        start, stop, step = (Fraction(repr(x)) for x in (self.start, self.stop, self.step))
+        return (stop - start) // step + 1
+
     def array(self) -> np.ndarray:
         """Return the values: the float64 nearest to each decimal number, as one would write it by hand."""
         if self.values is not None:

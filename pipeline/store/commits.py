@@ -20,7 +20,7 @@ import numpy as np
 import zarr
 
 from pipeline.layout.plan import Plan
-from pipeline.store.files import COMMITS, CUBE, TIMINGS, Files, LinkError, entry_of
+from pipeline.store.files import COMMITS, CUBE, TIMINGS, Files, LinkError, entries_of
 from pipeline.store.keys import Owners, chunk_keys
 from pipeline.store.records import (
     BLOCK,
@@ -75,7 +75,7 @@ def write_task(
         "digest": info.digest,
         "task": index,
         "status": dict(counts),
-        "objects": {key: entry_of(cube.read(key)) for key in objects},
+        "objects": entries_of(cube, objects),
     }
     if not is_packed(info, index):  # else somebody has committed these very bytes before
         info.files.write_once(marker_key(index), record_text(record).encode())
@@ -92,7 +92,7 @@ def is_packed(info: RunInfo, index: int) -> bool:
 
 def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
     """Write one variable's chunks of a task and return their keys."""
-    array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+")
+    array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+", zarr_format=3)
     # The setting is not stored: without it a block equal to the fill value would leave no file.
     array = array.with_config({"write_empty_chunks": True})
     block = plan.task(index)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import stat
@@ -17,7 +18,8 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from pipeline.store.errors import LockedError, RefusedError, UnreadableError
-from pipeline.store.files import LOCK, TEMPORARY, LinkError
+from pipeline.store.files import HOLDER, LOCK, TEMPORARY, LinkError
+from pipeline.store.lease import holder, in_words
 
 
 @dataclass(frozen=True)
@@ -284,14 +286,33 @@ def writer_lock(directory: Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
+        said = b""
+        with contextlib.suppress(OSError):
+            said = (directory / HOLDER).read_bytes()
         raise LockedError(
-            f"{directory}: another magpend run is writing here. Wait for it or stop it, then run again."
+            f"{directory}: another magpend run is writing here{in_words(said)}. Wait for it or stop it, then "
+            "run again."
         ) from None
     except (NotImplementedError, OSError) as error:
         warnings.warn(f"{directory}: no file lock here ({error}); start one run at a time.", stacklevel=3)
         yield
         return
     try:
-        yield
+        with _named(directory / HOLDER):
+            yield
     finally:
         lock.release()
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Say beside a lock who holds it, for those who ask in vain; a process that is killed leaves it there."""
+    content = json.dumps(holder()).encode()
+    with contextlib.suppress(OSError):
+        path.write_bytes(content)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            if path.read_bytes() == content:  # the folder may have been renamed meanwhile
+                path.unlink()

@@ -110,9 +110,9 @@ def until(true):
 
 def test_workers__come_and_go(tmp_path, write_spec, scheduler_file, worker, bytes_of, monkeypatch):
     """None is there at first; the first one is killed in the middle, after another has come."""
-    path, commits = write_spec(SPEC), tmp_path / "out" / "commits"
+    path = write_spec(SPEC)
     run(path, tmp_path / "alone", workers=0, echo=silent)
-    lines, kept = [], []
+    lines, kept, done = [], [], []
 
     def echo(line):
         lines.append(line)
@@ -121,10 +121,10 @@ def test_workers__come_and_go(tmp_path, write_spec, scheduler_file, worker, byte
 
     def add(self, cells):
         added(self, cells)
-        done = len(list(commits.glob("*.json")))
-        if done >= 2 and len(kept) == 1:
+        done.append(cells)
+        if len(done) >= 2 and len(kept) == 1:
             kept.append(worker())
-        if done >= 4 and kept[0].poll() is None:
+        if len(done) >= 4 and kept[0].poll() is None:
             end(kept[0])
 
     added = Progress.add
@@ -186,33 +186,41 @@ def test_late_worker__other_versions():
         other(3)
 
 
-def test_workers__other_files(tmp_path, scheduler_file, worker, processes):
-    """One sees another folder by the same name: an empty disk is mounted there, for it alone."""
+@pytest.mark.parametrize(
+    ("mount", "words"),
+    [
+        ("mount -t tmpfs none {}", "does not see it (No such file or directory). Workers write"),
+        (
+            "mount --bind {0} {0} && mount -o remount,ro,bind {0}",
+            "cannot write to it (Read-only file system)",
+        ),
+    ],
+)
+def test_workers__other_files(tmp_path, scheduler_file, worker, mount, words, monkeypatch):
+    """One sees an empty folder by the same name, or may only read: a disk is mounted there, for it alone."""
     out = tmp_path / "out"
     out.mkdir()
-    before = ("unshare", "--mount", "--", "sh", "-c", f'mount -t tmpfs none {out} && exec "$@"', "sh")
-    able = shutil.which("unshare") and subprocess.run(
-        [*before, "true"], capture_output=True, check=False
-    )  # fmt: skip
+    before = ("unshare", "--mount", "--", "sh", "-c", f'{mount.format(out)} && exec "$@"', "sh")
+    able = shutil.which("unshare") and subprocess.run([*before, "true"], capture_output=True, check=False)
     if not able or able.returncode:
         pytest.skip("file systems cannot be mounted for one process here (root is needed)")
     worker(before=before)
-    text = refusal(Where(str(scheduler_file), directory=out))
+    text = refusal(Where(str(scheduler_file), place=str(out)))
     assert f"1 of 1 workers cannot use {out}: tcp://127.0.0.1:" in text
-    assert "does not see it (No such file or directory). Workers write" in text
+    assert words in text
     assert not list((out / "commits").iterdir())
 
 
 def test_sees(tmp_path, monkeypatch):
     monkeypatch.setattr(probe, "_LATE_S", 0.3)
-    file = tmp_path / "file"
-    assert probe.sees(str(file), "token") == "does not see it (No such file or directory)"
-    file.write_text("another")
-    assert probe.sees(str(file), "token") == "sees another one by that name"
-    file.write_text("token")
-    assert probe.sees(str(file), "token") == ""
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
-    assert probe.sees(str(file), "token") == "may not write to it"
+    place, key = str(tmp_path), "commits/.probe.tmp"
+    assert probe.sees(place, key, "token") == "does not see it (No such file or directory)"
+    (tmp_path / "commits").mkdir()
+    (tmp_path / key).write_text("another")
+    assert probe.sees(place, key, "token") == "sees another one by that name"
+    (tmp_path / key).write_text("token")
+    assert probe.sees(place, key, "token") == ""
+    assert [path.name for path in (tmp_path / "commits").iterdir()] == [".probe.tmp"]
 
 
 # ---- the dashboard -------------------------------------------------------------------------------------

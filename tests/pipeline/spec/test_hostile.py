@@ -21,9 +21,9 @@ title = "small"
 model = "duffing"
 [parameters]
 frequency_hz = 0.2
-overrides = { d = 0.1 }
+overrides = { damping = 0.1 }
 [axes]
-B = { start = 0.2, stop = 0.3, num = 3 }
+amplitude = { start = 0.2, stop = 0.3, num = 3 }
 [initial_conditions]
 kind = "grid"
 x = { start = -1.0, stop = 1.0, num = 4 }
@@ -51,7 +51,7 @@ ODD = {
     "5000 hexadecimal digits": BASE.replace("n_keep = 3", "n_keep = 0x" + "F" * 5000),
     "5000 digits in a list": BASE.replace("v = 0.0", f"v = {{ values = [{HUGE}] }}"),
     "5000 digits of a float": BASE.replace("v = 0.0", f"v = {HUGE}.0"),
-    "digits of an overridden value": BASE.replace("d = 0.1", "d = 0x" + "F" * 300),
+    "digits of an overridden value": BASE.replace("damping = 0.1", "damping = 0x" + "F" * 300),
     "deep lists": "kind = " + "[" * DEEP + "]" * DEEP,
     "deep tables": "kind = " + "{a = " * DEEP + "1" + "}" * DEEP,
     "deep key": "a." * DEEP + "b = 1",
@@ -194,6 +194,10 @@ def spelled(value):
     if isinstance(value, list):
         return "[" + ", ".join(map(spelled, value)) + "]"
     return hex(value) if isinstance(value, int) and abs(value) > 10**300 else toml_value(value)
+
+
+def test_outcome__what_is_mutated_can_be_planned(write_spec):
+    assert outcome(write_spec(BASE))
 
 
 def outcome(path):

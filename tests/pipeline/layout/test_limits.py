@@ -1,0 +1,188 @@
+"""What is too large is refused at once, in words, before anything is created."""
+
+import shutil
+import subprocess
+import sys
+import time
+from collections import namedtuple
+
+import pytest
+
+from pipeline.layout import limits
+from pipeline.layout.limits import MOST_CHUNK_BYTES, MOST_TASKS, check_plan, check_space, in_words
+from pipeline.layout.plan import make_plan
+from pipeline.runs.preview import describe_plan
+from pipeline.runs.run import run
+from pipeline.spec.parsing import parse_spec
+from pipeline.spec.problems import SpecError
+from pipeline.store.commits import read_commits
+from pipeline.store.runfile import read_run
+
+SPEC = """
+kind = "sweep"
+model = "duffing"
+[parameters]
+frequency_hz = 0.2
+[axes]
+amplitude = {{ start = 0.2, stop = 0.3, num = {points} }}
+[initial_conditions]
+kind = "grid"
+x = {{ start = -1.0, stop = 1.0, num = {starts} }}
+v = {{ start = -1.0, stop = 1.0, num = {starts} }}
+[integration]
+n_transient = 2
+n_keep = {keep}
+[execution]
+{execution}
+"""
+
+
+def text_of(points=3, starts=2, keep=3, execution=""):
+    return SPEC.format(points=points, starts=starts, keep=keep, execution=execution)
+
+
+def plan_of(**sizes):
+    import tomllib
+
+    return make_plan(parse_spec(tomllib.loads(text_of(**sizes))))
+
+
+def refused(call):
+    with pytest.raises(SpecError) as caught:
+        call()
+    return str(caught.value)
+
+
+@pytest.fixture
+def refuses(write_spec, tmp_path):
+    """Give a specification to a run and a dry run, which both refuse it within seconds; returns the words."""
+
+    def call(**sizes):
+        path = write_spec(text_of(**sizes))
+        started = time.process_time()
+        words = {
+            refused(lambda: run(path, tmp_path / "run", workers=0)),
+            refused(lambda: list(describe_plan(path, tmp_path / "run"))),
+        }
+        assert time.process_time() - started < 10
+        assert [p.name for p in tmp_path.iterdir()] == [path.name]
+        (said,) = words
+        return said
+
+    return call
+
+
+def test_run__more_tasks_than_anyone_can_follow(refuses):
+    said = refuses(points=1_000_000, starts=40, execution="trajectories_per_task = 16")
+    assert "120000000 tasks" in said
+    assert f"{MOST_TASKS} are the most" in said
+    assert "execution.trajectories_per_task to 38400 or more" in said
+
+
+def test_make_plan__the_remedy_is_one():
+    check_plan(plan_of(points=1_000_000, starts=40, execution="trajectories_per_task = 38400"))
+
+
+@pytest.mark.parametrize(("points", "starts"), [(1_000_000, 40), (10_000_000, 3), (70, 3000), (2, 10_000)])
+def test_make_plan__many_cells_are_cut_into_as_many_tasks_as_can_be_followed(points, starts):
+    plan = plan_of(points=points, starts=starts, keep=60)
+    assert plan.n_cells == points * starts**2
+    assert plan.n_tasks <= MOST_TASKS
+    check_plan(plan)
+
+
+def test_run__sections_that_cannot_be_compressed_in_one_piece(refuses):
+    said = refuses(starts=40, keep=1_000_000, execution="trajectories_per_task = 1600")
+    assert "section: 1600 cells of a task take 25.6 GB in one piece" in said
+    assert "2.15 GB are the most" in said
+    assert "trajectories_per_task to 134 or less" in said
+
+
+def test_make_plan__the_largest_pieces_can_be_written():
+    """The bound is that of the compressor."""
+    from numcodecs import blosc
+
+    check_plan(plan_of(starts=40, keep=1_000_000, execution="trajectories_per_task = 120"))
+    assert MOST_CHUNK_BYTES == blosc.MAX_BUFFERSIZE
+
+
+def test_run__no_room(refuses):
+    said = refuses(points=100_000, starts=100, keep=1000)
+    assert "needs up to 16 TB (its cells before compression), and there are" in said
+    assert "MAGPEND_SPACE=0" in said
+
+
+def test_parse_spec__cells_that_nobody_can_count():
+    said = refused(lambda: plan_of(points=10_000_000, starts=10_000_000))
+    assert "axes.amplitude x initial_conditions.x x initial_conditions.v: 1e+21 cells" in said
+
+
+def test_check_plan__branches_whose_starts_fill_the_memory():
+    data = {
+        "kind": "continuation",
+        "model": "duffing",
+        "axes": {"frequency_hz": {"values": [0.1, 0.2]}},
+        "initial_conditions": {
+            "kind": "grid", **{s: {"start": 0.0, "stop": 1.0, "num": 100_000} for s in ("x", "v")}
+        },
+    }  # fmt: skip
+    assert "10000000 are the most" in refused(lambda: check_plan(make_plan(parse_spec(data))))
+
+
+Usage = namedtuple("Usage", "total used free")
+
+
+def test_check_space__counts_what_is_missing(monkeypatch, tmp_path):
+    plan = plan_of(points=1000, starts=10)
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: Usage(0, 0, plan.n_bytes // 2))
+    with pytest.raises(SpecError, match="needs up to"):
+        check_space(plan, tmp_path / "not" / "there")
+    check_space(plan, tmp_path, plan.n_cells // 4)
+    with pytest.raises(SpecError, match="needs up to"):
+        check_space(plan, tmp_path, plan.n_cells)
+    check_space(plan, None)
+    monkeypatch.setenv("MAGPEND_SPACE", "0")
+    check_space(plan, tmp_path)
+
+
+def test_check_space__files_count_too(monkeypatch, tmp_path):
+    plan = plan_of(points=1000, execution="trajectories_per_task = 1")
+    monkeypatch.setattr(limits, "_free_files", lambda place: 20_000)
+    with pytest.raises(SpecError, match=r"\d+ files, and there is room for 20000"):
+        check_space(plan, tmp_path)
+    monkeypatch.setattr(limits, "_free_files", lambda place: None)
+    check_space(plan, tmp_path)
+
+
+def test_run__goes_on_where_the_rest_fits(monkeypatch, write_spec, tmp_path):
+    """A run that is half done asks for the room of the other half alone."""
+    path, out = write_spec(text_of(execution="trajectories_per_task = 2")), tmp_path / "run"
+    run(path, out, workers=0, echo=lambda line: None)
+    info, plan = read_run(out), plan_of(execution="trajectories_per_task = 2")
+    assert len(read_commits(info, plan)) == plan.n_tasks > 2
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: Usage(0, 0, 10))
+    run(path, out, workers=0, echo=lambda line: None)  # nothing is missing
+    assert any("0.2" in line or "nothing" in line for line in describe_plan(path, out))
+    with pytest.raises(SpecError, match="needs up to"):
+        run(path, tmp_path / "another", workers=0, echo=lambda line: None)
+    assert not (tmp_path / "another").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a small file system is mounted")
+def test_check_space__a_small_disk(tmp_path):
+    """On a real file system of 1 MB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", "size=1M,nr_inodes=100", "none", str(place)]
+    mounted = subprocess.run(words, capture_output=True, check=False)
+    if mounted.returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        with pytest.raises(SpecError, match=r"up to .*MB .*, and there are 1.05 MB and .* files, and"):
+            check_space(plan_of(points=1000, starts=10), place / "run")
+    finally:
+        subprocess.run(["umount", str(place)], check=True)
+
+
+def test_in_words__sizes():
+    assert [in_words(n) for n in (0, 999, 1.9e12, 5e15)] == ["0 bytes", "999 bytes", "1.9 TB", "5 PB"]
