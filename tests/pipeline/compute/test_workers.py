@@ -18,8 +18,8 @@ from pipeline.compute.addresses import SchedulerError
 from pipeline.compute.execute import run_tasks
 from pipeline.compute.limits import Limits
 from pipeline.compute.local import local_cluster
-from pipeline.compute.order import TaskFailedError
-from pipeline.compute.window import Watch
+from pipeline.compute.order import Order, TaskFailedError
+from pipeline.compute.window import Watch, Window
 
 
 @pytest.fixture
@@ -149,6 +149,20 @@ def test_local_cluster__refuses_who_has_no_key():
             for service in (cluster.scheduler.http_server,):
                 for port in {s.getsockname()[1] for s in service._sockets.values()}:
                     assert pages(port) == [404, 404, 404]
+
+
+def test_workers__memory_stays(faulty, tmp_path):
+    """What dask keeps of every task in a worker is short; its defaults keep 3.6 kB of each of thousands."""
+    from distributed import Client
+
+    task = partial(faulty.fine, str(tmp_path))
+    with local_cluster(1) as cluster, Client(cluster, set_as_default=False) as client:
+        held = []
+        for n in (50, 100):
+            client.run(faulty.traced)
+            assert len(list(Window(client, task, Order(range(n)), seconds=one_second).results())) == n
+            held += client.run(faulty.traced).values()
+    assert (held[1] - held[0]) / 100 < 1200
 
 
 async def answer(connect, address, keys):
