@@ -31,6 +31,7 @@ from pipeline.runs.versions import code_version
 from pipeline.spec.problems import SpecError, unknown_name, validated
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED
+from pipeline.store.local import unwritable
 from pipeline.store.products import (
     leftover_products,
     open_product,
@@ -131,6 +132,8 @@ def derive(
         pass
     except DamagedError as error:
         run.echo(f"{name}: damaged ({error}); computing it again")
+    if problem := unwritable(path.parent):
+        run.echo(f"{problem}: what {name} finds is shown, and not kept")
     return _kept(run, path, _compute(run, analysis, wanted).assign_attrs(key))
 
 
@@ -201,8 +204,8 @@ def _compute(run: AnalysedRun, analysis: Analysis, options: Options) -> xr.Datas
 def _kept(run: AnalysedRun, path: Path, result: xr.Dataset) -> xr.Dataset:
     try:
         write_product(path, result)
-    except PermissionError as error:
-        run.echo(f"{path.name}: not kept ({error})")
+    except OSError as error:
+        run.echo(f"{path.name}: not kept ({error}); what was found is shown all the same")
         return result
     return _placed(open_product(path), path)
 

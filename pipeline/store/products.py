@@ -21,6 +21,7 @@ from zarr.storage import LocalStore
 
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.store.arrays import create_array
+from pipeline.store.declared import product_problem
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import TEMPORARY, entry_of
 from pipeline.store.local import (
@@ -104,9 +105,14 @@ def read_product_attrs(path: Path) -> dict[str, Any]:
         raise DamagedError(f"{path}: is, or lies behind, a link")
     if not path.exists():
         raise FileNotFoundError(path)
+    links = [file for file in files_below(path) if file.is_symlink()] if path.is_dir() else [path]
+    if links:
+        raise DamagedError(f"{links[0]}: is a link, or no folder")
     try:
         attrs: dict[str, Any] = json.loads((path / "zarr.json").read_text("utf-8"))["attributes"]
         if attrs[SEAL] == _seal(path, attrs):
+            if problem := product_problem(path, files_below(path)):
+                raise DamagedError(f"{path}: {problem}")
             return attrs
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DamagedError(f"{path}: {error!r}") from None

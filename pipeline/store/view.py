@@ -18,6 +18,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
 from pipeline.layout.plan import Plan
+from pipeline.store.declared import Declared
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files
 from pipeline.store.keys import Owners
@@ -42,6 +43,7 @@ class Shown:
     def __init__(self, info: RunInfo, plan: Plan, commits: Mapping[int, Commit]) -> None:
         self._skeleton = info.skeleton
         self._owners = Owners(plan)
+        self.declared = Declared(plan)
         self._commits = commits
 
     def arrays(self) -> list[str]:
@@ -98,6 +100,8 @@ class CommittedStore(WrapperStore[Store]):
         entry = self._shown.entry(key)
         if entry is None:
             return None
+        if self._files.local is not None and os.path.islink(f"{self._files.local}/{CUBE}/{key}"):
+            raise self._damaged(key, "is a link, which is not followed")
         whole = await self._store.get(key, prototype)
         if whole is None:
             raise self._damaged(key, "is missing")
@@ -105,6 +109,8 @@ class CommittedStore(WrapperStore[Store]):
             content = whole.as_buffer_like()
             if len(whole) != entry["size"] or await _sha256(content, len(whole)) != entry["sha256"]:
                 raise self._damaged(key, "is not what was written: its content has changed")
+        if problem := self._shown.declared.problem(key, whole.as_buffer_like()):
+            raise self._damaged(key, problem)
         return whole if byte_range is None else whole[_slice(byte_range, len(whole))]
 
     def small_chunk(self, key: str) -> bytes | None:
@@ -124,6 +130,8 @@ class CommittedStore(WrapperStore[Store]):
             raise self._damaged(key, "is missing") from None
         if len(content) != entry["size"] or hashlib.sha256(content).hexdigest() != entry["sha256"]:
             raise self._damaged(key, "is not what was written: its content has changed")
+        if problem := self._shown.declared.problem(key, content):
+            raise self._damaged(key, problem)
         return content
 
     def _damaged(self, key: str, problem: str) -> DamagedError:
