@@ -288,6 +288,14 @@ def test_commands__execute_nothing_of_a_run_directory(hostile, tmp_path):
     assert (hostile / "figures").is_dir()
 
 
+@pytest.mark.parametrize("depth", [100_000, 200])
+def test_commands__a_run_file_that_is_nested_too_deep(hostile, depth):
+    text = (hostile / "run.json").read_text("utf-8")
+    (hostile / "run.json").write_text(text.replace('"small"', "[" * depth + "]" * depth, 1))
+    with pytest.raises((DamagedError, ValueError)):
+        Run.open(hostile)
+
+
 def test_commands__a_model_that_names_an_object_is_not_imported(hostile):
     """A run.json that names a module and an object of it is a description; it is never imported."""
     module = hostile / "boom_module.py"
