@@ -125,8 +125,7 @@ def test_plot__without_kernel(directory, tmp_path):
 
 
 @pytest.mark.parametrize("name", shipped_workflows())
-def test_workflow__smoke(name, tmp_path):
-    done = magpend("run", name, "--smoke", "--out", tmp_path / name, "--workers", "0")
-    assert done.returncode == 0, done.stderr
+def test_workflow__smoke(name, tmp_path, command):
+    command(tmp_path, "run", name, "--smoke", "--out", name, "--workers", "0")
     with pipeline.open_run(tmp_path / name) as opened:
         assert (opened.status != Status.PENDING).all()
