@@ -174,3 +174,10 @@ def test_object_store__prints_a_table(bench, monkeypatch, capsys):
     bench("object_store").main(["--tasks", "2", "--latency-ms", "1"])
     printed = capsys.readouterr().out
     assert all(name in printed for name in ("set up", "commit a task", "load a variable", "verify"))
+
+
+def test_scaling__ceiling(bench, capsys):
+    bench("scaling").main(["--seconds", "0", "--workers", "4", "--task-seconds", "0.05", "--rounds", "3"])
+    printed = capsys.readouterr().out
+    assert "processor time per task" in printed
+    assert 0 < float(printed.split("busy")[1].split()[0]) <= 1
