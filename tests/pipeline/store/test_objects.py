@@ -139,9 +139,8 @@ def test_write_task__few_requests(made, remote, s3):
     remote.commit(0)
     s3.reset()
     remote.commit(1)
-    # every chunk is put and read back, and the marker put; metadata have been read before
-    # asking for a pack that is not there is one more
-    assert len(s3.requests) == 2 * len(made.plan.variables) + 2
+    # metadata are compared, every chunk is put and read back, a pack is asked for and the marker put
+    assert len(s3.requests) == 3 * len(made.plan.variables) + 2
     assert s3.requests[-1][:2] == ("PUT", f"/{BUCKET}/runs/one/commits/000001.json")
 
 
