@@ -139,9 +139,8 @@ def test_write_task__few_requests(made, remote, s3):
     remote.commit(0)
     s3.reset()
     remote.commit(1)
-    # every chunk is put and read back, and the marker put; metadata have been read before
-    # asking for a pack that is not there is one more
-    assert len(s3.requests) == 2 * len(made.plan.variables) + 2
+    # metadata are compared, every chunk is put and read back, a pack is asked for and the marker put
+    assert len(s3.requests) == 3 * len(made.plan.variables) + 2
     assert s3.requests[-1][:2] == ("PUT", f"/{BUCKET}/runs/one/commits/000001.json")
 
 
@@ -219,6 +218,40 @@ def test_run__an_outage_is_one_line_and_the_same_command_goes_on(s3, write_spec,
     assert stored() == bytes_of(tmp_path / "run")
 
 
+class CrashError(Exception):
+    """Stands for a process that is killed."""
+
+
+def test_write_task__killed_between_any_two_puts(made, remote, bytes_of, monkeypatch):
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+        if index:
+            remote.commit(index)
+    real, left = objects.RunStore.set, [0]
+
+    async def put(self, key, value):
+        if not left[0]:
+            raise CrashError
+        left[0] -= 1
+        await real(self, key, value)
+
+    def never(self, key, content):
+        raise CrashError
+
+    for n in range(len(made.plan.variables) + 1):
+        left[0] = n
+        with monkeypatch.context() as patch:
+            patch.setattr(objects.RunStore, "set", put)
+            patch.setattr(objects.ObjectFiles, "write_once", never)
+            with pytest.raises(CrashError):
+                remote.commit(0)
+        commits = read_commits(remote.info, remote.plan)
+        assert 0 not in commits
+        assert sweep(remote.info, remote.plan, commits) == n
+    remote.commit(0)
+    assert stored() == bytes_of(made.info.directory)
+
+
 # ---- damage ------------------------------------------------------------------------------------
 
 
@@ -264,7 +297,12 @@ def test_check__another_run_or_foreign_objects(whole, s3):
 
 
 def test_write_product__the_seal_comes_last(remote, s3):
-    ds = xr.Dataset({"mean": ("side", [1.0, 2.0])}, {"side": ["left", "right"]}, {"derived_product": "mean"})
+    # by their names, chunks of the second variable come after zarr.json
+    ds = xr.Dataset(
+        {"mean": ("side", [1.0, 2.0]), "zone": ("side", [1, 2])},
+        {"side": ["left", "right"]},
+        {"derived_product": "mean"},
+    )
     place = remote.info.files.below("derived").below("mean-1.zarr")
     s3.reset()
     write_product(place, ds)
