@@ -22,7 +22,7 @@ from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
 from pipeline.store.checking import damaged_records, name_of
-from pipeline.store.commits import log_timing
+from pipeline.store.commits import log_timing, sweep
 from pipeline.store.errors import IncompleteError
 from pipeline.store.files import Files, open_files
 from pipeline.store.packing import Packer
@@ -207,11 +207,11 @@ def _complete(
             log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
             packer.add(result["task"])
             progress.add(result["cells"])
-    _require_all(info, plan)
+    _require_all(info, plan, echo)
 
 
-def _require_all(info: RunInfo, plan: Plan) -> None:
-    """Believe the commit records, not the workers."""
+def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
+    """Believe the commit records, not the workers; remove what those left that were stopped at their work."""
     commits, problems = damaged_records(info, plan, contents=False)
     absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:
@@ -221,3 +221,4 @@ def _require_all(info: RunInfo, plan: Plan) -> None:
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
             "and have room to write; then give the same command again: it computes these tasks alone."
         )
+    sweep(info, plan, commits, echo)

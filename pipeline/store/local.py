@@ -148,6 +148,18 @@ def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
             _measure(Path(entry.path), f"{prefix}{entry.name}/", found)
 
 
+def unwritable(folder: Path) -> str | None:
+    """Say why nothing can be written in a folder, there or not yet; None if something can."""
+    place = folder.absolute()
+    while not os.path.lexists(place):
+        place = place.parent
+    if not place.is_dir():
+        return f"{place}: is no folder"
+    if not os.access(place, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
+        return f"{place}: cannot be written to"
+    return None
+
+
 def make_folder(path: Path) -> None:
     """Make a folder, and those that it lies in, and have their entries on the disk."""
     if path.is_dir():
@@ -185,11 +197,16 @@ def sync(files: Iterable[Path], top: Path) -> None:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a small file so that after a crash it is there whole or not at all."""
     temporary = temporary_beside(path)
-    with temporary.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
     sync_folder(path.parent)
 
 

@@ -19,6 +19,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
 from pipeline.layout.plan import Plan
+from pipeline.store.declared import Declared
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files
 from pipeline.store.keys import Owners
@@ -43,6 +44,7 @@ class Shown:
     def __init__(self, info: RunInfo, plan: Plan, commits: Mapping[int, Commit]) -> None:
         self._skeleton = info.skeleton
         self._owners = Owners(plan)
+        self.declared = Declared(plan)
         self._commits = commits
 
     def arrays(self) -> list[str]:
@@ -142,6 +144,8 @@ class CommittedStore(WrapperStore[Store]):
             len(content) != entry["size"] or hashlib.sha256(content).hexdigest() != entry["sha256"]
         ):
             raise self._damaged(key, "is not what was written: its content has changed")
+        if problem := self._shown.declared.problem(key, content):
+            raise self._damaged(key, problem)
         return content
 
     def _damaged(self, key: str, problem: str) -> DamagedError:
