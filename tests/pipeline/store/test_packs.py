@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline import open_run
+from pipeline.compute import task
 from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.store import commits as store_commits
@@ -242,3 +244,31 @@ def test_owners__keys_lead_back(made):
     no_chunks = ["zarr.json", "status/zarr.json", "x/c.0", "frequency/c.0", "status/d.0.0.0.0"]
     for key in [*no_chunks, *(f"status/c.{w}" for w in ("9.9.9.9", "00.0.0.0", "0", "0.0.0.-1"))]:
         assert owners.task(key) is None, key
+
+
+def test_run__packs_as_it_goes_and_mends_one_task(write_spec, tmp_path, bytes_of, monkeypatch):
+    """With the kernel: damage of equal size in a packed run costs one task, and leaves the very bytes."""
+    axis = "frequency_hz = { start = 0.15, stop = 0.25, num = 5 }"
+    grid = '[initial_conditions]\nkind = "grid"\nx = 0.5\nv = 0.1'
+    short = "rtol = 1e-6\natol = 1e-6\nn_transient = 2\nn_keep = 3"
+    one = "[execution]\ntrajectories_per_task = 1"
+    spec = write_spec(
+        f'kind = "sweep"\nmodel = "duffing"\n[axes]\n{axis}\n{grid}\n[integration]\n{short}\n{one}'
+    )
+    directory, said = tmp_path / "run", []
+    assert run(spec, directory, workers=0, echo=silent).complete
+    assert sorted(f.name for f in (directory / "commits").iterdir()) == PACKED
+    before = bytes_of(directory)
+    (chunk,) = (directory / "cube.zarr/n_steps").glob("c.2*")
+    chunk.write_bytes(bytes(len(chunk.read_bytes())))
+    original, computed = task.compute, []
+    monkeypatch.setattr(task, "compute", lambda *a: computed.append(a) or original(*a))
+    assert run(spec, directory, workers=0, echo=said.append).complete
+    assert len(computed) == 1
+    assert f"n_steps/{chunk.name}: its content has changed: computed again" in said
+    assert bytes_of(directory) == before
+    monkeypatch.setenv("MAGPEND_VERIFY", "0")
+    chunk.write_bytes(bytes(len(chunk.read_bytes())))
+    said.clear()
+    assert run(spec, directory, workers=0, echo=said.append).complete
+    assert "nothing to do" in said[-1]
