@@ -26,6 +26,7 @@ from pipeline.store.commits import log_timing, sweep
 from pipeline.store.errors import IncompleteError
 from pipeline.store.files import Files, open_files
 from pipeline.store.packing import Packer
+from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
 
@@ -136,9 +137,11 @@ def carry_out(
     identity = identity_here(spec, plan)
     if check(files, identity) is None:
         check_space(plan, files.local)
-    with stoppable(files.name), files.lock():
-        info = establish(files, spec, plan, identity, text, echo)
-        _complete(info, spec, plan, workers, where, echo, sources)
+    with stoppable(files.name), files.lock() as alone:
+        is_alone = alone is not False
+        info = establish(files, spec, plan, identity, text, echo, alone=is_alone)
+        commits = sound_commits(info, plan, echo, alone=is_alone)
+        _complete(info, spec, plan, commits, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
@@ -159,6 +162,7 @@ def _complete(
     info: RunInfo,
     spec: Spec,
     plan: Plan,
+    commits: Records,
     workers: int | None,
     where: Where,
     echo: Echo,
@@ -167,7 +171,6 @@ def _complete(
     """Compute all tasks without a valid commit record."""
     from pipeline.compute import clients, execute, task
 
-    commits = sound_commits(info, plan, echo)
     packer = Packer(info, plan, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:

@@ -7,9 +7,7 @@ angles in degrees are converted once, in `pipeline.layout.cells`.
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +27,7 @@ from pipeline.spec.files import merged, nested, odd_data, read_toml
 from pipeline.spec.methods import method_problems
 from pipeline.spec.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
 from pipeline.spec.problems import SpecError, problems_of, shown, unknown_choice, unknown_key
+from pipeline.spec.ranges import corner_problems, size_problems
 from pipeline.spec.recorded import DriveTable, recorded, run_problems, with_drive
 from pipeline.spec.section import SectionTable, section_of, seen_through
 from pipeline.spec.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
@@ -119,9 +118,6 @@ _TABLES: dict[str, type[Table]] = {
     "section": SectionTable,
 }
 _OPTIONAL = ("drive", "section")
-MAX_CELLS = 10**15
-MOST_RELATED = 12
-"""Axes of parameters that a model relates to each other: all corners of their box are looked at."""
 _KEYS = (
     "kind", "title", "model", "parameters", "axes", "initial_conditions", "continuation", "integration",
     "products", "execution", "drive", "section",
@@ -232,7 +228,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
     problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
-    problems += _size_problems(axes, starts)
+    problems += size_problems(axes, starts)
     problems += method_problems(tables["integration"], products, "drive" in data)
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
     has_periods = "drive" in data or "section" in data or model.autonomous
@@ -396,19 +392,6 @@ def _walk(
     return walk
 
 
-def _size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
-    """Say that nobody could count the cells, so that nothing behind this overflows."""
-    sizes = {f"axes.{name}": axis.n for name, axis in axes.items()}
-    if isinstance(starts, GridStarts):
-        sizes |= {f"initial_conditions.{name}": axis.n for name, axis in starts.ranges.items()}
-    if math.prod(sizes.values()) <= MAX_CELLS:
-        return []
-    return [
-        f"{' x '.join(sizes)}: {math.prod(sizes.values()):.3g} cells; {MAX_CELLS:.0e} are the most: take "
-        "fewer values."
-    ]
-
-
 def _parameter_problems(
     table: ParametersTable, model: Model, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
 ) -> list[str]:
@@ -430,7 +413,7 @@ def _parameter_problems(
             problems.append(f"axes.{name}: is also in parameters.overrides; keep one of the two.")
     for name, values in swept.items():
         problems += [f"axes.{name}: {p}" for p in _axis_problems(base, name, values)]
-    return problems or [f"axes: {p}" for p in _corner_problems(base, swept)]
+    return problems or [f"axes: {p}" for p in corner_problems(base, swept)]
 
 
 def _frequency_problems(
@@ -458,41 +441,3 @@ def _axis_problems(base: Parameters, name: str, values: np.ndarray) -> list[str]
         except ParameterError as error:
             problems += [p for p in error.problems if p not in problems]
     return problems
-
-
-def _corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]:
-    """Problems between parameters: bounds are intervals, so the corners of the box decide.
-
-    Only along the axes that the model looks at when it relates parameters: it is asked once, and again where
-    an answer made it look at others.
-    """
-    ends = {name: (float(v.min()), float(v.max())) for name, v in swept.items()}
-    asked = _Asked(base)
-    problems, looked_at = base.model.relations(asked), set[str]()
-    while not problems and looked_at != asked.names & set(ends):
-        looked_at = asked.names & set(ends)
-        if len(looked_at) > MOST_RELATED:
-            return [f"{base.model.name} relates more than {MOST_RELATED} of them; fix some."]
-        for corner in itertools.product(*(dict.fromkeys(ends[name]) for name in sorted(looked_at))):
-            asked.values_now = {**base, **dict(zip(sorted(looked_at), corner, strict=True))}
-            problems = base.model.relations(asked)
-            if problems:
-                return list(problems)
-    return list(problems)
-
-
-class _Asked(Mapping[str, float]):
-    """Values that note which of them are asked for."""
-
-    def __init__(self, values: Mapping[str, float]) -> None:
-        self.values_now, self.names = dict(values), set[str]()
-
-    def __getitem__(self, name: str) -> float:
-        self.names.add(name)
-        return self.values_now[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.values_now)
-
-    def __len__(self) -> int:
-        return len(self.values_now)

@@ -1,0 +1,68 @@
+"""What is wrong with ranges of parameters and starts together: too many cells, values that exclude others."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from magpend_core.models.parameters import Parameters
+from pipeline.spec.starts import GridStarts, Starts
+from pipeline.spec.tables import Range
+
+MAX_CELLS = 10**15
+MOST_RELATED = 12
+"""Axes of parameters that a model relates to each other: all corners of their box are looked at."""
+
+
+def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
+    """Say that nobody could count the cells, so that nothing behind this overflows."""
+    sizes = {f"axes.{name}": axis.n for name, axis in axes.items()}
+    if isinstance(starts, GridStarts):
+        sizes |= {f"initial_conditions.{name}": axis.n for name, axis in starts.ranges.items()}
+    if math.prod(sizes.values()) <= MAX_CELLS:
+        return []
+    return [
+        f"{' x '.join(sizes)}: {math.prod(sizes.values()):.3g} cells; {MAX_CELLS:.0e} are the most: take "
+        "fewer values."
+    ]
+
+
+def corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]:
+    """Problems between parameters: bounds are intervals, so the corners of the box decide.
+
+    Only along the axes that the model looks at when it relates parameters: it is asked once, and again where
+    an answer made it look at others.
+    """
+    ends = {name: (float(v.min()), float(v.max())) for name, v in swept.items()}
+    asked = _Asked(base)
+    problems, looked_at = base.model.relations(asked), set[str]()
+    while not problems and looked_at != asked.names & set(ends):
+        looked_at = asked.names & set(ends)
+        if len(looked_at) > MOST_RELATED:
+            return [f"{base.model.name} relates more than {MOST_RELATED} of them; fix some."]
+        for corner in itertools.product(*(dict.fromkeys(ends[name]) for name in sorted(looked_at))):
+            asked.values_now = {**base, **dict(zip(sorted(looked_at), corner, strict=True))}
+            problems = base.model.relations(asked)
+            if problems:
+                return list(problems)
+    return list(problems)
+
+
+class _Asked(Mapping[str, float]):
+    """Values that note which of them are asked for."""
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        self.values_now, self.names = dict(values), set[str]()
+
+    def __getitem__(self, name: str) -> float:
+        self.names.add(name)
+        return self.values_now[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_now)
+
+    def __len__(self) -> int:
+        return len(self.values_now)
