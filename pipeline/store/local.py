@@ -130,7 +130,7 @@ class LocalFiles:
         """The folder as zarr takes it."""
         return LocalStore(self.root, read_only=read_only)
 
-    def lock(self) -> AbstractContextManager[None]:
+    def lock(self) -> AbstractContextManager[bool]:
         """Hold the folder's lock."""
         return writer_lock(self.root)
 
@@ -185,11 +185,16 @@ def sync(files: Iterable[Path], top: Path) -> None:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a small file so that after a crash it is there whole or not at all."""
     temporary = temporary_beside(path)
-    with temporary.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
     sync_folder(path.parent)
 
 
@@ -271,13 +276,15 @@ def remove_tree(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def writer_lock(directory: Path) -> Iterator[None]:
+def writer_lock(directory: Path) -> Iterator[bool]:
     """Hold the directory's lock: a courtesy between people, the commit protocol does not rest on it.
+
+    The system frees the lock of a process that has ended, however it did. Gives False where locks fail.
 
     Raises
     ------
     LockedError
-        If another process holds it.
+        If another process holds it; names that one.
     """
     from filelock import FileLock, Timeout
 
@@ -295,11 +302,11 @@ def writer_lock(directory: Path) -> Iterator[None]:
         ) from None
     except (NotImplementedError, OSError) as error:
         warnings.warn(f"{directory}: no file lock here ({error}); start one run at a time.", stacklevel=3)
-        yield
+        yield False
         return
     try:
         with _named(directory / HOLDER):
-            yield
+            yield True
     finally:
         lock.release()
 

@@ -90,7 +90,9 @@ def test_ask__wrong_port():
         assert f"tcp://127.0.0.1:{port}: nothing listens there" in refusal(f"127.0.0.1:{port}")
 
 
-def test_ask__web_server():
+def test_ask__web_server(monkeypatch):
+    assert addresses.ANSWER_S <= 5
+    monkeypatch.setattr(addresses, "ANSWER_S", 0.5)
     with web_server() as port:
         assert "is another kind of server" in refusal(f"tcp://127.0.0.1:{port}")
 

@@ -28,6 +28,18 @@ prologue = ["module load python/3.12"]
 directives = ["-pe smp 4", "--exclusive"]
 coordinator_walltime = "48:00:00"
 """
+SMALL = """
+kind = "sweep"
+model = "duffing"
+[parameters]
+frequency_hz = 0.2
+[initial_conditions]
+kind = "list"
+points = [[0.5, 0.0]]
+[integration]
+n_transient = 1
+n_keep = 1
+"""
 WHOLE = {
     "slurm": """
 #SBATCH --job-name=magpend-out
@@ -213,8 +225,8 @@ def test_submit__what_the_batch_system_says(main, tmp_path, write_spec, sweep_te
     assert main(*words)[0] == 0
 
 
-def test_submit__nothing_to_send(main, tmp_path, write_spec, sweep_text, cluster):
-    path = write_spec(sweep_text)
+def test_submit__nothing_to_send(main, tmp_path, write_spec, cluster):
+    path = write_spec(SMALL)
     run(path, tmp_path / "out", workers=0, echo=lambda line: None)
     code, out, _ = main("submit", path, "--cluster", cluster("slurm"), "--out", "out")
     assert (code, out) == (0, "out is complete; nothing to send.\n")
