@@ -17,10 +17,7 @@ MORE = 2.0
 """Every further try of a task may take this many times longer than the one before."""
 
 SILENT_S = 20.0
-"""A worker that has not been heard of for so long is taken for stopped [s].
-
-Workers report every half a second; more than a thousand of them, every few seconds.
-"""
+"""A worker that has not been heard of for so long is taken for stopped [s]; they report every half second."""
 
 
 class Limits:

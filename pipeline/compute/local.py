@@ -28,6 +28,15 @@ PREFIX = "magpend-workers-"
 START_S = 180.0
 """A worker that does not start within this time has failed [s]."""
 
+LOGGERS = [
+    "tornado",
+    "distributed",
+    *(f"distributed.{part}" for part in ("client", "core", "nanny", "scheduler", "worker")),
+]
+
+REMOVALS = 20
+"""Times that a folder is removed, a tenth of a second apart."""
+
 SETTINGS: dict[str, Any] = {
     # what nobody reads, and what grows with tasks and time: profiles, events, states of the machine
     "distributed.worker.profile.enabled": False,
@@ -64,6 +73,7 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
 
     _start_tracker()
     with (
+        _hushed(),
         _scratch() as scratch,
         dask.config.set({**SETTINGS, **({} if dashboard else NO_PAGES), "temporary-directory": str(scratch)}),
         _loop() as loop,
@@ -88,7 +98,6 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
             _await_one(cluster)
             yield cluster
         except BaseException:
-            _silence()
             for nanny in cluster.workers.values():
                 nanny.auto_restart = False
             kill_workers()
@@ -152,8 +161,18 @@ def _scratch() -> Iterator[Path]:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder)
         _scratch_folders.discard(folder)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder, though workers that were just starting may still be writing into it."""
+    for _ in range(REMOVALS):
+        kill_workers()
+        shutil.rmtree(folder, ignore_errors=True)
+        if not folder.exists():
+            return
+        time.sleep(0.1)
 
 
 def _sweep() -> None:
@@ -196,22 +215,31 @@ def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _silence() -> None:
-    """Say nothing of connections that break now; the exception that leads here says what happened."""
-    for name in ("distributed", "distributed.client", "distributed.core", "distributed.nanny", "tornado"):
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+@contextlib.contextmanager
+def _hushed() -> Iterator[None]:
+    """Say nothing of connections that come and go; after an exception for good, for that says what happened.
+
+    dask logs some of them after a cluster has closed.
+    """
+    loggers = [logging.getLogger(name) for name in LOGGERS]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    yield
+    for logger, level in zip(loggers, before, strict=True):
+        logger.setLevel(level)
 
 
 def kill_workers() -> None:
     """End the workers at once: what they are computing is given up, and may take long."""
     for process in multiprocessing.active_children():
         if process.name.startswith("Dask Worker process"):
-            process.kill()
+            with contextlib.suppress(ValueError):  # closed meanwhile
+                process.kill()
 
 
 def abandon() -> None:
     """Leave nothing behind, without waiting: for a process that is about to end at once."""
-    _silence()
     kill_workers()
     for folder in list(_scratch_folders):
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder)

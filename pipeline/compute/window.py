@@ -33,6 +33,9 @@ MOST_LOOKED_AT = 100
 ANSWER_S = 30.0
 """A scheduler that does not answer for so long is taken for gone [s]."""
 
+MOST_PATIENCE = 8
+"""How much longer silence may last in the end."""
+
 WAITING_S = 30.0
 """Without workers for so long, a line says so [s]."""
 
@@ -193,10 +196,10 @@ class Window:
             seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
         except (OSError, TimeoutError) as error:
             raise SchedulerError(self._lost()) from error
-        silent = self._watch.look(seen["workers"])
-        for address in silent:
+        limit = self._watch.limit_s
+        for address in self._watch.look(seen["workers"]):
             self._echo(
-                f"a worker has not answered for {SILENT_S:.0f} s: it is restarted, its tasks go elsewhere"
+                f"a worker has not answered for {limit:.0f} s: it is restarted, its tasks go elsewhere"
             )
             self._restart(address)
         self._say_if_waiting()
@@ -250,8 +253,18 @@ class Watch:
         self._last = clock()
         self._looked = float("-inf")
         self._heard: dict[str, tuple[float, float]] = {}
+        self._patience = 1
         self.n_threads = 0
         self._time = 0.0
+
+    @property
+    def limit_s(self) -> float:
+        """For how long a worker may be silent [s].
+
+        It doubles with those that were found: on a machine that is far too busy all are slow to answer.
+        """
+        least = max(SILENT_S, len(self._heard) / 50)  # many workers are asked to report less often
+        return least * min(self._patience, MOST_PATIENCE)
 
     @property
     def now(self) -> float:
@@ -275,8 +288,10 @@ class Watch:
             before = self._heard.get(address)
             heard[address] = before if before is not None and before[0] == seen else (seen, now)
         self._heard = heard
-        limit = max(SILENT_S, len(workers) / 50)
-        return [address for address, (_, since) in heard.items() if now - since > limit]
+        silent = [address for address, (_, since) in heard.items() if now - since > self.limit_s]
+        if silent:
+            self._patience *= 2
+        return silent
 
     def forget(self, address: str) -> None:
         """Begin anew with a worker."""
