@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import subprocess
 import time
 from pathlib import Path
@@ -145,8 +144,7 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert not list(logs.glob(".keys-*"))
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(os.environ.get("MAGPEND_LONG") != "1", reason="half a minute; MAGPEND_LONG=1 runs it")
+@pytest.mark.long
 def test_submit__a_cancelled_coordinator_takes_its_workers_along(tmp_path, shell, magpend):
     (tmp_path / "spec.toml").write_text(SPEC.replace("n_transient = 2000", "n_transient = 20000"))
     (tmp_path / "several.toml").write_text(SEVERAL_JOBS)
