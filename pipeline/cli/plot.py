@@ -48,11 +48,15 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
     """Draw a figure of a run, write it and the data drawn, and say where."""
     from pipeline.cli import console
     from pipeline.runs.drawing import drawn, ready
+    from pipeline.store.errors import RefusedError
+    from pipeline.store.local import unwritable
 
     if options.out:
         check_figure_path(_target_of(options))
     run, wanted = ready(directory, name, options, console.note)
     target = _target_of(wanted) if wanted.out else _in_run(run.info.files, name, wanted)
+    if problem := unwritable(target.parent):
+        raise RefusedError(f"{problem}; give another place for the figure: --out FILE.")
     figure = drawn(run, name, wanted)
     from pipeline.plots import save_data, save_figure
 

@@ -29,8 +29,11 @@ START_S = 180.0
 """A worker that does not start within this time has failed [s]."""
 
 SETTINGS: dict[str, Any] = {
-    # a profile of every task would grow with their number
+    # what nobody reads, and what grows with tasks and time: profiles, events, states of the machine
     "distributed.worker.profile.enabled": False,
+    "distributed.admin.low-level-log-length": 20,
+    "distributed.admin.log-length": 100,
+    "distributed.admin.system-monitor.log-length": 20,
     "distributed.worker.http.routes": [],
     # results are small: there is nothing to write to disk
     "distributed.worker.memory.target": False,

@@ -68,6 +68,8 @@ class Source:
         products = [CELL_PRODUCTS[n].variables(self.wanted.products[n], model) for n in same]
         own = [*base_variables(model), *(v for variables in products for v in variables)]
         self.names = [variable.name for variable in own]
+        self._is_committed = np.zeros(self.run.plan.n_tasks + 1, bool)
+        self._is_committed[list(self.run.commits)] = True
         self._read = lru_cache(maxsize=2)(partial(read_block, self.run, names=tuple(self.names)))
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
@@ -76,9 +78,7 @@ class Source:
         In a refined grid some of these were inferred, which `take` leaves out.
         """
         place = self.finder.find(inputs, way)
-        is_committed = np.zeros(self.run.plan.n_tasks + 1, bool)
-        is_committed[list(self.run.commits)] = True
-        return np.where(is_committed[self._task(place)], place, NOWHERE)
+        return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
         """Return which of some cells were integrated and are whole, and these cells' variables."""

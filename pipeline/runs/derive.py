@@ -31,6 +31,7 @@ from pipeline.runs.versions import code_version
 from pipeline.spec.problems import SpecError, unknown_name, validated
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED, Files
+from pipeline.store.local import unwritable
 from pipeline.store.products import (
     leftover_products,
     open_product,
@@ -131,6 +132,8 @@ def derive(
         pass
     except DamagedError as error:
         run.echo(f"{name}: damaged ({error}); computing it again")
+    if place.local is not None and (problem := unwritable(place.local.parent)):
+        run.echo(f"{problem}: what {name} finds is shown, and not kept")
     return _kept(run, place, _compute(run, analysis, wanted).assign_attrs(key))
 
 
@@ -201,8 +204,9 @@ def _compute(run: AnalysedRun, analysis: Analysis, options: Options) -> xr.Datas
 def _kept(run: AnalysedRun, place: Files, result: xr.Dataset) -> xr.Dataset:
     try:
         write_product(place, result)
-    except PermissionError as error:
-        run.echo(f"{place.name.rpartition('/')[2]}: not kept ({error})")
+    except OSError as error:
+        name = place.name.rpartition("/")[2]
+        run.echo(f"{name}: not kept ({error}); what was found is shown all the same")
         return result
     return _placed(open_product(place), place)
 

@@ -22,10 +22,11 @@ from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
 from pipeline.store.checking import damaged_records, name_of
-from pipeline.store.commits import log_timing
+from pipeline.store.commits import log_timing, sweep
 from pipeline.store.errors import IncompleteError
 from pipeline.store.files import Files, open_files
 from pipeline.store.packing import Packer
+from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
 
@@ -136,9 +137,11 @@ def carry_out(
     identity = identity_here(spec, plan)
     if check(files, identity) is None:
         check_space(plan, files.local)
-    with stoppable(files.name), files.lock():
-        info = establish(files, spec, plan, identity, text, echo)
-        _complete(info, spec, plan, workers, where, echo, sources)
+    with stoppable(files.name), files.lock() as alone:
+        is_alone = alone is not False
+        info = establish(files, spec, plan, identity, text, echo, alone=is_alone)
+        commits = sound_commits(info, plan, echo, alone=is_alone)
+        _complete(info, spec, plan, commits, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
@@ -159,6 +162,7 @@ def _complete(
     info: RunInfo,
     spec: Spec,
     plan: Plan,
+    commits: Records,
     workers: int | None,
     where: Where,
     echo: Echo,
@@ -167,7 +171,6 @@ def _complete(
     """Compute all tasks without a valid commit record."""
     from pipeline.compute import clients, execute, task
 
-    commits = sound_commits(info, plan, echo)
     packer = Packer(info, plan, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
@@ -204,11 +207,11 @@ def _complete(
             log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
             packer.add(result["task"])
             progress.add(result["cells"])
-    _require_all(info, plan)
+    _require_all(info, plan, echo)
 
 
-def _require_all(info: RunInfo, plan: Plan) -> None:
-    """Believe the commit records, not the workers."""
+def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
+    """Believe the commit records, not the workers; remove what those left that were stopped at their work."""
     commits, problems = damaged_records(info, plan, contents=False)
     absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:
@@ -218,3 +221,4 @@ def _require_all(info: RunInfo, plan: Plan) -> None:
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
             "and have room to write; then give the same command again: it computes these tasks alone."
         )
+    sweep(info, plan, commits, echo)

@@ -134,8 +134,10 @@ class Files(Protocol):
         """What zarr reads and writes here."""
         ...
 
-    def lock(self) -> AbstractContextManager[None]:
+    def lock(self) -> AbstractContextManager[bool | None]:
         """Hold the lock: a courtesy between people, the commit protocol does not rest on it.
+
+        Gives False where locks do not work, so that another process may be writing, too.
 
         Raises
         ------

@@ -130,7 +130,7 @@ class LocalFiles:
         """The folder as zarr takes it."""
         return LocalStore(self.root, read_only=read_only)
 
-    def lock(self) -> AbstractContextManager[None]:
+    def lock(self) -> AbstractContextManager[bool]:
         """Hold the folder's lock."""
         return writer_lock(self.root)
 
@@ -146,6 +146,18 @@ def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
         elif entry.is_dir(follow_symlinks=bool(not prefix)):
             refuse_links(Path(entry.path))
             _measure(Path(entry.path), f"{prefix}{entry.name}/", found)
+
+
+def unwritable(folder: Path) -> str | None:
+    """Say why nothing can be written in a folder, there or not yet; None if something can."""
+    place = folder.absolute()
+    while not os.path.lexists(place):
+        place = place.parent
+    if not place.is_dir():
+        return f"{place}: is no folder"
+    if not os.access(place, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
+        return f"{place}: cannot be written to"
+    return None
 
 
 def make_folder(path: Path) -> None:
@@ -185,11 +197,16 @@ def sync(files: Iterable[Path], top: Path) -> None:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a small file so that after a crash it is there whole or not at all."""
     temporary = temporary_beside(path)
-    with temporary.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
     sync_folder(path.parent)
 
 
@@ -271,13 +288,15 @@ def remove_tree(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def writer_lock(directory: Path) -> Iterator[None]:
+def writer_lock(directory: Path) -> Iterator[bool]:
     """Hold the directory's lock: a courtesy between people, the commit protocol does not rest on it.
+
+    The system frees the lock of a process that has ended, however it did. Gives False where locks fail.
 
     Raises
     ------
     LockedError
-        If another process holds it.
+        If another process holds it; names that one.
     """
     from filelock import FileLock, Timeout
 
@@ -295,11 +314,11 @@ def writer_lock(directory: Path) -> Iterator[None]:
         ) from None
     except (NotImplementedError, OSError) as error:
         warnings.warn(f"{directory}: no file lock here ({error}); start one run at a time.", stacklevel=3)
-        yield
+        yield False
         return
     try:
         with _named(directory / HOLDER):
-            yield
+            yield True
     finally:
         lock.release()
 

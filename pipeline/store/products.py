@@ -23,6 +23,7 @@ from zarr.storage import LocalStore, MemoryStore
 
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.store.arrays import create_array
+from pipeline.store.declared import product_problem
 from pipeline.store.errors import DamagedError, UnreadableError
 from pipeline.store.files import TEMPORARY, Files, open_files
 from pipeline.store.local import (
@@ -143,10 +144,16 @@ def read_product_attrs(place: Place) -> dict[str, Any]:
             raise DamagedError(f"{path}: is, or lies behind, a link")
         if not path.exists():
             raise FileNotFoundError(path)
+        links = [file for file in files_below(path) if file.is_symlink()] if path.is_dir() else [path]
+        if links:
+            raise DamagedError(f"{links[0]}: is a link, or no folder")
         try:
-            return _sealed_attrs(files, files.read(_GROUP), _digests(files))
+            attrs = _sealed_attrs(files, files.read(_GROUP), _digests(files))
         except (OSError, UnreadableError) as error:
             raise DamagedError(f"{path}: {error!r}") from None
+        if problem := product_problem(path, files_below(path)):
+            raise DamagedError(f"{path}: {problem}")
+        return attrs
     keys = files.everything()
     group = dict(files.read_each([_GROUP] if keys else []))
     return _sealed_attrs(files, group.get(_GROUP), _digests(files))

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.layout.limits import check_plan
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.spec.parsing import Spec, kept_spec
 from pipeline.store.commits import cube_digest, read_commits
@@ -67,6 +68,7 @@ class Run:
         check_skeleton(info)
         spec = kept_spec(info.spec)
         plan = make_plan(spec)
+        check_plan(plan)
         return cls(info, spec, plan, read_commits(info, plan))
 
     @property

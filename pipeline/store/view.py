@@ -19,6 +19,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
 from pipeline.layout.plan import Plan
+from pipeline.store.declared import Declared
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files
 from pipeline.store.keys import Owners
@@ -29,7 +30,7 @@ VERIFY = "MAGPEND_VERIFY"
 """Environment variable; ``0`` reads chunks without comparing them with their records."""
 
 SMALL = 200_000
-"""Chunks of so many bytes are read by `pipeline.store.quick`; larger ones are hashed in threads."""
+"""Chunks of so many bytes are read by `pipeline.store.quick`; larger ones by zarr, one by one."""
 
 
 def checks_chunks() -> bool:
@@ -43,6 +44,7 @@ class Shown:
     def __init__(self, info: RunInfo, plan: Plan, commits: Mapping[int, Commit]) -> None:
         self._skeleton = info.skeleton
         self._owners = Owners(plan)
+        self.declared = Declared(plan)
         self._commits = commits
 
     def arrays(self) -> list[str]:
@@ -99,13 +101,14 @@ class CommittedStore(WrapperStore[Store]):
         entry = self._shown.entry(key)
         if entry is None:
             return None
-        whole = await self._store.get(key, prototype)
-        if whole is None:
-            raise self._damaged(key, "is missing")
-        if self._checks:
-            content = whole.as_buffer_like()
-            if len(whole) != entry["size"] or await _sha256(content, len(whole)) != entry["sha256"]:
-                raise self._damaged(key, "is not what was written: its content has changed")
+        if self._files.local is not None:
+            # read and compared in one go, away from the loop that asks for others meanwhile
+            content: Any = await asyncio.to_thread(self._read, key, entry)
+        else:
+            found = await self._store.get(key, prototype)
+            content = None if found is None else found.to_bytes()
+            await asyncio.to_thread(self._compare, key, entry, content)
+        whole = prototype.buffer.from_bytes(content)
         return whole if byte_range is None else whole[_slice(byte_range, len(whole))]
 
     def small_chunk(self, key: str) -> bytes | None:
@@ -121,15 +124,28 @@ class CommittedStore(WrapperStore[Store]):
         entry = self._shown.entry(key) if self._files.local is not None else None
         if entry is None or entry["size"] > SMALL:
             return None
-        try:
-            content = self._files.read(f"{CUBE}/{key}")
-        except FileNotFoundError:
-            raise self._damaged(key, "is missing") from None
-        sound = len(content) == entry["size"] and (
-            hashlib.sha256(content).hexdigest() == entry["sha256"] if self._checks else _crc32c_fits(content)
-        )
-        if not sound:
+        content = self._read(key, entry)
+        if not self._checks and not _crc32c_fits(content):
             raise self._damaged(key, "is not what was written: its content has changed")
+        return content
+
+    def _read(self, key: str, entry: Mapping[str, Any]) -> bytes:
+        """Content of a local file, compared with its record unless that is left out."""
+        try:
+            content: bytes | None = self._files.read(f"{CUBE}/{key}")
+        except FileNotFoundError:
+            content = None
+        return self._compare(key, entry, content)
+
+    def _compare(self, key: str, entry: Mapping[str, Any], content: bytes | None) -> bytes:
+        if content is None:
+            raise self._damaged(key, "is missing")
+        if self._checks and (
+            len(content) != entry["size"] or hashlib.sha256(content).hexdigest() != entry["sha256"]
+        ):
+            raise self._damaged(key, "is not what was written: its content has changed")
+        if problem := self._shown.declared.problem(key, content):
+            raise self._damaged(key, problem)
         return content
 
     def _damaged(self, key: str, problem: str) -> DamagedError:
@@ -167,12 +183,6 @@ class CommittedStore(WrapperStore[Store]):
 
 def _crc32c_fits(content: bytes) -> bool:
     return bool(google_crc32c.value(content[:-4]) == int.from_bytes(content[-4:], "little"))
-
-
-async def _sha256(content: Any, size: int) -> str:
-    if size > SMALL:  # others are read meanwhile
-        return await asyncio.to_thread(lambda: hashlib.sha256(content).hexdigest())
-    return hashlib.sha256(content).hexdigest()
 
 
 def _slice(byte_range: ByteRequest, size: int) -> slice:

@@ -382,3 +382,12 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
     again = parse_spec(read_run(tmp_path / "run").spec)
     assert list(again.axes) == list(spec.axes) == ["q", "frequency_hz", "eps_drive"]
     assert digest_of(identity_of(again, make_plan(again), "k")) == digest_of(identity)
+
+
+def test_write_task__refuses_damaged_metadata(made):
+    """Chunks that were encoded by them would be committed, and read as something else."""
+    path = made.info.directory / "cube.zarr/section/zarr.json"
+    path.write_text(path.read_text().replace('"little"', '"big"'))
+    with pytest.raises(DamagedError, match=r"section/zarr\.json: its content has changed"):
+        made.commit(0)
+    assert read_commits(made.info, made.plan) == {}
