@@ -308,7 +308,7 @@ def place(tmp_path, write_spec, count):
 def test_in_place__the_old_run_stays_beside(place, bytes_of, count):
     mine, wide, fresh = place
     before = bytes_of(mine)
-    assert extend(mine, wide, workers=0, echo=silent).directory == mine
+    assert extend(mine, wide, workers=0, echo=silent).name == str(mine)
     assert bytes_of(mine) == bytes_of(fresh)
     assert bytes_of(mine.with_name("mine.before")) == before
     assert sorted(p.name for p in mine.parent.iterdir()) == ["mine", "mine.before"]
