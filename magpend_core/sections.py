@@ -10,7 +10,14 @@ import numpy as np
 
 from magpend_core.crossing import Crossing
 from magpend_core.engine.entry import N_LANES, integrate
-from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD_CLOSED, RECORD_LAST, Settings
+from magpend_core.engine.observers import (
+    FIRST_TURN,
+    ORBIT_PERIOD,
+    RECORD_CLOSED,
+    RECORD_LAST,
+    Settings,
+    window_of,
+)
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
@@ -154,7 +161,7 @@ def run_branches(
     max_orbit_period = check_count("max_orbit_period", max_orbit_period, 1)
     tolerance = check_tolerance("closure_tolerance", closure_tolerance)
     observer = RECORD_CLOSED if check_flag("stop_when_closed", stop_when_closed) else RECORD_LAST
-    settings = Settings(n_transient, n_keep, max_orbit_period, tolerance, max(64, 4 * max_orbit_period))
+    settings = Settings(n_transient, n_keep, max_orbit_period, tolerance, window_of(max_orbit_period))
     if method is not None:
         system = replace(system, method=method)
     if section is not None:

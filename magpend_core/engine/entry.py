@@ -139,6 +139,8 @@ def integrate(
         )
     initial = check_states(initial_states, 2, system.n_states, "initial_states")
     n_branches = len(frequency)
+    # memory that may not be written to is a type of its own to numba, and would compile the engine once more
+    frequency, packed = (np.require(a, requirements="W") for a in (frequency, packed))
     first_step = np.zeros(n_branches) if step_size is None else check_array("step_size", step_size, 1)
     for name, array in (("initial_states", initial), ("step_size", first_step)):
         if len(array) != n_branches:

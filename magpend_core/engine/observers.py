@@ -48,6 +48,11 @@ class Settings(NamedTuple):
     window: int
 
 
+def window_of(max_orbit_period: int) -> int:
+    """Sections that are looked at to say whether an orbit closes."""
+    return max(64, 4 * max_orbit_period)
+
+
 def _leave(state: Any, memory: Any, settings: Any) -> None:
     """Rewrite nothing."""
 

@@ -24,7 +24,8 @@ CommandError: Any = UsageError.__base__
 
 EXIT_HELP = "Exit codes: " + "; ".join(f"{int(code)} {code.sentence}" for code in Exit) + "."
 
-Directory = Annotated[Path, typer.Argument(metavar="DIR", help="Run directory.")]
+# no Path: that would make one slash of the two in s3://BUCKET
+Directory = Annotated[str, typer.Argument(metavar="DIR", help="Run directory, or s3://BUCKET/PREFIX.")]
 Csv = Annotated[
     str | None,
     typer.Option("--csv", metavar="FILE", help="Write the table as CSV; - writes it to the standard output."),

@@ -14,6 +14,7 @@ class Exit(IntEnum):
     LOCKED = 3
     FAILED = 4
     DAMAGED = 5
+    HUNG_UP = 129
     INTERRUPTED = 130
     TERMINATED = 143
 
@@ -32,4 +33,5 @@ _SENTENCES = {
     Exit.DAMAGED: "stored data are damaged",
     Exit.INTERRUPTED: "stopped by Ctrl-C; what is committed stays, the same command goes on",
     Exit.TERMINATED: "stopped by SIGTERM; likewise",
+    Exit.HUNG_UP: "stopped because its terminal was closed; likewise",
 }

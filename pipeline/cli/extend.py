@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -36,11 +35,11 @@ def extend(
         ),
     ] = None,
     also: Annotated[
-        list[Path] | None,
+        list[str] | None,
         typer.Option(metavar="DIR", help="A further run that holds cells, such as another half."),
     ] = None,
     out: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
             help="Directory of the wider run. Default: it takes the place of DIR when it is complete."
         ),
@@ -72,7 +71,7 @@ def extend(
         directory, spec, out, also=also or (), **changes, workers=workers, scheduler=scheduler,
         cluster=cluster, dashboard=dashboard, echo=console.note,
     )  # fmt: skip
-    console.result(f"cube: {state.directory / 'cube.zarr'}")
+    console.result(f"cube: {state.files.below('cube.zarr').name}")
 
 
 def _axes(texts: list[str]) -> dict[str, dict[str, Any]]:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from typing import Annotated, Any
+
+from pipeline.runs import stopping
+
+if __name__ == "__main__":
+    stopping.listen()
 
 import typer
 
@@ -113,15 +117,19 @@ def main() -> None:
     """Entry point: run the command line and turn errors into messages and exit codes."""
     code: Any = Exit.DONE
     try:
-        code = app(standalone_mode=False) or Exit.DONE
-        sys.stdout.flush()
+        with stopping.in_order():
+            code = app(standalone_mode=False) or Exit.DONE
+            sys.stdout.flush()
+        if code == Exit.INTERRUPTED:  # what typer makes of every signal
+            raise KeyboardInterrupt
     except (EnoughError, BrokenPipeError):
         _leave_quietly()
     except CommandError as error:
         _usage(error)
         code = Exit.REFUSED
-    except typer.Abort:
-        code = Exit.INTERRUPTED
+    except (typer.Abort, KeyboardInterrupt):
+        print("magpend: stopped.", file=sys.stderr)
+        code = 128 + (stopping.first_signal() or int(Exit.INTERRUPTED) - 128)
     except Exception as error:
         code = _exit_code(error)
         if code is Exit.BUG:
@@ -150,10 +158,8 @@ def _leave_quietly() -> None:
 
 
 def _exit_code(error: Exception) -> Exit:
-    from pipeline.runs.run import InterruptedRunError
-
-    if isinstance(error, InterruptedRunError):
-        return Exit.TERMINATED if error.signal_number == signal.SIGTERM else Exit.INTERRUPTED
+    if isinstance(error, stopping.InterruptedRunError):
+        return Exit(128 + error.signal_number)
     return next((code for kinds, code in _codes() if isinstance(error, kinds)), Exit.BUG)
 
 

@@ -13,6 +13,7 @@ from pipeline.cli.options import taking
 
 if TYPE_CHECKING:
     from pipeline.products.product import FigureOptions
+    from pipeline.store.files import Files
 
 FORMATS = ("png", "pdf", "svg")
 
@@ -43,7 +44,7 @@ plot_app = typer.Typer(
 )
 
 
-def draw(directory: Path, name: str, options: FigureOptions) -> None:
+def draw(directory: str, name: str, options: FigureOptions) -> None:
     """Draw a figure of a run, write it and the data drawn, and say where."""
     from pipeline.cli import console
     from pipeline.runs.drawing import drawn, ready
@@ -53,13 +54,13 @@ def draw(directory: Path, name: str, options: FigureOptions) -> None:
     if options.out:
         check_figure_path(_target_of(options))
     run, wanted = ready(directory, name, options, console.note)
-    target = _target_of(wanted) if wanted.out else _in_run(directory, name, wanted)
+    target = _target_of(wanted) if wanted.out else _in_run(run.info.files, name, wanted)
     if problem := unwritable(target.parent):
         raise RefusedError(f"{problem}; give another place for the figure: --out FILE.")
     figure = drawn(run, name, wanted)
     from pipeline.plots import save_data, save_figure
 
-    target.parent.mkdir(exist_ok=True)
+    target.parent.mkdir(parents=not wanted.out, exist_ok=True)
     console.result(f"figure: {save_figure(figure, target)}")
     console.result(f"data: {save_data(figure, target)}")
 
@@ -70,8 +71,10 @@ def _target_of(options: FigureOptions) -> Path:
     return out.with_name(out.name + suffix) if options.format and out.suffix.lower() != suffix else out
 
 
-def _in_run(directory: Path, name: str, options: FigureOptions) -> Path:
-    return directory / "figures" / f"{name}{options.label()}.{options.format or 'png'}"
+def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
+    """File in the run directory; of a run in an object store, in a folder of its name in ``figures``."""
+    folder = files.local / "figures" if files.local else Path("figures") / files.name.rpartition("/")[2]
+    return folder / f"{name}{options.label()}.{options.format or 'png'}"
 
 
 def check_figure_path(path: Path) -> None:

@@ -55,7 +55,9 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be done;
 
 def run(
     spec: Spec,
-    out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
+    out: Annotated[
+        str | None, typer.Option(help="Run directory, or s3://BUCKET/PREFIX; by default runs/NAME.")
+    ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     cluster: ClusterFile = None,
@@ -87,14 +89,14 @@ def run(
         spec, out, workers=workers, scheduler=scheduler, cluster=cluster, dashboard=dashboard, smoke=smoke,
         echo=console.note,
     )  # fmt: skip
-    console.result(f"cube: {state.directory / 'cube.zarr'}")
+    console.result(f"cube: {state.files.below('cube.zarr').name}")
     if plot:
-        _diagram(state.directory)
+        _diagram(state.name)
     else:
-        console.result(f"plot it with: {preview.figure_command(state.plan, state.directory)}")
+        console.result(f"plot it with: {preview.figure_command(state.plan, state.name)}")
 
 
-def _diagram(directory: Path) -> None:
+def _diagram(directory: str) -> None:
     from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES
 
@@ -110,7 +112,7 @@ def status(directory: Directory, json: Json = False) -> None:
 
     found = state(directory)
     row = {
-        "directory": str(found.directory), "title": found.title, "complete": found.complete,
+        "directory": found.name, "title": found.title, "complete": found.complete,
         "cells": found.plan.n_cells, "committed_cells": found.n_committed, "tasks": found.plan.n_tasks,
         "committed_tasks": len(found.done), "status": dict(found.cells),
     }  # fmt: skip

@@ -32,7 +32,7 @@ def submit(
     if dry_run:
         console.result(prepared.script.rstrip("\n"))
     elif prepared.complete:
-        console.result(f"{prepared.directory} is complete; nothing to send.")
+        console.result(f"{prepared.name} is complete; nothing to send.")
     else:
         for line in send(prepared).lines():
             console.result(line)

@@ -42,14 +42,14 @@ class Where:
         With the ``[cluster]`` table of a batch system; by default what ``MAGPEND_CLUSTER`` says.
     dashboard : bool
         Serve dask's dashboard on loopback, and say where.
-    directory : Path, optional
-        Which all workers must see.
+    place : str, optional
+        Of the run directory, which all workers must see: see `open_files`.
     """
 
     scheduler: str | None = None
     cluster_file: Path | None = None
     dashboard: bool = False
-    directory: Path | None = None
+    place: str | None = None
 
     @classmethod
     def of(cls, scheduler: Where | str | None) -> Where:
@@ -139,7 +139,7 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
         Before anything is computed.
     """
     import dask
-    import distributed  # noqa: F401 - before its settings change: what is set earlier takes them all along
+    import distributed  # noqa: F401  its defaults come with it, and would go with a setting made before them
 
     target = where.resolved()
     with contextlib.ExitStack() as stack:
@@ -149,7 +149,7 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
             client = stack.enter_context(_client(target.url, security_of(target)))
             _wait(client, target.named, _patience(), echo)
         elif isinstance(target, Cluster):
-            folder = jobs_folder(where.directory or Path.cwd() / "magpend")
+            folder = jobs_folder(where.place or "magpend")
             jobs = stack.enter_context(job_cluster(target, folder, dashboard=where.dashboard, echo=echo))
             client = stack.enter_context(_client(jobs, None))
             _wait(client, f"jobs of {target.kind}", target.wait_s, echo)
@@ -159,7 +159,7 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
         if where.dashboard:
             echo(f"dashboard: {client.dashboard_link}")
         if target != LOCAL:
-            _check(client, where.directory)
+            _check(client, where.place)
         yield client
 
 
@@ -201,8 +201,8 @@ def _workers(client: Any) -> list[str]:
     return list(client.scheduler_info(n_workers=-1)["workers"])
 
 
-def _check(client: Any, directory: Path | None) -> None:
+def _check(client: Any, place: str | None) -> None:
     workers = _workers(client)
     check_versions(client, workers)
-    if directory is not None:
-        check_directory(client, workers, directory)
+    if place is not None:
+        check_directory(client, workers, place)

@@ -70,10 +70,12 @@ def run_tasks(
     if where.resolved() == IN_PROCESS or workers == 0:
         yield from _in_process(task, order)
         return
+    from pipeline.compute.probe import Fitting
     from pipeline.compute.window import Window
 
     n_workers = min(workers or default_workers(), len(indices))
     with connected(where, n_workers, echo) as client:
+        task = Fitting(task)
         yield from Window(client, task, order, seconds=seconds, echo=echo).results()
     order.close()
 

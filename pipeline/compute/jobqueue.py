@@ -22,6 +22,8 @@ COMMANDS = {"slurm": "sbatch", "pbs": "qsub", "sge": "qsub", "lsf": "bsub"}
 
 _THREADS = ("export NUMBA_NUM_THREADS=1", "export OMP_NUM_THREADS=1")
 _MEANWHILE_S = 60
+_TARGET = "0.1 s"
+"""Few tasks are in flight per worker, however many are left: more workers are wanted if they take longer."""
 
 
 def check_means(cluster: Cluster) -> None:
@@ -33,10 +35,9 @@ def check_means(cluster: Cluster) -> None:
         Naming the extra that is not installed, or the command that is not found.
     """
     problems = []
-    if not all(find_spec(name) for name in ("dask_jobqueue", "cryptography")):
+    if not find_spec("dask_jobqueue"):
         problems.append(
-            f"{cluster.kind}: needs packages that are not installed; install them: pip install "
-            "'magpend[cluster]'."
+            f"{cluster.kind}: needs dask-jobqueue, which is not installed: pip install 'magpend[cluster]'."
         )
     if not shutil.which(COMMANDS[cluster.kind]):
         problems.append(
@@ -47,9 +48,15 @@ def check_means(cluster: Cluster) -> None:
         raise SpecError(problems)
 
 
-def jobs_folder(directory: Path) -> Path:
-    """Where a run's batch scripts, and what its jobs say, are kept: beside its directory."""
-    return directory.absolute().with_name(f"{directory.absolute().name}.jobs")
+def jobs_folder(place: str) -> Path:
+    """Where a run's batch scripts, and what its jobs say, are kept: beside its directory.
+
+    Those of a run that is in no local folder are kept in the working directory.
+    """
+    where = (
+        Path(place).absolute() if "://" not in place else Path.cwd() / place.rstrip("/").rpartition("/")[2]
+    )
+    return where.with_name(f"{where.name}.jobs")
 
 
 def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
@@ -147,10 +154,9 @@ def job_cluster(
         except (ValueError, OSError, RuntimeError) as error:
             raise SchedulerError(f"{cluster.kind}: no scheduler could be started here ({error}).") from None
         with jobs:
-            if cluster.min_jobs == cluster.max_jobs:
-                jobs.scale(jobs=cluster.max_jobs)
-            else:
-                jobs.adapt(minimum_jobs=cluster.min_jobs, maximum_jobs=cluster.max_jobs)
+            # not `scale`: that would not replace workers that have left at the end of their lifetime; and
+            # one job at least, as no task is submitted before the first worker was looked at
+            jobs.adapt(minimum_jobs=cluster.min_jobs, maximum_jobs=cluster.max_jobs, target_duration=_TARGET)
             echo(
                 f"scheduler at {jobs.scheduler_address} in this process ({os.uname().nodename}); workers "
                 f"come in {cluster.kind} jobs named {JOB_NAME}, up to {cluster.max_jobs} of {cluster.cores} "

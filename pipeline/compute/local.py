@@ -29,8 +29,11 @@ START_S = 180.0
 """A worker that does not start within this time has failed [s]."""
 
 SETTINGS: dict[str, Any] = {
-    # a profile of every task would grow with their number
+    # what nobody reads, and what grows with tasks and time: profiles, events, states of the machine
     "distributed.worker.profile.enabled": False,
+    "distributed.admin.low-level-log-length": 20,
+    "distributed.admin.log-length": 100,
+    "distributed.admin.system-monitor.log-length": 20,
     "distributed.worker.http.routes": [],
     # results are small: there is nothing to write to disk
     "distributed.worker.memory.target": False,
@@ -59,10 +62,10 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
     import dask
     from distributed import LocalCluster
 
-    _quiet_tracker()
+    _start_tracker()
     with (
-        dask.config.set(SETTINGS if dashboard else SETTINGS | NO_PAGES),
         _scratch() as scratch,
+        dask.config.set({**SETTINGS, **({} if dashboard else NO_PAGES), "temporary-directory": str(scratch)}),
         _loop() as loop,
         LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=0,
@@ -110,13 +113,9 @@ def _loop() -> Iterator[Any]:
     """
     from distributed.utils import LoopRunner
 
-    numbers = {signal.SIGINT, signal.SIGHUP}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-    try:
+    with _blocked({signal.SIGINT, signal.SIGHUP}):
         runner = LoopRunner()
         runner.start()  # type: ignore[no-untyped-call]
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     try:
         yield runner.loop
     finally:
@@ -168,21 +167,33 @@ def _sweep() -> None:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-def _quiet_tracker() -> None:
+def _start_tracker() -> None:
     """Start the process that removes semaphores of killed processes, without its warning about each.
 
-    What it removes is what it is there for; nobody can do anything about the warning.
+    What it removes is what it is there for; nobody can do anything about the warning. It must outlive a
+    terminal that closes, as it does Ctrl-C.
     """
     name, before = "PYTHONWARNINGS", os.environ.get("PYTHONWARNINGS")
     quiet = "ignore::UserWarning:multiprocessing.resource_tracker"
     os.environ[name] = f"{before},{quiet}" if before else quiet
     try:
-        resource_tracker.ensure_running()
+        with _blocked({signal.SIGHUP}):
+            resource_tracker.ensure_running()
     finally:
         if before is None:
             del os.environ[name]
         else:
             os.environ[name] = before
+
+
+@contextlib.contextmanager
+def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
+    """Block signals in this thread, and in what it starts meanwhile."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _silence() -> None:

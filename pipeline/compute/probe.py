@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import platform
+import re
 import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping
@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
+from pipeline.store.errors import StoreError
+from pipeline.store.files import COMMITS, TEMPORARY, open_files
 
 PACKAGES = ("numpy", "numba", "zarr", "numcodecs", "dask", "distributed")
 _ROOMS = ("spec", "layout", "products", "compute", "store")
 _SHOWN = 3
-_LATE_S = 5.0
+_LATE_S, _AGAIN_S = 5.0, 0.2
 """A network's file system may take so long to show a new file."""
 
 
@@ -59,7 +61,8 @@ def check_versions(client: Any, workers: Iterable[str]) -> None:
 
 
 def _difference(here: Mapping[str, str], there: Any) -> str:
-    if isinstance(there, (ModuleNotFoundError, AttributeError)):
+    # what cannot be unpickled there comes back as an Exception with the error's text
+    if isinstance(there, Exception) and re.search(r"ModuleNotFoundError|AttributeError", repr(there)):
         return "has no magpend, or one of another version"
     if isinstance(there, BaseException):
         return f"does not answer ({type(there).__name__}: {there})"
@@ -67,7 +70,7 @@ def _difference(here: Mapping[str, str], there: Any) -> str:
     return ", ".join(f"{name} {theirs}, here {ours}" for name, (theirs, ours) in found.items())
 
 
-def check_directory(client: Any, workers: Iterable[str], directory: Path) -> None:
+def check_directory(client: Any, workers: Iterable[str], place: str) -> None:
     """Refuse workers that do not see the run directory, or cannot write to it.
 
     A file of one moment goes through all of them: another directory by the same name does not pass.
@@ -77,39 +80,49 @@ def check_directory(client: Any, workers: Iterable[str], directory: Path) -> Non
     SchedulerError
         Naming workers, and the remedy.
     """
-    directory = directory.absolute()
-    token = uuid.uuid4().hex
+    files, token = open_files(place), uuid.uuid4().hex
     # where, and named as, leftovers are swept by the next run, should this process be killed here
-    path = directory / "commits" / f".probe.{token}.tmp"
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(token, "ascii")
+    key = f"{COMMITS}/.probe.{token}{TEMPORARY}"
+    files.write(key, token.encode())
     try:
-        answers = client.run(sees, str(path), token, workers=list(workers), on_error="return")
+        answers = client.run(sees, place, key, token, workers=list(workers), on_error="return")
     finally:
-        path.unlink(missing_ok=True)
+        files.remove([key])
     blind = {address: str(answer) for address, answer in answers.items() if answer != ""}
     if blind:
         raise SchedulerError(
-            f"{len(blind)} of {len(answers)} workers cannot use {directory}: {_listed(blind)}. Workers write "
-            "their results there themselves: choose, with --out, a folder of a file system that all of them "
-            "see by this path and may write to."
+            f"{len(blind)} of {len(answers)} workers cannot use {files.name}: {_listed(blind)}. Workers "
+            "write their results there themselves: choose, with --out, a folder of a file system that all of "
+            "them see by this path and may write to."
         )
 
 
-def sees(path: str, token: str) -> str:
+def sees(place: str, key: str, token: str) -> str:
     """Say what bars this process from a run directory; empty if nothing does."""
-    file, deadline = Path(path), time.monotonic() + _LATE_S
+    deadline = time.monotonic() + _LATE_S
     while True:
         try:
-            found = file.read_text("ascii")
-        except OSError as error:
-            if time.monotonic() < deadline and isinstance(error, FileNotFoundError) and file.parent.is_dir():
-                time.sleep(0.2)
-                continue
-            return f"does not see it ({error.strerror or error})"
-        if found != token:
-            return "sees another one by that name"
-        return "" if os.access(file.parent, os.W_OK | os.X_OK) else "may not write to it"
+            files = open_files(place)
+            files.names()
+            found = files.read(key).decode(errors="replace")
+            break
+        except (OSError, StoreError) as error:
+            if time.monotonic() > deadline or not isinstance(error, FileNotFoundError):
+                return f"does not see it ({_reason(error)})"
+            time.sleep(_AGAIN_S)
+    if found != token:
+        return "sees another one by that name"
+    mine = f"{COMMITS}/.probe.{uuid.uuid4().hex}{TEMPORARY}"
+    try:
+        files.write(mine, b"")
+        files.remove([mine])
+    except (OSError, StoreError) as error:
+        return f"cannot write to it ({_reason(error)})"
+    return ""
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)
 
 
 def _listed(problems: Mapping[str, str]) -> str:

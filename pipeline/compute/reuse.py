@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core import Sections, Status
+from pipeline.compute.longer import kept_on, obstacle
 from pipeline.compute.task import Integrate, Job, integrate
 from pipeline.compute.walking import WALKED, going_on
 from pipeline.layout.cells import CellMap, Inputs
@@ -55,15 +56,20 @@ class Source:
     finder: Finder = field(init=False)
     names: list[str] = field(init=False)
     missing: list[str] = field(init=False)
+    goes_on: bool = field(init=False)
 
     def __post_init__(self) -> None:
         self.finder = Finder(self.run.spec)
         same = same_products(self.run, self.wanted)
-        self.missing = [name for name in self.wanted.products if name not in same]
+        self.goes_on = self.run.spec.integration.n_keep < self.wanted.integration.n_keep
+        # exponents begin at the last section, which is another then
+        self.missing = [name for name in self.wanted.products if self.goes_on or name not in same]
         model = self.wanted.model
         products = [CELL_PRODUCTS[n].variables(self.wanted.products[n], model) for n in same]
         own = [*base_variables(model), *(v for variables in products for v in variables)]
         self.names = [variable.name for variable in own]
+        self._is_committed = np.zeros(self.run.plan.n_tasks + 1, bool)
+        self._is_committed[list(self.run.commits)] = True
         self._read = lru_cache(maxsize=2)(partial(read_block, self.run, names=tuple(self.names)))
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
@@ -72,9 +78,7 @@ class Source:
         In a refined grid some of these were inferred, which `take` leaves out.
         """
         place = self.finder.find(inputs, way)
-        is_committed = np.zeros(self.run.plan.n_tasks + 1, bool)
-        is_committed[list(self.run.commits)] = True
-        return np.where(is_committed[self._task(place)], place, NOWHERE)
+        return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
         """Return which of some cells were integrated and are whole, and these cells' variables."""
@@ -137,9 +141,8 @@ def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
         Specification and identity of the run that would take them.
     """
     lines = unlike(run.info.identity, identity)
-    old, new = run.spec.integration.n_keep, wanted.integration.n_keep
-    if old != new:
-        lines.append(f"integration.n_keep: {old} in the directory, {new} now")
+    if line := obstacle(run.spec, wanted):
+        lines.append(line)
     same = same_products(run, wanted)
     return lines + [
         f"products.{name}: is watched while cells are integrated, and not as asked for in the directory"
@@ -194,6 +197,8 @@ class Pool:
         for source in self.sources:
             place = source.find(begin.take(rest), way)
             taken, stored = source.take(place.ravel())
+            if source.goes_on and taken.any():
+                taken, stored = self._go_on(spec, inputs.take(rest), source, taken, stored)
             n_taken = _leading(taken.reshape(place.shape))
             order = np.cumsum(taken).reshape(place.shape) - 1
             for n in np.unique(n_taken[n_taken > 0]):
@@ -211,6 +216,17 @@ class Pool:
         if len(rest):
             _put(values, rest, integrate(spec, inputs.take(rest)), n_branches)
         return values
+
+    def _go_on(
+        self, spec: Spec, inputs: Inputs, source: Source, taken: np.ndarray, stored: Values
+    ) -> tuple[np.ndarray, Values]:
+        """Let cells of a sweep go on to more sections; which of them did, and their variables."""
+        rows = np.flatnonzero(taken)
+        points = {name: array[:, None] for name, array in stored.items()}
+        is_exact, longer = kept_on(spec, inputs.take(rows), points, source.run.spec.integration.n_keep)
+        taken = taken.copy()
+        taken[rows[~is_exact]] = False
+        return taken, {name: array[:, 0] for name, array in longer.items()}
 
 
 def _leading(taken: np.ndarray) -> np.ndarray:
@@ -240,6 +256,7 @@ def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], name
         orbit_period=values["orbit_period"], n_periods=values["n_periods"], n_steps=values["n_steps"],
         n_rejected=values["n_rejected"], final_state=values["section"][:, :, -1],
         step_size=values["step_size"], return_time=values.get("return_time"),
+        extremes=values.get("extremes"),
     )  # fmt: skip
     found: Values = {}
     for name in names:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,7 +63,7 @@ def _prepare(
     """Read a run once per worker, and make sure that this installation would compute the same."""
     if origin is not None:
         import_model(*origin)
-    info = read_run(Path(directory))
+    info = read_run(directory)
     spec = kept_spec(info.spec)
     plan = make_plan(spec)
     identity = identity_of(spec, plan, kernel_version())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import queue
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -25,6 +26,9 @@ WINDOW = 3
 
 TICK_S = 1.0
 """The workers are looked at so often [s]."""
+
+MOST_LOOKED_AT = 100
+"""Workers that are looked at in a second: more of them are looked at less often."""
 
 ANSWER_S = 30.0
 """A scheduler that does not answer for so long is taken for gone [s]."""
@@ -231,10 +235,7 @@ class Window:
     def _restart(self, address: str) -> None:
         """End a worker; its nanny starts a new one, and the scheduler gives its tasks to others."""
         self._watch.forget(address)
-        restart = self._client.restart_workers(
-            [address], timeout=ANSWER_S, raise_for_error=False, asynchronous=True
-        )
-        asyncio.run_coroutine_threadsafe(_quietly(restart), self._client.loop.asyncio_loop)
+        threading.Thread(target=_restarted, args=(self._client, address), daemon=True).start()
 
 
 class Watch:
@@ -262,7 +263,7 @@ class Watch:
 
     def due(self) -> bool:
         """Whether it is time to look again."""
-        return self.now - self._looked >= TICK_S
+        return self.now - self._looked >= max(TICK_S, len(self._heard) / MOST_LOOKED_AT)
 
     def look(self, workers: dict[str, Any]) -> list[str]:
         """Take what the scheduler knows of its workers, and return those that have fallen silent."""
@@ -290,9 +291,10 @@ async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]
         return None, error
 
 
-async def _quietly(restart: Any) -> None:
+def _restarted(client: Any, address: str) -> None:
+    """Restart a worker, and wait for that; in a thread of its own, for a stopped process takes its time."""
     with contextlib.suppress(Exception):
-        await restart
+        client.restart_workers([address], timeout=ANSWER_S, raise_for_error=False)
 
 
 def _reason(error: BaseException) -> str:

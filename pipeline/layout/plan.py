@@ -281,7 +281,9 @@ def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float
     largest = max(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
     n_seeds = cells.shape[-1] // len(directions)
     if len(directions) > 1:
+        # fewer than such a group would put branches of both directions into one task
         n_seeds = _group(n_seeds, wanted, TASK_BYTES // _bytes_per_cell(spec))
+        wanted = max(wanted, n_seeds)
     block = list(_block((*cells.shape[:-1], n_seeds), cells.path, wanted))
     n_branches = math.prod(block) // n_points
     points = spec.execution.points_per_task

@@ -30,12 +30,12 @@ from pipeline.runs.naming import named
 from pipeline.runs.versions import code_version
 from pipeline.spec.problems import SpecError, unknown_name, validated
 from pipeline.store.errors import DamagedError
-from pipeline.store.files import DERIVED
+from pipeline.store.files import DERIVED, Files
 from pipeline.store.local import unwritable
 from pipeline.store.products import (
     leftover_products,
     open_product,
-    product_paths,
+    products_in,
     read_product_attrs,
     remove_product,
     write_product,
@@ -122,26 +122,26 @@ def derive(
     _refuse_recorded(run, name)
     wanted = prepared(run, analysis, wanted)
     key = _key(run, analysis, wanted)
-    path = run.directory / DERIVED / f"{name}-{key['derived_key'][:8]}.zarr"
+    place = run.info.files.below(DERIVED).below(f"{name}-{key['derived_key'][:8]}.zarr")
     try:
-        ds = open_product(path)
+        ds = open_product(place)
         if all(ds.attrs.get(part) == value for part, value in key.items()):
-            run.echo(f"{name}: taken from {path}")
-            return _placed(ds, path)
+            run.echo(f"{name}: taken from {place.name}")
+            return _placed(ds, place)
     except FileNotFoundError:
         pass
     except DamagedError as error:
         run.echo(f"{name}: damaged ({error}); computing it again")
-    if problem := unwritable(path.parent):
+    if place.local is not None and (problem := unwritable(place.local.parent)):
         run.echo(f"{problem}: what {name} finds is shown, and not kept")
-    return _kept(run, path, _compute(run, analysis, wanted).assign_attrs(key))
+    return _kept(run, place, _compute(run, analysis, wanted).assign_attrs(key))
 
 
 def _refuse_recorded(run: Run, name: str) -> None:
     """Refuse a run under a recorded drive: an analysis runs cells on, under a drive that goes on."""
     if run.spec.recorded is not None:
         raise SpecError([
-            f"{run.directory}: its drive is the recording {run.spec.recorded.file}, and {name} goes on where "
+            f"{run.name}: its drive is the recording {run.spec.recorded.file}, and {name} goes on where "
             "it ends. For attractors and what rests on them make a run at its mean frequency (frequency_hz = "
             f"{run.spec.frequency_hz:.6g} instead of [drive]); this one's sections can be drawn: magpend "
             "plot bifurcation, or section."
@@ -156,7 +156,7 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
     SpecError
         If it has not, with the directory's name.
     """
-    with refused(run.directory):
+    with refused(run.name):
         options = named(run, options)
         if product.needs:
             function_of(product.needs)(run, options)
@@ -165,7 +165,7 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 @contextlib.contextmanager
-def refused(directory: Path) -> Iterator[None]:
+def refused(directory: str | Path) -> Iterator[None]:
     """Turn what an analysis or a figure refuses into a sentence with the directory's name."""
     try:
         yield
@@ -195,38 +195,42 @@ def _key(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
 
 def _compute(run: AnalysedRun, analysis: Analysis, options: Options) -> xr.Dataset:
     started = time.perf_counter()
-    with refused(run.directory):
+    with refused(run.name):
         result: xr.Dataset = function_of(analysis.compute)(run, options)
     run.echo(f"{analysis.name}: computed in {time.perf_counter() - started:.1f} s")
     return result
 
 
-def _kept(run: AnalysedRun, path: Path, result: xr.Dataset) -> xr.Dataset:
+def _kept(run: AnalysedRun, place: Files, result: xr.Dataset) -> xr.Dataset:
     try:
-        write_product(path, result)
+        write_product(place, result)
     except OSError as error:
-        run.echo(f"{path.name}: not kept ({error}); what was found is shown all the same")
+        kept = place.name.rpartition("/")[2]
+        run.echo(f"{kept}: not kept ({error}); what was found is shown all the same")
         return result
-    return _placed(open_product(path), path)
+    return _placed(open_product(place), place)
 
 
-def _placed(ds: xr.Dataset, path: Path) -> xr.Dataset:
-    ds.encoding["source"] = str(path)
+def _placed(ds: xr.Dataset, place: Files) -> xr.Dataset:
+    ds.encoding["source"] = place.name
     return ds
 
 
-def stale(source: Source) -> list[Path]:
-    """Results of an earlier cube or an earlier version of the code, damaged ones, and leftovers.
+def stale(source: Source) -> list[str]:
+    """Places of results of an earlier cube or an earlier version of the code, damaged ones, and leftovers.
 
     A leftover is what a process that was killed had begun to write; one younger than an hour may
     belong to a process at work and is not listed.
     """
-    run = Run.open(source)
-    folder = run.directory / DERIVED
+    return [place.name for place in _stale(Run.open(source))]
 
-    def is_stale(path: Path) -> bool:
+
+def _stale(run: Run) -> list[Files]:
+    folder = run.info.files.below(DERIVED)
+
+    def is_stale(place: Files) -> bool:
         try:
-            attrs = read_product_attrs(path)
+            attrs = read_product_attrs(place)
         except DamagedError:
             return True
         name = str(attrs.get("derived_product"))
@@ -234,13 +238,13 @@ def stale(source: Source) -> list[Path]:
             return True
         return bool(attrs.get("analysis_version") != code_version(name))
 
-    products = [path for path in product_paths(folder) if is_stale(path)]
+    products = [place for place in products_in(folder) if is_stale(place)]
     return products + leftover_products(folder, older_than=_LEFTOVER_SECONDS)
 
 
-def prune(source: Source) -> list[Path]:
+def prune(source: Source) -> list[str]:
     """Remove what `stale` lists; returns it."""
-    found = stale(source)
-    for path in found:
-        remove_product(path)
-    return found
+    found = _stale(Run.open(source))
+    for place in found:
+        remove_product(place)
+    return [place.name for place in found]

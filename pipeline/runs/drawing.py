@@ -68,5 +68,5 @@ def drawn(run: AnalysedRun, name: str, options: FigureOptions) -> DataFigure:
     """Draw a figure with options that are settled."""
     from pipeline.plots import draw_figure
 
-    with refused(run.directory):
+    with refused(run.name):
         return draw_figure(run, name, options)

@@ -69,12 +69,26 @@ class Extension:
         """Digest of the wider run."""
         return digest_of(self.identity)
 
+    @property
+    def share(self) -> float:
+        """Part of the drive periods of a fresh run that is left."""
+        counts = zip(self.runs, self.counts, strict=True)
+        left = self.plan.n_cells - self.reused + sum(count * self._more(run) for run, count in counts)
+        return left / self.plan.n_cells
+
+    def _more(self, run: Run) -> float:
+        """Part of a cell's periods by which the cells of a run have to go on."""
+        integration = self.spec.integration
+        n_more = integration.n_keep - run.spec.integration.n_keep
+        return n_more / (integration.n_transient + integration.n_keep)
+
     def lines(self) -> Iterator[str]:
         """Say what is taken from where."""
         yield from self.notes
         n = self.plan.n_cells
         for run, count in zip(self.runs, self.counts, strict=True):
-            yield f"{count} of {n} cells are taken from {run.name}"
+            how = "go on from their last section in" if self._more(run) else "are taken from"
+            yield f"{count} of {n} cells {how} {run.name}"
         bound = "at most " if self.spec.refine is not None else ""
         yield f"{bound}{n - self.reused} cells are left to integrate"
 
@@ -186,7 +200,7 @@ def describe_extension(extension: Extension, *, workers: int | None = None) -> I
     yield f"{spec.kind}: {plan.n_cells} cells ({dims or 'one cell'}) in {plan.n_tasks} tasks"
     yield from extension.lines()
     yield f"cube: {size(plan.n_bytes)} before compression"
-    yield time_line(spec, plan, 1 - extension.reused / plan.n_cells, plan.n_tasks, workers)
+    yield time_line(spec, plan, extension.share, plan.n_tasks, workers)
 
 
 def extend(
@@ -253,7 +267,7 @@ def extend(
     first = open_files(source)
     in_place = out is None or open_files(out).place == first.place
     built = open_files(_beside(_folder(first)) if in_place else str(out))
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, built.local)
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, built.place)
     where.resolved()
     how: dict[str, Any] = {"workers": workers, "where": where, "echo": echo}
     if in_place:

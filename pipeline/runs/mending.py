@@ -20,7 +20,7 @@ _LONG_SECONDS = 5.0
 _NAMED = 10
 
 
-def sound_commits(info: RunInfo, plan: Plan, echo: Echo) -> Records:
+def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) -> Records:
     """Return the records whose chunks are what was written, byte for byte; the others are withdrawn.
 
     Equal sizes and times prove nothing, so every committed file is read, unless the environment has
@@ -33,6 +33,9 @@ def sound_commits(info: RunInfo, plan: Plan, echo: Echo) -> Records:
         The run.
     echo
         Prints a line; names what is computed again, and why.
+    alone
+        Whether no other process can be writing here; else what no record vouches for stays, since another
+        may be about to commit it.
     """
     started = time.perf_counter()
     contents = checks_chunks()
@@ -50,5 +53,6 @@ def sound_commits(info: RunInfo, plan: Plan, echo: Echo) -> Records:
     if damaged:
         withdraw(info, damaged)
         records, _ = scan(info, plan)
-    sweep(info, plan, records, echo)
+    if alone:
+        sweep(info, plan, records, echo)
     return records

@@ -16,7 +16,7 @@ from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.commits import read_commits
-from pipeline.store.files import local_path
+from pipeline.store.files import open_files
 from pipeline.store.setup import check
 
 MANY_SECTIONS = 500
@@ -41,7 +41,7 @@ def first_figure(plan: Plan) -> str:
     return "bifurcation" if any(not is_start_dim(d) for d in plan.dims) else "gallery"
 
 
-def figure_command(plan: Plan, directory: Path) -> str:
+def figure_command(plan: Plan, directory: str | Path) -> str:
     """Return the command that draws `first_figure` of a run."""
     name = first_figure(plan)
     as_map = name == "lyapunov" and _long(plan)[0] >= 2
@@ -87,18 +87,18 @@ def describe_plan(
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     check_starts(parsed)
-    directory = local_path(out) if out is not None else default_directory(path, smoke)
+    files = open_files(out if out is not None else default_directory(path, smoke))
     plan = make_plan(parsed)
-    info = check(directory, identity_here(parsed, plan))
+    info = check(files, identity_here(parsed, plan))
     done = read_commits(info, plan) if info else {}
-    check_space(plan, directory, plan.n_cells - sum(plan.cells_in(i) for i in done))
+    check_space(plan, files.local, plan.n_cells - sum(plan.cells_in(i) for i in done))
     if parsed.title:
         yield parsed.title
     dims = ", ".join(f"{d} {n}" for d, n in zip(plan.dims, plan.shape, strict=True))
     yield f"{parsed.kind}: {plan.n_cells} cells ({dims or 'one cell'})"
     yield f"tasks: {plan.n_tasks} of {' x '.join(map(str, plan.block)) or '1'} cells, {len(done)} done"
     yield f"cube: {size(plan.n_bytes)} before compression"
-    yield f"directory: {directory}" + ("" if info else " (not created)")
+    yield f"directory: {files.name}" + ("" if info else " (not created)")
     missing = set(range(plan.n_tasks)) - set(done)
     share = sum(plan.cells_in(i) for i in missing) / plan.n_cells
     yield time_line(parsed, plan, share, len(missing), workers)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,39 +18,26 @@ from pipeline.products.reporting import report
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
+from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
 from pipeline.store.checking import damaged_records, name_of
-from pipeline.store.commits import log_timing
+from pipeline.store.commits import log_timing, sweep
 from pipeline.store.errors import IncompleteError
 from pipeline.store.files import Files, open_files
 from pipeline.store.packing import Packer
+from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
 
 if TYPE_CHECKING:
     from pipeline.compute.clients import Where
 
+__all__ = ["InterruptedRunError", "carry_out", "identity_here", "run"]
+
 Echo = Callable[[str], None]
 Sources = Sequence[tuple[str, str]]
 """Directories and digests of runs that hold cells of the one at hand."""
-
-
-class InterruptedRunError(Exception):
-    """The run was stopped by a signal; what was committed stays.
-
-    Attributes
-    ----------
-    signal_number : int
-    """
-
-    def __init__(self, signal_number: int, message: str) -> None:
-        self.signal_number = signal_number
-        super().__init__(message)
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, treated like Ctrl-C."""
 
 
 def run(
@@ -104,14 +89,14 @@ def run(
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
-        After Ctrl-C or SIGTERM. What was committed stays.
+        After Ctrl-C, SIGTERM or SIGHUP. What was committed stays.
     """
     from pipeline.compute.clients import Where
 
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     files = open_files(out if out is not None else default_directory(path, smoke))
-    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.local)
+    where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)
     carry_out(parsed, path.read_text("utf-8"), files, workers=workers, where=where, echo=echo)
@@ -152,10 +137,11 @@ def carry_out(
     identity = identity_here(spec, plan)
     if check(files, identity) is None:
         check_space(plan, files.local)
-    with files.lock():
-        info = establish(files, spec, plan, identity, text, echo)
-        with stoppable(files.name):
-            _complete(info, spec, plan, workers, where, echo, sources)
+    with stoppable(files.name), files.lock() as alone:
+        is_alone = alone is not False
+        info = establish(files, spec, plan, identity, text, echo, alone=is_alone)
+        commits = sound_commits(info, plan, echo, alone=is_alone)
+        _complete(info, spec, plan, commits, workers, where, echo, sources)
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
@@ -176,6 +162,7 @@ def _complete(
     info: RunInfo,
     spec: Spec,
     plan: Plan,
+    commits: Records,
     workers: int | None,
     where: Where,
     echo: Echo,
@@ -184,7 +171,6 @@ def _complete(
     """Compute all tasks without a valid commit record."""
     from pipeline.compute import clients, execute, task
 
-    commits = sound_commits(info, plan, echo)
     packer = Packer(info, plan, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
@@ -221,11 +207,11 @@ def _complete(
             log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
             packer.add(result["task"])
             progress.add(result["cells"])
-    _require_all(info, plan)
+    _require_all(info, plan, echo)
 
 
-def _require_all(info: RunInfo, plan: Plan) -> None:
-    """Believe the commit records, not the workers."""
+def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
+    """Believe the commit records, not the workers; remove what those left that were stopped at their work."""
     commits, problems = damaged_records(info, plan, contents=False)
     absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:
@@ -235,31 +221,4 @@ def _require_all(info: RunInfo, plan: Plan) -> None:
             f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
             "and have room to write; then give the same command again: it computes these tasks alone."
         )
-
-
-@contextlib.contextmanager
-def stoppable(directory: str | Path) -> Iterator[None]:
-    """Turn Ctrl-C and SIGTERM into `InterruptedRunError`, after everything inside has been closed.
-
-    Parameters
-    ----------
-    directory
-        Where what has been done is kept, for the message.
-    """
-
-    def stop(number: int, frame: Any) -> None:
-        raise _Terminated
-
-    try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not the main thread: signals are somebody else's
-        before = None
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        number = signal.SIGTERM if isinstance(error, _Terminated) else signal.SIGINT
-        message = f"Stopped. What is committed in {directory} stays; the same command goes on from there."
-        raise InterruptedRunError(number, message) from None
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGTERM, before)
+    sweep(info, plan, commits, echo)

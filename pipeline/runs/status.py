@@ -17,7 +17,8 @@ class State:
 
     Attributes
     ----------
-    directory : Path
+    files : Files
+        Of the run directory.
     title : str
     plan : Plan
     done : frozenset of int
@@ -26,11 +27,16 @@ class State:
         Committed cells by status name.
     """
 
-    directory: Path
+    files: Files
     title: str
     plan: Plan
     done: frozenset[int]
     cells: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """What people call the directory."""
+        return self.files.name
 
     @property
     def n_committed(self) -> int:
@@ -52,7 +58,7 @@ def state(source: str | Path | Files | Run) -> State:
         As `Run.open`.
     """
     run = Run.open(source)
-    return State(run.directory, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
+    return State(run.info.files, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
 
 
 def describe_state(found: State) -> list[str]:
@@ -61,7 +67,7 @@ def describe_state(found: State) -> list[str]:
     share = 100 * found.n_committed / plan.n_cells
     lines = [found.title] if found.title else []
     lines += [
-        f"{found.directory}: {'complete' if found.complete else 'incomplete'}",
+        f"{found.name}: {'complete' if found.complete else 'incomplete'}",
         f"committed: {found.n_committed} of {plan.n_cells} cells ({share:.1f} %), "
         f"{len(found.done)} of {plan.n_tasks} tasks",
     ]

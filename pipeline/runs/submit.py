@@ -24,7 +24,7 @@ from pipeline.spec.parsing import load_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.commits import read_commits
 from pipeline.store.errors import LockedError
-from pipeline.store.files import local_path
+from pipeline.store.files import open_files
 from pipeline.store.local import write_atomically
 from pipeline.store.setup import check
 
@@ -45,8 +45,10 @@ class Submission:
 
     Attributes
     ----------
-    directory, folder : Path
-        Of the run, and of its job: script, number, and what is said in it.
+    name : str
+        The run directory, as it was given.
+    folder : Path
+        Of its jobs: script, number, and what is said in them.
     cluster : Cluster
         What a job is.
     script : str
@@ -57,7 +59,7 @@ class Submission:
         Its number, once it is sent.
     """
 
-    directory: Path
+    name: str
     folder: Path
     cluster: Cluster
     script: str
@@ -69,7 +71,7 @@ class Submission:
         words = WORDS[self.cluster.kind]
         return [
             f"sent: job {self.job}",
-            f"follow: magpend status {shlex.quote(str(self.directory))}; {words.follow} {self.job}; "
+            f"follow: magpend status {shlex.quote(self.name)}; {words.follow} {self.job}; "
             f"tail -F {self.folder}/coordinator*",
             f"cancel: {words.cancel} {self.job}",
             "after a cancel, or where time ran out: give this command again, and it goes on",
@@ -104,8 +106,8 @@ def prepare(
             f"{CLUSTER_FILE}; docs/clusters.md has an example."
         ])  # fmt: skip
     cluster = load_cluster(file)
-    directory = local_path(out) if out is not None else default_directory(path, smoke)
-    folder = jobs_folder(directory)
+    files = open_files(out if out is not None else default_directory(path, smoke))
+    folder = jobs_folder(files.place)
     if _AWKWARD.search(str(folder)):
         raise SpecError([
             f"{folder}: batch systems do not take this path for what a job says; give an --out of letters, "
@@ -113,22 +115,22 @@ def prepare(
         ])  # fmt: skip
     check_starts(parsed)
     plan = make_plan(parsed)
-    info = check(directory, identity_here(parsed, plan))
+    info = check(files, identity_here(parsed, plan))
     complete = info is not None and len(read_commits(info, plan)) == plan.n_tasks
-    command = _command(cluster, Path(file), path, directory, smoke)
-    name = f"magpend-{re.sub(r'[^A-Za-z0-9_.-]', '-', directory.absolute().name)}"
+    command = _command(cluster, Path(file), path, files.place, smoke)
+    name = f"magpend-{re.sub(r'[^A-Za-z0-9_.-]', '-', folder.stem)}"
     script = coordinator_script(cluster, name, f"{folder}/coordinator", str(Path.cwd()), command)
-    return Submission(directory, folder, cluster, script, complete)
+    return Submission(files.name, folder, cluster, script, complete)
 
 
-def _command(cluster: Cluster, file: Path, spec: Path, directory: Path, smoke: bool) -> list[str]:
+def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) -> list[str]:
     """``magpend run``, as the job gives it."""
     where = ["--scheduler", "local", "--workers", str(cluster.cores)]
     if not is_whole(cluster):
         where = ["--scheduler", cluster.kind, "--cluster", str(file.absolute())]
     python = cluster.python or sys.executable
     return [
-        python, "-m", "pipeline.cli.main", "run", str(spec.absolute()), "--out", str(directory.absolute()),
+        python, "-m", "pipeline.cli.main", "run", str(spec.absolute()), "--out", place,
         *where, *(["--smoke"] if smoke else []),
     ]  # fmt: skip
 
@@ -164,7 +166,7 @@ def send(submission: Submission) -> Submission:
         raise SubmitError(f"{words.send[0]} did not take the job: {said}. The script is {script}.")
     write_atomically(submission.folder / SENT, json.dumps({"kind": kind, "job": job}) + "\n")
     return Submission(
-        submission.directory,
+        submission.name,
         submission.folder,
         submission.cluster,
         submission.script,
@@ -188,7 +190,7 @@ def _refuse_second(submission: Submission) -> None:
     if done.returncode == 0 and state and not re.fullmatch(words.over, state):
         named = f" ({state})" if "\n" not in state else ""
         raise LockedError(
-            f"{submission.directory}: job {job} of this run is there already{named}; wait for it "
+            f"{submission.name}: job {job} of this run is there already{named}; wait for it "
             f"({words.follow} {job}) or cancel it ({words.cancel} {job})."
         )
 

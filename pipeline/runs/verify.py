@@ -47,7 +47,7 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
         rest = rebuild_skeleton(info, spec, plan)
         withdraw(info, found.damaged)
         for name in found.derived:
-            remove_product(info.directory / DERIVED / name)
+            remove_product(info.files.below(DERIVED).below(name))
     rebuilt = [problem for problem in found.skeleton if problem not in rest]
     return replace(found, skeleton=rest, rebuilt=rebuilt)
 

@@ -73,12 +73,13 @@ def read_source(path: str | Path) -> Source:
         If there is none, or it is not valid.
     """
     from pipeline.runs.workflows import find_spec
-    from pipeline.store.files import local_path
+    from pipeline.store.files import is_url, local_path
     from pipeline.store.runfile import read_run
 
-    if local_path(path).is_dir():
+    if is_url(path) or local_path(path).is_dir():
         info = read_run(path)
-        return Source(kept_spec(info.spec), f"run {info.directory.resolve().name}, digest {info.digest}")
+        name = info.files.local.resolve().name if info.files.local else info.name
+        return Source(kept_spec(info.spec), f"run {name}, digest {info.digest}")
     found = find_spec(path)
     return Source(load_spec(found), f"specification {found.name}")
 

@@ -67,7 +67,7 @@ class Cluster(Table):
     lifetime_stagger: str | None = Field(
         None, description="They leave up to so much earlier or later, so that not all do at once."
     )
-    min_jobs: int = Field(0, ge=0, le=10_000, description="Jobs that are kept, whatever there is to do.")
+    min_jobs: int = Field(1, ge=1, le=10_000, description="Jobs that are kept, whatever there is to do.")
     max_jobs: int = Field(1, ge=1, le=10_000, description="Jobs at most.")
     coordinator_memory: str = Field(
         "4 GB", description="Memory of the job that sends tasks to the others, where there are several."

@@ -9,7 +9,7 @@ from pipeline.products.reporting import report
 from pipeline.store.commits import absent_objects, leftover_keys, scan
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import COMMITS, CUBE, DERIVED, problems_of
-from pipeline.store.products import product_paths, read_product_attrs
+from pipeline.store.products import products_in, read_product_attrs
 from pipeline.store.records import Records, marker_key
 from pipeline.store.runfile import RunInfo
 
@@ -109,13 +109,11 @@ def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
 def damaged_products(info: RunInfo) -> dict[str, str]:
     """Products in ``derived`` that are not what was written, by name."""
     found: dict[str, str] = {}
-    if info.files.local is None:
-        return found
-    for path in product_paths(info.directory / DERIVED):
+    for files in products_in(info.files.below(DERIVED)):
         try:
-            read_product_attrs(path)
+            read_product_attrs(files)
         except FileNotFoundError:
             continue
         except DamagedError as error:
-            found[path.name] = str(error).removeprefix(f"{info.directory}/")
+            found[files.name.rpartition("/")[2]] = str(error).removeprefix(f"{info.name}/")
     return found

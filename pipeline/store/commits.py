@@ -20,7 +20,8 @@ import numpy as np
 import zarr
 
 from pipeline.layout.plan import Plan
-from pipeline.store.files import COMMITS, CUBE, TIMINGS, Files, LinkError, entry_of
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import COMMITS, CUBE, TIMINGS, Files, LinkError, entries_of, problems_of
 from pipeline.store.keys import Owners, chunk_keys
 from pipeline.store.records import (
     BLOCK,
@@ -66,19 +67,32 @@ def write_task(
     ------
     ValueError
         If an array has another shape or dtype than the store, or a block cuts a chunk.
+    DamagedError
+        If the metadata of a variable are not what was written.
     """
     info.files.refuse_links(CUBE, *(f"{CUBE}/{v.name}" for v in plan.variables), COMMITS)
     cube = info.files.below(CUBE)
+    _require_metadata(info, plan)
     objects = [key for v in plan.variables for key in write_block(cube, plan, index, v.name, values[v.name])]
     cube.sync(objects)
     record = {
         "digest": info.digest,
         "task": index,
         "status": dict(counts),
-        "objects": {key: entry_of(cube.read(key)) for key in objects},
+        "objects": entries_of(cube, objects),
     }
     if not is_packed(info, index):  # else somebody has committed these very bytes before
         info.files.write_once(marker_key(index), record_text(record).encode())
+
+
+def _require_metadata(info: RunInfo, plan: Plan) -> None:
+    """Refuse to encode chunks by damaged metadata: they would be committed, and read as something else."""
+    own = {key: info.skeleton[key] for key in (f"{v.name}/zarr.json" for v in plan.variables)}
+    problems = problems_of(info.files.below(CUBE), own)
+    if problems:
+        raise DamagedError(
+            f"{info.name}/{CUBE}/{problems[0]}. Give the command that made the run again: it is rebuilt."
+        )
 
 
 def is_packed(info: RunInfo, index: int) -> bool:
@@ -92,7 +106,7 @@ def is_packed(info: RunInfo, index: int) -> bool:
 
 def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
     """Write one variable's chunks of a task and return their keys."""
-    array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+")
+    array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+", zarr_format=3)
     # The setting is not stored: without it a block equal to the fill value would leave no file.
     array = array.with_config({"write_empty_chunks": True})
     block = plan.task(index)

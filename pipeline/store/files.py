@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from zarr.abc.store import Store
 
 RUN_FILE, CUBE, COMMITS, LOCK, TIMINGS = "run.json", "cube.zarr", "commits", "lock", "timings.jsonl"
+HOLDER = "lock.json"
 DERIVED, FIGURES, EXTENDED = "derived", "figures", "extended.json"
-OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, TIMINGS, DERIVED, FIGURES, EXTENDED})
+OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, HOLDER, TIMINGS, DERIVED, FIGURES, EXTENDED})
 TEMPORARY = ".tmp"
 
 # one letter before the colon is a drive; pathlib makes one slash of two
@@ -133,8 +134,10 @@ class Files(Protocol):
         """What zarr reads and writes here."""
         ...
 
-    def lock(self) -> AbstractContextManager[None]:
+    def lock(self) -> AbstractContextManager[bool | None]:
         """Hold the lock: a courtesy between people, the commit protocol does not rest on it.
+
+        Gives False where locks do not work, so that another process may be writing, too.
 
         Raises
         ------
@@ -145,16 +148,27 @@ class Files(Protocol):
 
 
 def open_files(place: str | Path | Files) -> Files:
-    """Return the files of a run by its place; files are returned as they are.
+    """Return the files of a run by its place: a folder, or ``s3://bucket/prefix``; files as they are.
 
     Raises
     ------
     RefusedError
-        If `place` looks like a URL.
+        If `place` is another URL, or the object store cannot be used.
     """
+    if not isinstance(place, (str, Path)):
+        return place
+    if is_url(place):
+        from pipeline.store.objects import parse_url
+
+        return parse_url(str(place))
     from pipeline.store.local import LocalFiles
 
-    return LocalFiles(local_path(place)) if isinstance(place, (str, Path)) else place
+    return LocalFiles(local_path(place))
+
+
+def is_url(place: str | Path) -> bool:
+    """Whether a place is an object store's."""
+    return str(place).startswith("s3://")
 
 
 def local_path(path: str | Path) -> Path:
@@ -163,12 +177,15 @@ def local_path(path: str | Path) -> Path:
     Raises
     ------
     RefusedError
-        If `path` looks like a URL: runs are kept in local folders.
+        If `path` looks like a URL.
     """
     text = str(path)
     if _URL.match(text):
-        scheme = text.partition(":")[0]
-        raise RefusedError(f"{text}: {scheme}: is no local folder, and runs are kept in these; give a path.")
+        if is_url(text):
+            raise RefusedError(
+                f"{text}: must be a folder of this machine; runs alone are kept in object stores."
+            )
+        raise RefusedError(f"{text}: is no folder and no object store; give a path, or s3://BUCKET/PREFIX.")
     return Path(path)
 
 
@@ -180,6 +197,16 @@ def is_temporary(name: str) -> bool:
 def entry_of(data: bytes) -> dict[str, Any]:
     """Size and sha256 of a content, as commit records and ``run.json`` hold them."""
     return {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
+
+def entries_of(files: Files, keys: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Size and sha256 by key of files that were just written, as they are read back."""
+    found = {}
+    for key, content in files.read_each(keys):
+        if isinstance(content, FileNotFoundError):
+            raise content
+        found[key] = entry_of(content)
+    return found
 
 
 def problems_of(files: Files, objects: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import stat
@@ -17,7 +18,8 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from pipeline.store.errors import LockedError, RefusedError, UnreadableError
-from pipeline.store.files import LOCK, TEMPORARY, LinkError
+from pipeline.store.files import HOLDER, LOCK, TEMPORARY, LinkError
+from pipeline.store.lease import holder, in_words
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ class LocalFiles:
         """The folder as zarr takes it."""
         return LocalStore(self.root, read_only=read_only)
 
-    def lock(self) -> AbstractContextManager[None]:
+    def lock(self) -> AbstractContextManager[bool]:
         """Hold the folder's lock."""
         return writer_lock(self.root)
 
@@ -195,11 +197,16 @@ def sync(files: Iterable[Path], top: Path) -> None:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a small file so that after a crash it is there whole or not at all."""
     temporary = temporary_beside(path)
-    with temporary.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
     sync_folder(path.parent)
 
 
@@ -281,13 +288,15 @@ def remove_tree(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def writer_lock(directory: Path) -> Iterator[None]:
+def writer_lock(directory: Path) -> Iterator[bool]:
     """Hold the directory's lock: a courtesy between people, the commit protocol does not rest on it.
+
+    The system frees the lock of a process that has ended, however it did. Gives False where locks fail.
 
     Raises
     ------
     LockedError
-        If another process holds it.
+        If another process holds it; names that one.
     """
     from filelock import FileLock, Timeout
 
@@ -296,14 +305,33 @@ def writer_lock(directory: Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
+        said = b""
+        with contextlib.suppress(OSError):
+            said = (directory / HOLDER).read_bytes()
         raise LockedError(
-            f"{directory}: another magpend run is writing here. Wait for it or stop it, then run again."
+            f"{directory}: another magpend run is writing here{in_words(said)}. Wait for it or stop it, then "
+            "run again."
         ) from None
     except (NotImplementedError, OSError) as error:
         warnings.warn(f"{directory}: no file lock here ({error}); start one run at a time.", stacklevel=3)
-        yield
+        yield False
         return
+    try:
+        with _named(directory / HOLDER):
+            yield True
+    finally:
+        lock.release()
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Say beside a lock who holds it, for those who ask in vain; a process that is killed leaves it there."""
+    content = json.dumps(holder()).encode()
+    with contextlib.suppress(OSError):
+        path.write_bytes(content)
     try:
         yield
     finally:
-        lock.release()
+        with contextlib.suppress(OSError):
+            if path.read_bytes() == content:  # the folder may have been renamed meanwhile
+                path.unlink()

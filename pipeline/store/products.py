@@ -11,19 +11,21 @@ import errno
 import hashlib
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
-from zarr.storage import LocalStore
+from zarr.abc.store import Store
+from zarr.core.buffer import cpu
+from zarr.storage import LocalStore, MemoryStore
 
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.store.arrays import create_array
 from pipeline.store.declared import product_problem
-from pipeline.store.errors import DamagedError
-from pipeline.store.files import TEMPORARY, entry_of
+from pipeline.store.errors import DamagedError, UnreadableError
+from pipeline.store.files import TEMPORARY, Files, open_files
 from pipeline.store.local import (
     files_below,
     refuse_links,
@@ -41,10 +43,14 @@ SEAL = "content_sha256"
 
 _WORDS = "words"
 _PRODUCT_CHUNK_BYTES = 16_000_000
+_GROUP = "zarr.json"
+
+Place = str | Path | Files
+Digests = list[tuple[str, str]]
 
 
-def write_product(path: Path, ds: xr.Dataset) -> None:
-    """Write a dataset so that it is at `path` whole or not at all.
+def write_product(place: Place, ds: xr.Dataset) -> None:
+    """Write a dataset so that it is at its place whole or not at all.
 
     Words are stored as codes (the attribute ``words`` lists them), since zarr format 3 has no strings
     of fixed length. If another process puts a sound product of the same attributes there first, that
@@ -57,11 +63,16 @@ def write_product(path: Path, ds: xr.Dataset) -> None:
     RefusedError
         If the folder is a link.
     """
+    files = open_files(place)
+    if files.local is None:
+        _put_product(files, ds)
+        return
+    path = files.local
     refuse_links(path.parent)
     path.parent.mkdir(exist_ok=True)
     temporary = temporary_beside(path)
     try:
-        attrs = _write_group(temporary, ds)
+        attrs = _write_group(LocalStore(temporary), ds, lambda: _digests(open_files(temporary)))
         sync(files_below(temporary), temporary)
         _put_in_place(temporary, path, attrs)
         sync_folder(path.parent)
@@ -69,7 +80,23 @@ def write_product(path: Path, ds: xr.Dataset) -> None:
         remove_tree(temporary)
 
 
-def open_product(path: Path) -> xr.Dataset:
+def _put_product(files: Files, ds: xr.Dataset) -> None:
+    """Put a product into an object store, the attributes with the seal last: before, it is none."""
+    data: dict[str, Any] = {}
+
+    def digests() -> Digests:
+        return [(key, _sha256(value.to_bytes())) for key, value in data.items() if key != _GROUP]
+
+    attrs = _write_group(MemoryStore(data), ds, digests)
+    with contextlib.suppress(FileNotFoundError, DamagedError):
+        if _own(read_product_attrs(files)) == attrs:
+            return
+    remove_product(files)
+    for key in sorted(data, key=lambda key: (key == _GROUP, key)):
+        files.write(key, data[key].to_bytes())
+
+
+def open_product(place: Place) -> xr.Dataset:
     """Read a product into memory.
 
     Raises
@@ -81,17 +108,28 @@ def open_product(path: Path) -> xr.Dataset:
     """
     import xarray as xr
 
-    read_product_attrs(path)
+    files = open_files(place)
+    store: Any
+    if files.local is None:
+        # all of it is read for the seal, so it is read once
+        contents = dict(files.read_each(files.everything()))
+        _sealed_attrs(files, contents.get(_GROUP), _digests_of(contents.items()))
+        _refuse_declared(files, contents.items())
+        whole = ((key, value) for key, value in contents.items() if isinstance(value, bytes))
+        store = MemoryStore({key: cpu.Buffer.from_bytes(value) for key, value in whole})
+    else:
+        read_product_attrs(files)
+        store = files.zarr(read_only=True)
     try:
-        with xr.open_zarr(LocalStore(path, read_only=True), consolidated=False, chunks=None) as ds:
+        with xr.open_zarr(store, consolidated=False, chunks=None) as ds:
             loaded = ds.load().assign(_with_words(ds))
     except (ValueError, KeyError, OSError) as error:
-        raise DamagedError(f"{path}: {error}") from None
+        raise DamagedError(f"{files.name}: {error}") from None
     variables = {name: loaded.variables[name] for name in sorted(map(str, loaded.data_vars))}
     return netcdf_safe(xr.Dataset(variables, loaded.coords, _own(loaded.attrs)))
 
 
-def read_product_attrs(path: Path) -> dict[str, Any]:
+def read_product_attrs(place: Place) -> dict[str, Any]:
     """Attributes of a product, once its seal has been found to fit.
 
     Raises
@@ -101,25 +139,45 @@ def read_product_attrs(path: Path) -> dict[str, Any]:
     DamagedError
         If it is not what was written.
     """
-    if path.is_symlink() or path.parent.is_symlink():
-        raise DamagedError(f"{path}: is, or lies behind, a link")
-    if not path.exists():
-        raise FileNotFoundError(path)
-    links = [file for file in files_below(path) if file.is_symlink()] if path.is_dir() else [path]
-    if links:
-        raise DamagedError(f"{links[0]}: is a link, or no folder")
-    try:
-        attrs: dict[str, Any] = json.loads((path / "zarr.json").read_text("utf-8"))["attributes"]
-        if attrs[SEAL] == _seal(path, attrs):
-            if problem := product_problem(path, files_below(path)):
-                raise DamagedError(f"{path}: {problem}")
+    files = open_files(place)
+    if (path := files.local) is not None:
+        if path.is_symlink() or path.parent.is_symlink():
+            raise DamagedError(f"{path}: is, or lies behind, a link")
+        if not path.exists():
+            raise FileNotFoundError(path)
+        try:
+            attrs = _sealed_attrs(files, files.read(_GROUP), _digests(files))
+            _refuse_declared(files, files.read_each(files.everything()))
             return attrs
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DamagedError(f"{path}: {error!r}") from None
-    raise DamagedError(f"{path}: its content has changed")
+        except (OSError, UnreadableError) as error:
+            raise DamagedError(f"{path}: {error!r}") from None
+    keys = files.everything()
+    group = dict(files.read_each([_GROUP] if keys else []))
+    return _sealed_attrs(files, group.get(_GROUP), _digests(files))
 
 
-def remove_product(path: Path) -> None:
+def _refuse_declared(files: Files, contents: Iterable[tuple[str, bytes | FileNotFoundError]]) -> None:
+    """Refuse a product whose files declare more than they have."""
+    if problem := product_problem((key, value) for key, value in contents if isinstance(value, bytes)):
+        raise DamagedError(f"{files.name}: {problem}")
+
+
+def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests: Digests) -> dict[str, Any]:
+    """Attributes of a product, compared with the digests of its other files."""
+    if not isinstance(group, bytes):
+        if digests:
+            raise DamagedError(f"{files.name}: it has no {_GROUP}")
+        raise FileNotFoundError(files.name)
+    try:
+        attrs: dict[str, Any] = json.loads(group)["attributes"]
+        if attrs[SEAL] == _seal(attrs, digests):
+            return attrs
+    except (ValueError, KeyError, TypeError) as error:
+        raise DamagedError(f"{files.name}: {error!r}") from None
+    raise DamagedError(f"{files.name}: its content has changed")
+
+
+def remove_product(place: Place) -> None:
     """Remove a product; one that is gone already is no error, of a link what it leads to stays.
 
     Raises
@@ -127,6 +185,13 @@ def remove_product(path: Path) -> None:
     RefusedError
         If the folder that holds it is a link.
     """
+    files = open_files(place)
+    if files.local is None:
+        keys = files.everything()
+        files.remove(key for key in keys if key == _GROUP)  # without it the rest is no product
+        files.remove(key for key in keys if key != _GROUP)
+        return
+    path = files.local
     refuse_links(path.parent)
     aside = temporary_beside(path)
     with contextlib.suppress(FileNotFoundError):
@@ -134,13 +199,16 @@ def remove_product(path: Path) -> None:
         remove_tree(aside)
 
 
-def leftover_products(folder: Path, older_than: float) -> list[Path]:
+def leftover_products(files: Files, older_than: float) -> list[Files]:
     """Temporary folders of products that nothing has changed for some seconds."""
+    if files.local is None:  # there, one without its seal is damaged
+        return []
     limit = time.time() - older_than
-    return [p for p in sorted(folder.glob(f".*.zarr.*{TEMPORARY}")) if p.lstat().st_mtime < limit]
+    found = [p for p in sorted(files.local.glob(f".*.zarr.*{TEMPORARY}")) if p.lstat().st_mtime < limit]
+    return [files.below(p.name) for p in found]
 
 
-def product_paths(folder: Path) -> list[Path]:
+def products_in(files: Files) -> list[Files]:
     """Products in a folder, sound or not.
 
     Raises
@@ -148,8 +216,12 @@ def product_paths(folder: Path) -> list[Path]:
     RefusedError
         If the folder is a link.
     """
-    refuse_links(folder)
-    return sorted(folder.glob("*.zarr"))
+    files.refuse_links("")
+    try:
+        names = files.names()
+    except FileNotFoundError:
+        return []
+    return [files.below(name) for name in names if name.endswith(".zarr") and not name.startswith(".")]
 
 
 def _own(attrs: Mapping[Any, Any]) -> dict[str, Any]:
@@ -171,9 +243,9 @@ def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None
         remove_product(path)
 
 
-def _write_group(folder: Path, ds: xr.Dataset) -> dict[str, Any]:
+def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -> dict[str, Any]:
     """Write all variables, then the attributes with the seal; returns the attributes without it."""
-    group = zarr.create_group(LocalStore(folder), zarr_format=3)
+    group = zarr.create_group(store, zarr_format=3)
     for name in sorted(map(str, ds.variables)):
         values, attrs = _coded(name, ds.variables[name])
         fill = np.nan if values.dtype.kind == "f" else 0
@@ -185,18 +257,29 @@ def _write_group(folder: Path, ds: xr.Dataset) -> dict[str, Any]:
     attrs = _plain(ds.attrs)
     others = sorted(str(name) for name in ds.coords if name not in ds.dims)
     stored = {**attrs, "coordinates": " ".join(others)} if others else attrs
-    group.update_attributes({**stored, SEAL: _seal(folder, stored)})
+    group.update_attributes({**stored, SEAL: _seal(stored, digests())})
     return stored
 
 
-def _seal(folder: Path, attrs: Mapping[str, Any]) -> str:
-    """Digest of a product's attributes and files."""
+def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
+    """Digest of a product's attributes and of its files but the one that holds them."""
     digest = hashlib.sha256(json.dumps(_own(attrs), sort_keys=True).encode())
-    for file in sorted(f for f in files_below(folder) if f != folder / "zarr.json"):
-        digest.update(
-            f"\n{file.relative_to(folder).as_posix()} {entry_of(file.read_bytes())['sha256']}".encode()
-        )
+    for key, sha256 in sorted(digests, key=lambda entry: entry[0].split("/")):
+        digest.update(f"\n{key} {sha256}".encode())
     return digest.hexdigest()
+
+
+def _digests(files: Files) -> Digests:
+    """Digests of a product's files but the one that holds the attributes."""
+    return _digests_of(files.read_each(key for key in files.everything() if key != _GROUP))
+
+
+def _digests_of(contents: Iterable[tuple[str, bytes | FileNotFoundError]]) -> Digests:
+    return [(key, _sha256(c)) for key, c in contents if key != _GROUP and isinstance(c, bytes)]
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _product_chunks(values: np.ndarray) -> tuple[int, ...]:

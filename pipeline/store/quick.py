@@ -52,7 +52,7 @@ def _put(item: Any, target: np.ndarray) -> bool:
     content = place.store.small_chunk(place.path)
     if content is None:
         return False
-    # the sha256 of the whole chunk has just been compared: its crc32c holds too
+    # the sha256 of the whole chunk, or its crc32c, has just been compared
     data = numcodecs.blosc.decompress(content[:-_CHECKSUM_BYTES])
     dtype = spec.dtype.to_native_dtype().newbyteorder("<")
     target[selection] = np.frombuffer(data, dtype).reshape(spec.shape)[chunk_selection]

@@ -162,6 +162,8 @@ def establish(
     identity: Mapping[str, Any],
     spec_text: str,
     echo: Echo,
+    *,
+    alone: bool = True,
 ) -> RunInfo:
     """Make a run directory, or find one and rebuild what is damaged of its set-up. For the lock's holder.
 
@@ -176,7 +178,8 @@ def establish(
     files = open_files(place)
     info = check(files, identity)
     names = _names(files)
-    files.remove([name for name in names if name.startswith(f".{RUN_FILE}.")])
+    if alone:  # else somebody may be writing it just now
+        files.remove([name for name in names if name.startswith(f".{RUN_FILE}.")])
     if COMMITS not in names:
         files.prepare(COMMITS)
     if info is None:

@@ -13,6 +13,7 @@ import os
 from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping
 from typing import Any
 
+import google_crc32c
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
@@ -29,7 +30,7 @@ VERIFY = "MAGPEND_VERIFY"
 """Environment variable; ``0`` reads chunks without comparing them with their records."""
 
 SMALL = 200_000
-"""Chunks of so many bytes are read by `pipeline.store.quick`; larger ones are hashed in threads."""
+"""Chunks of so many bytes are read by `pipeline.store.quick`; larger ones by zarr, one by one."""
 
 
 def checks_chunks() -> bool:
@@ -100,35 +101,48 @@ class CommittedStore(WrapperStore[Store]):
         entry = self._shown.entry(key)
         if entry is None:
             return None
-        if self._files.local is not None and os.path.islink(f"{self._files.local}/{CUBE}/{key}"):
-            raise self._damaged(key, "is a link, which is not followed")
-        whole = await self._store.get(key, prototype)
-        if whole is None:
-            raise self._damaged(key, "is missing")
-        if self._checks:
-            content = whole.as_buffer_like()
-            if len(whole) != entry["size"] or await _sha256(content, len(whole)) != entry["sha256"]:
-                raise self._damaged(key, "is not what was written: its content has changed")
-        if problem := self._shown.declared.problem(key, whole.as_buffer_like()):
-            raise self._damaged(key, problem)
+        if self._files.local is not None:
+            # read and compared in one go, away from the loop that asks for others meanwhile
+            content: Any = await asyncio.to_thread(self._read, key, entry)
+        else:
+            found = await self._store.get(key, prototype)
+            content = None if found is None else found.to_bytes()
+            await asyncio.to_thread(self._compare, key, entry, content)
+        whole = prototype.buffer.from_bytes(content)
         return whole if byte_range is None else whole[_slice(byte_range, len(whole))]
 
     def small_chunk(self, key: str) -> bytes | None:
-        """Content of a small chunk in a local folder, compared with its record; None for anything else.
+        """Content of a small chunk in a local folder; None for anything else.
+
+        It is compared with its record, or else with the checksum at its own end.
 
         Raises
         ------
         DamagedError
             If what is there is not what was written.
         """
-        entry = self._shown.entry(key) if self._checks and self._files.local is not None else None
+        entry = self._shown.entry(key) if self._files.local is not None else None
         if entry is None or entry["size"] > SMALL:
             return None
+        content = self._read(key, entry)
+        if not self._checks and not _crc32c_fits(content):
+            raise self._damaged(key, "is not what was written: its content has changed")
+        return content
+
+    def _read(self, key: str, entry: Mapping[str, Any]) -> bytes:
+        """Content of a local file, compared with its record unless that is left out."""
         try:
-            content = self._files.read(f"{CUBE}/{key}")
+            content: bytes | None = self._files.read(f"{CUBE}/{key}")
         except FileNotFoundError:
-            raise self._damaged(key, "is missing") from None
-        if len(content) != entry["size"] or hashlib.sha256(content).hexdigest() != entry["sha256"]:
+            content = None
+        return self._compare(key, entry, content)
+
+    def _compare(self, key: str, entry: Mapping[str, Any], content: bytes | None) -> bytes:
+        if content is None:
+            raise self._damaged(key, "is missing")
+        if self._checks and (
+            len(content) != entry["size"] or hashlib.sha256(content).hexdigest() != entry["sha256"]
+        ):
             raise self._damaged(key, "is not what was written: its content has changed")
         if problem := self._shown.declared.problem(key, content):
             raise self._damaged(key, problem)
@@ -167,10 +181,8 @@ class CommittedStore(WrapperStore[Store]):
             yield key, await self.get(key, prototype, byte_range)
 
 
-async def _sha256(content: Any, size: int) -> str:
-    if size > SMALL:  # others are read meanwhile
-        return await asyncio.to_thread(lambda: hashlib.sha256(content).hexdigest())
-    return hashlib.sha256(content).hexdigest()
+def _crc32c_fits(content: bytes) -> bool:
+    return bool(google_crc32c.value(content[:-4]) == int.from_bytes(content[-4:], "little"))
 
 
 def _slice(byte_range: ByteRequest, size: int) -> slice:

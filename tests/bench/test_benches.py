@@ -165,3 +165,19 @@ def test_text_peers__equations_are_those_of_the_engine(bench, name):
     function = heyoka.cfunc(right, variables)
     theirs = function(inputs=np.ascontiguousarray(states.T), time=np.full(len(states), 0.1)).T
     assert np.allclose(theirs, ours, rtol=1e-10, atol=1e-10)
+
+
+def test_object_store__prints_a_table(bench, monkeypatch, capsys):
+    pytest.importorskip("obstore")
+    for name in ("AWS_ENDPOINT_URL", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_REGION"):
+        monkeypatch.setenv(name, "")  # the benchmark sets them, and they are as before at the end
+    bench("object_store").main(["--tasks", "2", "--latency-ms", "1"])
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in ("set up", "commit a task", "load a variable", "verify"))
+
+
+def test_scaling__ceiling(bench, capsys):
+    bench("scaling").main(["--seconds", "0", "--workers", "4", "--task-seconds", "0.05", "--rounds", "3"])
+    printed = capsys.readouterr().out
+    assert "processor time per task" in printed
+    assert 0 < float(printed.split("busy")[1].split()[0]) <= 1

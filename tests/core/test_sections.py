@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from magpend_core import Status, run_branches, sections
+from magpend_core.engine.lanes import engine_of
+from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-11}
 
@@ -184,3 +187,16 @@ def test_run_branches__names_the_bad_array(parameters, frequency, message):
         run_branches(
             parameters, frequency, [[0.1, 0.1, 0.0, 0.0]], n_transient=0, n_keep=1, rtol=1e-8, atol=1e-8
         )
+
+
+def test_run_branches__read_only_memory_compiles_nothing_more(preset):
+    # to numba such an array is of another type, and an engine takes 10 s
+    packed, start = preset.pack()[None, None], np.zeros((1, 4))
+    frequency = np.array([[2.2]])
+    settings = {"n_transient": 0, "n_keep": 1, "rtol": 1e-5, "atol": 1e-5}
+    found = run_branches(packed, frequency, start, **settings)
+    for array in (packed, frequency, start):
+        array.flags.writeable = False
+    frozen = run_branches(packed, frequency, start, **settings)
+    assert frozen.section.tobytes() == found.section.tobytes()
+    assert len(engine_of(PENDULUM_FITTED, RECORD_LAST).signatures) == 1

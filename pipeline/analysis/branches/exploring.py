@@ -281,7 +281,9 @@ def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch],
             continue
         halves = run_together(
             [
-                crossing_half(parent.family, one, way, scope.low, scope.high, scope.settings)
+                crossing_half(
+                    parent.family, one, _direction(parent, one), way, scope.low, scope.high, scope.settings
+                )
                 for way in (-1.0, 1.0)
             ],
             FOLLOWING,
@@ -290,6 +292,13 @@ def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch],
         if len(child.points) > 2:
             child.origin, one.child = one, child
             branches.append(child)
+
+
+def _direction(branch: Branch, at: Bifurcation) -> np.ndarray:
+    """Where a branch goes as it passes a bifurcation: from the point before it to the one after it."""
+    u = np.array([p.u for p in branch.points])
+    i = int(np.argmin(np.linalg.norm(u - at.point.u, axis=1)))
+    return np.asarray(u[min(i + 1, len(u) - 1)] - u[max(i - 1, 0)])
 
 
 def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> bool:

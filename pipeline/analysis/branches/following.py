@@ -230,15 +230,17 @@ def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
 
 
 def crossing_half(
-    family: Family, at: Bifurcation, way: float, low: float, high: float, settings: Settings
+    family: Family, at: Bifurcation, own: np.ndarray, way: float, low: float, high: float, settings: Settings
 ) -> Steps[Half]:
     """Follow the other branch through a branch point, one way.
 
     Its tangent lies in the kernel of the derivative, of two dimensions there; the known branch does not
     meet the plane at a small distance from it, so that Newton's method in that plane finds the other.
+    `own` is the direction of the known branch, by its neighbouring points: at the branch point itself the
+    tangent is any vector of the kernel, by rounding errors alone.
     """
     kernel = np.linalg.svd(at.point.value.derivative)[2][-2:]
-    own = kernel @ at.point.tangent
+    own = kernel @ own
     normal = kernel.T @ np.array([-own[1], own[0]])
     normal *= way / np.linalg.norm(normal)
     start = Point(at.point.u, normal, at.point.value, 0)

@@ -32,6 +32,7 @@ from pipeline.spec.models import is_model_file
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import (
     FIGURES,
+    HOLDER,
     LOCK,
     RUN_FILE,
     entry_of,
@@ -49,7 +50,7 @@ FORMAT = 1
 IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES = (
     "identification.json", "result.json", "residuals.nc", "preset.toml", "outcomes",
 )  # fmt: skip
-_OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK})
+_OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK, HOLDER})
 _ROOM = Path(__file__).parent
 _NOT_NUMBERS = (
     "check.py", "comparison.py", "directory.py", "figures.py", "reports.py", "residuals.py",
@@ -217,7 +218,9 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
         return None
     if not is_identification(directory):
         with unreadable(directory):
-            names = sorted(p.name for p in directory.iterdir() if p.name != LOCK and not is_temporary(p.name))
+            locks = (LOCK, HOLDER)
+            found = [p.name for p in directory.iterdir()]
+            names = sorted(name for name in found if name not in locks and not is_temporary(name))
         if names:
             raise RefusedError(
                 f"{directory}: is not empty and holds no identification ({', '.join(names[:5])}); give "

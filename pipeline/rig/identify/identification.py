@@ -26,7 +26,7 @@ from pipeline.rig.identify.profiles import Curvature, Profile, following, profil
 from pipeline.rig.identify.search import search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
 from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
-from pipeline.runs.run import stoppable
+from pipeline.runs.stopping import stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.files import FIGURES, local_path

@@ -32,7 +32,7 @@ def cube_and_parameters(
     SpecError
         If it is of another model, sweeps no frequency, or another axis has more than one value.
     """
-    where = run.directory
+    where = run.name
     model = load_model(model)
     if run.model is not model:
         raise SpecError([
@@ -88,7 +88,7 @@ class Computed:
             If it is of another model, sweeps no frequency, or another axis has more than one value.
         """
         cube, parameters = cube_and_parameters(run, model, at)
-        with refused(run.directory):
+        with refused(run.name):
             found = run.derive("attractors")
             keep = (FREQUENCY_DIM, *start_dims(found))
             found = choose(found, at, keep, "measured sweeps are compared at one value of the other axes")

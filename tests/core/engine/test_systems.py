@@ -143,6 +143,7 @@ RELAXATION = System(
     jacobian=_relaxation_jacobian,
 )
 """x' = cos(2 pi f t) - rate x"""
+BOUNDED_RELAXATION = dataclasses.replace(RELAXATION, name="bounded_relaxation", escape=(10.0,))
 
 
 def test_system__fills_in_what_is_left_out():
@@ -166,7 +167,7 @@ def test_one_state__section_multiplier_and_exponent_are_the_closed_forms():
     packed, frequency = np.array([[rate]] * 2), np.full(2, UNIT_FREQUENCY)
     starts = np.array([[0.3], [-2.0]])
     result = run_branches(
-        packed[:, None], frequency[:, None], starts, system=RELAXATION, n_transient=10, n_keep=1,
+        packed[:, None], frequency[:, None], starts, system=BOUNDED_RELAXATION, n_transient=10, n_keep=1,
         rtol=1e-11, atol=1e-11,
     )  # fmt: skip
     orbit = rate / (rate**2 + omega**2)
@@ -207,10 +208,9 @@ def test_one_state__without_forcing_or_parameters():
 
 def test_one_state__that_is_left_unbounded_fails_by_a_status():
     # x' = cos t + 0.5 x leaves any bound
-    bounded = dataclasses.replace(RELAXATION, name="bounded_relaxation", escape=(10.0,))
     result = run_branches(
-        np.array([[[-0.5]]]), np.array([[UNIT_FREQUENCY]]), np.array([[1.0]]), system=bounded, n_transient=50,
-        n_keep=1, rtol=1e-6, atol=1e-6,
+        np.array([[[-0.5]]]), np.array([[UNIT_FREQUENCY]]), np.array([[1.0]]), system=BOUNDED_RELAXATION,
+        n_transient=50, n_keep=1, rtol=1e-6, atol=1e-6,
     )  # fmt: skip
     assert result.status.item() == Status.DIVERGED
 

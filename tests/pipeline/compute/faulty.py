@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import time
+import tracemalloc
 from pathlib import Path
 
 
@@ -61,3 +63,11 @@ def slow(folder: str, index: int, seconds: float = 0.2) -> dict:
     log(folder, index)
     time.sleep(seconds)
     return {"task": index}
+
+
+def traced() -> int:
+    """Bytes that this process holds, counted from the first call on."""
+    if not tracemalloc.is_tracing():
+        tracemalloc.start()
+    gc.collect()
+    return tracemalloc.get_traced_memory()[0]

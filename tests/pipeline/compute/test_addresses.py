@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from pipeline.compute import addresses
+from pipeline.compute import addresses, clients
 from pipeline.compute.addresses import Address, SchedulerError, ask, read_address
 from pipeline.compute.clients import Where
 from pipeline.spec.problems import SpecError
@@ -90,7 +90,9 @@ def test_ask__wrong_port():
         assert f"tcp://127.0.0.1:{port}: nothing listens there" in refusal(f"127.0.0.1:{port}")
 
 
-def test_ask__web_server():
+def test_ask__web_server(monkeypatch):
+    assert addresses.ANSWER_S <= 5
+    monkeypatch.setattr(addresses, "ANSWER_S", 0.5)
     with web_server() as port:
         assert "is another kind of server" in refusal(f"tcp://127.0.0.1:{port}")
 
@@ -226,6 +228,13 @@ def test_where__no_batch_system_here(tmp_path, monkeypatch):
     monkeypatch.setenv("MAGPEND_CLUSTER", str(path))
     with pytest.raises(SpecError, match="slurm: there is no command 'sbatch' here"):
         Where("slurm").resolved()
+
+
+def test_where__dashboard_without_its_package(monkeypatch):
+    monkeypatch.setattr(clients, "find_spec", lambda name: None)
+    with pytest.raises(SpecError, match=r"needs bokeh; install it: pip install 'magpend\[dashboard\]'"):
+        Where("local", dashboard=True).resolved()
+    Where("none", dashboard=True).resolved()
 
 
 def test_run__wrong_address(main, tmp_path, write_spec, sweep_text):

@@ -37,7 +37,7 @@ v = [-1, 1]
 [integration]
 rtol = 1e-9
 atol = 1e-9
-n_transient = 1000
+n_transient = 500
 n_keep = 4
 [execution]
 trajectories_per_task = 16
@@ -110,9 +110,9 @@ def until(true):
 
 def test_workers__come_and_go(tmp_path, write_spec, scheduler_file, worker, bytes_of, monkeypatch):
     """None is there at first; the first one is killed in the middle, after another has come."""
-    path, commits = write_spec(SPEC), tmp_path / "out" / "commits"
+    path = write_spec(SPEC)
     run(path, tmp_path / "alone", workers=0, echo=silent)
-    lines, kept = [], []
+    lines, kept, done = [], [], []
 
     def echo(line):
         lines.append(line)
@@ -121,10 +121,10 @@ def test_workers__come_and_go(tmp_path, write_spec, scheduler_file, worker, byte
 
     def add(self, cells):
         added(self, cells)
-        done = len(list(commits.glob("*.json")))
-        if done >= 2 and len(kept) == 1:
+        done.append(cells)
+        if len(done) >= 2 and len(kept) == 1:
             kept.append(worker())
-        if done >= 4 and kept[0].poll() is None:
+        if len(done) >= 4 and kept[0].poll() is None:
             end(kept[0])
 
     added = Progress.add
@@ -151,8 +151,13 @@ def test_workers__none(main, write_spec, scheduler_file, monkeypatch):
 # ---- other programs, other files -----------------------------------------------------------------------
 
 
-def refusal(where):
-    with pytest.raises(SchedulerError) as refused, connected(where, 1, silent):
+def refusal(scheduler_file, n_workers, **where):
+    """What is said when so many workers are there."""
+    from distributed import Client
+
+    with Client(scheduler_file=str(scheduler_file), set_as_default=False) as client:
+        client.wait_for_workers(n_workers, timeout=PATIENCE_S)
+    with pytest.raises(SchedulerError) as refused, connected(Where(str(scheduler_file), **where), 1, silent):
         pass
     text = str(refused.value)
     assert "\n" not in text
@@ -163,18 +168,15 @@ def test_workers__other_versions(tmp_path, environment, scheduler_file, worker):
     """One has another numba, and one no magpend at all."""
     (tmp_path / "other" / "numba-0.0.1.dist-info").mkdir(parents=True)
     (tmp_path / "other" / "numba-0.0.1.dist-info" / "METADATA").write_text("Name: numba\nVersion: 0.0.1\n")
-    paths = os.pathsep.join([str(tmp_path / "other"), environment["PYTHONPATH"]])
-    first = worker(PYTHONPATH=paths)
-    where = Where(str(scheduler_file))
-    text = refusal(where)
-    here = probe.installation()["numba"]
-    assert "1 of 1 workers have other programs than this process: tcp://127.0.0.1:" in text
-    assert f"numba 0.0.1, here {here}. Install the same versions everywhere" in text
-    end(first)
+    worker(PYTHONPATH=os.pathsep.join([str(tmp_path / "other"), environment["PYTHONPATH"]]))
     (tmp_path / "none").mkdir()
     (tmp_path / "none" / "pipeline.py").touch()  # a module, so that nothing is found in it
     worker(PYTHONPATH=str(tmp_path / "none"))
-    assert "has no magpend, or one of another version" in refusal(where)
+    text = refusal(scheduler_file, 2)
+    assert "2 of 2 workers have other programs than this process: tcp://127.0.0.1:" in text
+    assert f"numba 0.0.1, here {probe.installation()['numba']}" in text
+    assert "has no magpend, or one of another version" in text
+    assert "Install the same versions everywhere" in text
 
 
 def test_late_worker__other_versions():
@@ -186,33 +188,39 @@ def test_late_worker__other_versions():
         other(3)
 
 
-def test_workers__other_files(tmp_path, scheduler_file, worker, processes):
-    """One sees another folder by the same name: an empty disk is mounted there, for it alone."""
+MOUNTS = {
+    "mount -t tmpfs none {}": "does not see it (No such file or directory)",
+    "mount --bind {0} {0} && mount -o remount,ro,bind {0}": "cannot write to it (Read-only file system)",
+}
+
+
+def test_workers__other_files(tmp_path, scheduler_file, worker):
+    """One sees an empty folder by the same name, one may only read: disks are mounted for them alone."""
     out = tmp_path / "out"
     out.mkdir()
-    before = ("unshare", "--mount", "--", "sh", "-c", f'mount -t tmpfs none {out} && exec "$@"', "sh")
-    able = shutil.which("unshare") and subprocess.run(
-        [*before, "true"], capture_output=True, check=False
-    )  # fmt: skip
-    if not able or able.returncode:
-        pytest.skip("file systems cannot be mounted for one process here (root is needed)")
-    worker(before=before)
-    text = refusal(Where(str(scheduler_file), directory=out))
-    assert f"1 of 1 workers cannot use {out}: tcp://127.0.0.1:" in text
-    assert "does not see it (No such file or directory). Workers write" in text
+    for mount in MOUNTS:
+        before = ("unshare", "--mount", "--", "sh", "-c", f'{mount.format(out)} && exec "$@"', "sh")
+        able = shutil.which("unshare") and subprocess.run([*before, "true"], capture_output=True, check=False)
+        if not able or able.returncode:
+            pytest.skip("file systems cannot be mounted for one process here (root is needed)")
+        worker(before=before)
+    text = refusal(scheduler_file, 2, place=str(out))
+    assert f"2 of 2 workers cannot use {out}: tcp://127.0.0.1:" in text
+    assert all(words in text for words in MOUNTS.values())
+    assert "choose, with --out, a folder of a file system that all of them see" in text
     assert not list((out / "commits").iterdir())
 
 
 def test_sees(tmp_path, monkeypatch):
     monkeypatch.setattr(probe, "_LATE_S", 0.3)
-    file = tmp_path / "file"
-    assert probe.sees(str(file), "token") == "does not see it (No such file or directory)"
-    file.write_text("another")
-    assert probe.sees(str(file), "token") == "sees another one by that name"
-    file.write_text("token")
-    assert probe.sees(str(file), "token") == ""
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
-    assert probe.sees(str(file), "token") == "may not write to it"
+    place, key = str(tmp_path), "commits/.probe.tmp"
+    assert probe.sees(place, key, "token") == "does not see it (No such file or directory)"
+    (tmp_path / "commits").mkdir()
+    (tmp_path / key).write_text("another")
+    assert probe.sees(place, key, "token") == "sees another one by that name"
+    (tmp_path / key).write_text("token")
+    assert probe.sees(place, key, "token") == ""
+    assert [path.name for path in (tmp_path / "commits").iterdir()] == [".probe.tmp"]
 
 
 # ---- the dashboard -------------------------------------------------------------------------------------

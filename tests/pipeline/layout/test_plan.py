@@ -94,6 +94,16 @@ def test_make_plan__multiples_of_lanes_and_sizes():
     assert plan.n_tasks < 20_000
 
 
+@pytest.mark.parametrize("n_seeds", [1, 5, 6, 7, 12])
+@pytest.mark.parametrize("wanted", [1, 2, 4, 5, 8, 24])
+def test_make_plan__no_task_walks_both_ways(walk_text, n_seeds, wanted):
+    text = walk_text.replace("n = 5", f"n = {n_seeds}").replace("task = 2", f"task = {wanted}")
+    plan = make_plan(parse_spec(tomllib.loads(text)))
+    assert plan.shape[-1] == 2 * n_seeds
+    for block in plan.tasks():
+        assert block[-1].start // n_seeds == (block[-1].stop - 1) // n_seeds
+
+
 def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
     import os
 

@@ -91,8 +91,9 @@ def running(folder: Path) -> Iterator[dict[str, str]]:
         yield variables
     finally:
         subprocess.run(["scancel", "--full", "-u", "root"], env=environment, check=False, capture_output=True)
-        for name in ("slurmd", "slurmctld", "munged"):
-            _stop(folder / f"{name}.pid")
+        # what the controller would save at its end, for seconds, is thrown away
+        for name, seconds in (("slurmd", 15.0), ("slurmctld", 0.5), ("munged", 15.0)):
+            _stop(folder / f"{name}.pid", seconds)
 
 
 def _call(environment: dict[str, str], *command: str) -> None:
@@ -119,7 +120,7 @@ def _wait_for_node(environment: dict[str, str], folder: Path, seconds: float = 2
         time.sleep(0.1)
 
 
-def _stop(pid_file: Path, seconds: float = 15.0) -> None:
+def _stop(pid_file: Path, seconds: float) -> None:
     try:
         pid = int(pid_file.read_text())
         os.kill(pid, signal.SIGTERM)

@@ -7,10 +7,12 @@ import os
 import signal
 import time
 
+import numpy as np
 import pytest
 
+from magpend_core import Status
 from pipeline import open_run
-from pipeline.compute import exponents, task, walking
+from pipeline.compute import exponents, longer, task, walking
 from pipeline.compute.execute import TaskFailedError
 from pipeline.runs import extend as extending
 from pipeline.runs.extend import extend
@@ -58,7 +60,7 @@ class Count:
     """Cells that went through the kernel, those that warm it up aside, and those that products took."""
 
     def __init__(self, monkeypatch):
-        self.cells, self.tangents = 0, 0
+        self.cells, self.tangents, self.more = 0, 0, 0
         branches, tangents = walking.run_branches, exponents.lyapunov_exponents
 
         def run_branches(parameters, frequency, states, **options):
@@ -69,6 +71,13 @@ class Count:
             self.tangents += len(parameters)
             return tangents(parameters, *words, **options)
 
+        more_sections = longer.more_sections
+
+        def go_on(parameters, *words, **options):
+            self.more += len(parameters)
+            return more_sections(parameters, *words, **options)
+
+        monkeypatch.setattr(longer, "more_sections", go_on)
         monkeypatch.setattr(walking, "run_branches", run_branches)
         monkeypatch.setattr(exponents, "lyapunov_exponents", lyapunov_exponents)
         monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
@@ -88,7 +97,7 @@ def grown(write_spec, tmp_path, bytes_of, count):
         before = bytes_of(tmp_path / "old")
         path = write_spec(new, "new.toml")
         run(path, tmp_path / "fresh", workers=0, echo=silent)
-        count.cells = count.tangents = 0
+        count.cells = count.tangents = count.more = 0
         found = extend(tmp_path / "old", path, tmp_path / "new", workers=0, echo=silent, **more)
         assert found.complete
         assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")
@@ -168,6 +177,60 @@ def test_walk__new_products(grown, count):
     new = WALK.replace("[execution]", lyapunov).replace("stop = 0.14, num = 5", "stop = 0.15, num = 6")
     assert grown(WALK.replace('"both"', '"up"'), new.replace('"both"', '"up"')) == 5
     assert count.tangents == 30
+
+
+KEPT = BASE.replace("n_transient = 3\nn_keep = 4", "n_transient = 40\nn_keep = 30")
+KEPT_MORE = KEPT.replace("n_keep = 30", "n_keep = 70")
+WATCHED = (
+    "[products]\nextremes = { quantities = ['x', 'v'] }\nlyapunov = { n_periods = 4, n_blocks = 2 }\n[ex"
+)
+STOPS = "stop_when_closed = true\nclosure_tolerance = 1e-6\n[execution]"
+CLOSING = (
+    KEPT.replace("[execution]", STOPS)
+    .replace("n_transient = 40", "n_transient = 70")
+    .replace("[axes]", "[parameters]\noverrides = { amplitude = 0.3 }\n[axes]")
+)
+LONGER_CELLS = {
+    "all go on": (KEPT, KEPT_MORE, 0, 25),
+    "from the first period on": (
+        KEPT.replace("n_transient = 40", "n_transient = 0"),
+        KEPT_MORE.replace("n_transient = 40", "n_transient = 0").replace("70", "45"),
+        0,
+        25,
+    ),
+    "with a wider axis": (KEPT, KEPT_MORE.replace("stop = 0.14, num = 5", "stop = 0.15, num = 6"), 5, 25),
+    "with what is watched": (KEPT.replace("[ex", WATCHED), KEPT_MORE.replace("[ex", WATCHED), 0, 25),
+    "where cells fail": (
+        KEPT.replace("n_transient = 40", "max_steps_per_period = 44\nn_transient = 40"),
+        KEPT_MORE.replace("n_transient = 40", "max_steps_per_period = 44\nn_transient = 40"),
+        None,
+        None,
+    ),
+    "where some have closed": (
+        CLOSING,
+        CLOSING.replace("n_keep = 30", "n_keep = 70"),
+        None,
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("what", LONGER_CELLS)
+def test_more_sections__go_on_from_the_last(grown, count, tmp_path, what):
+    old, new, cells, more = LONGER_CELLS[what]
+    found = grown(old, new)
+    if cells is not None:
+        assert (found, count.more) == (cells, more)
+        return
+    assert len(np.unique(open_run(tmp_path / "new").n_periods)) > 1, "all cells are of one kind"
+    assert found < 25
+    assert count.more > 0
+
+
+def test_more_sections__too_few_to_judge(tmp_path, write_spec):
+    run(write_spec(KEPT), tmp_path / "old", workers=0, echo=silent)
+    with pytest.raises(RefusedError, match="judged by the last 64 sections: keep as many"):
+        extend(tmp_path / "old", keep=40, out=tmp_path / "new", echo=silent)
 
 
 def test_extend__new_products_go_on_from_the_sections(grown, count):
@@ -264,7 +327,7 @@ def test_in_place__the_same_command_goes_on(place, bytes_of, monkeypatch, count,
     def fail_at(n, original):
         def call(*words, **options):
             calls.append(1)
-            if len(calls) == n:
+            if len(calls) >= n:
                 raise OSError("the power went")
             return original(*words, **options)
 
@@ -352,3 +415,43 @@ def test_command__refuses(place, main, words, message):
     code, _, err = main("extend", place[0], *words)
     assert code == 2
     assert message in err
+
+
+FULL = """
+kind = "sweep"
+model = "duffing"
+[parameters]
+overrides = { amplitude = 0.02 }
+[axes]
+frequency_hz = { values = [0.2] }
+[initial_conditions]
+kind = "grid"
+x = { start = 0.5, stop = 1.5, num = 9 }
+v = { start = 0.0, stop = 0.5, num = 9 }
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 100
+n_keep = 2
+closure_tolerance = 1e-3
+"""
+REFINED = FULL.replace("num = 9 }\n[int", "num = 9 }\nrefine = 4\n[int")
+
+
+@pytest.mark.parametrize(("old", "new"), [("full", "refined"), ("refined", "full"), ("refined", "wider")])
+def test_refined__integrated_cells_alone_are_taken(grown, tmp_path, old, new):
+    texts = {
+        "full": FULL,
+        "refined": REFINED,
+        "wider": REFINED.replace("stop = 1.5, num = 9", "stop = 2.0, num = 13"),
+    }
+    cells = grown(texts[old], texts[new])
+    found = open_run(tmp_path / ("new" if new != "full" else "old")).status.values
+    n_inferred = int((found == Status.INFERRED).sum())
+    assert n_inferred > 10
+    if (old, new) == ("full", "refined"):
+        assert cells == 0
+    elif new == "full":
+        assert cells == n_inferred
+    else:
+        assert cells < found.size - n_inferred

@@ -12,8 +12,10 @@ from pipeline import open_run
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.table import branches_table
 from pipeline.analysis.chaos.table import chaos_table
+from pipeline.compute import task, walking
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive
+from pipeline.runs.extend import extend
 from pipeline.runs.run import run
 from pipeline.spec.parsing import parse_spec
 
@@ -22,10 +24,10 @@ kind = "sweep"
 title = "two attractors of a flow"
 
 [model]
-name = "bautin"
+name = "normal_form"  # tests/core/flows.py has it, too: it compiles once
 states = { x = {}, y = {} }
-parameters = { mu = -0.1, omega = 2.0 }
-define = { s = "x**2 + y**2", g = "mu + s - s**2" }
+parameters = { mu = -0.1, omega = 2.0, cubic = 1.0, quintic = -1.0 }
+define = { s = "x**2 + y**2", g = "mu + cubic*s + quintic*s**2" }
 equations = { x = "g*x - omega*y", y = "omega*x + g*y" }
 
 [section]
@@ -113,3 +115,22 @@ def test_workflows__flows_read():
     """What a flow's specification says is read back from the plain data of a run."""
     spec = parse_spec(tomllib.loads(SPEC))
     assert parse_spec(spec.as_dict()) == spec
+
+
+def test_extend__takes_what_stands_there(directory, tmp_path, bytes_of, monkeypatch):
+    text = SPEC.replace("[-0.2, -0.1, 0.1]", "[-0.2, 0.1]").replace("num = 6 }\n\n[int", "num = 7 }\n\n[int")
+    text = text.replace("start = -1.05, stop = 0.95, num = 7", "start = -1.05, stop = 1.35, num = 7")
+    (tmp_path / "spec.toml").write_text(text)
+    run(tmp_path / "spec.toml", tmp_path / "fresh", workers=0)
+    calls = []
+    original = walking.run_branches
+
+    def counted(parameters, *words, **options):
+        calls.append(len(parameters))
+        return original(parameters, *words, **options)
+
+    monkeypatch.setattr(walking, "run_branches", counted)
+    monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
+    extend(directory, tmp_path / "spec.toml", tmp_path / "new", workers=0)
+    assert sum(calls) == 2 * 6
+    assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")

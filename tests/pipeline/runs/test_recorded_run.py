@@ -15,6 +15,7 @@ from pipeline.compute import task
 from pipeline.compute.execute import TaskFailedError
 from pipeline.runs.derive import derive
 from pipeline.runs.drawing import figure
+from pipeline.runs.extend import extend
 from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import run
 from pipeline.runs.status import state
@@ -194,3 +195,26 @@ def test_cli__says_which_numbers_do_not_fit(recorded, tmp_path, main):
     assert code == 2
     assert "n_transient = 9 and n_keep = 4 are 13 drive periods, and drive.csv has 12" in err
     assert not (tmp_path / "run").exists()
+
+
+def test_extend__cells_under_the_same_recording(recorded, tmp_path, bytes_of, monkeypatch):
+    run(recorded(), tmp_path / "old", workers=0, echo=silent)
+    wider = recorded(RECORDED.replace("[0.6, 1.6]", "[0.6, 1.1, 1.6]"))
+    run(wider, tmp_path / "fresh", workers=0, echo=silent)
+    calls = []
+    original = task.under_recording
+
+    def counted(drive, inputs, **options):
+        calls.append(len(inputs.initial_states))
+        return original(drive, inputs, **options)
+
+    monkeypatch.setattr(task, "under_recording", counted)
+    monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
+    extend(tmp_path / "old", wider, tmp_path / "new", workers=0, echo=silent)
+    assert sum(calls) == 12
+    assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")
+    with pytest.raises(RefusedError, match="cells under a recorded drive do not go on"):
+        extend(tmp_path / "old", keep=5, out=tmp_path / "longer", echo=silent)
+    other = recorded(drive=edges(jitter=0.02))
+    with pytest.raises(RefusedError, match=r"drive\.sha256"):
+        extend(tmp_path / "old", other, tmp_path / "other", echo=silent)

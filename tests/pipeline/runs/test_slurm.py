@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -46,14 +45,13 @@ kind = "slurm"
 cores = 1
 memory = "1 GB"
 walltime = "00:10:00"
-min_jobs = 2
 max_jobs = 2
 coordinator_memory = "1 GB"
 interface = "lo"
 prologue = ["export PROLOGUE=read"]
 directives = ["--nice=1"]
 """
-PATIENCE_S = 120.0
+PATIENCE_S = 100.0
 
 
 def load(name):
@@ -69,30 +67,33 @@ pytestmark = [pytest.mark.skipif(bool(slurm.why_not()), reason=slurm.why_not() o
 
 
 @pytest.fixture
-def variables(tmp_path, environment):
-    """A SLURM that runs, and the variables of a shell in which it can be used."""
+def shell(tmp_path, environment, monkeypatch):
+    """A SLURM that runs, and commands of a shell in which it can be used."""
     folder = tmp_path / "slurm"
     folder.mkdir()
-    with slurm.running(folder) as found:
-        yield {**environment, **found, "MAGPEND_CLUSTER": ""}
+    with slurm.running(folder) as variables:
+        for name, value in {**environment, **variables}.items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
+
+        def call(*words):
+            return subprocess.run(words, capture_output=True, text=True, timeout=60, check=True).stdout
+
+        yield call
 
 
 @pytest.fixture
-def shell(tmp_path, variables):
+def magpend(main):
     def call(*words, code=0):
-        done = subprocess.run(
-            [str(w) for w in words],
-            cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
-        assert done.returncode == code, done.stdout + done.stderr
-        return done.stdout if code == 0 else done.stderr
+        found, out, errors = main(*words)
+        assert found == code, errors
+        return out + errors
 
     return call
 
 
-@pytest.fixture
-def magpend(shell):
-    return lambda *words, code=0: shell(sys.executable, "-m", "pipeline.cli.main", *words, code=code)
+def is_run(directory):
+    return (directory / "run.json").is_file()
 
 
 def wait(for_what, logs):
@@ -108,7 +109,6 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
         (tmp_path / f"{name}.toml").write_text(text)
     run(tmp_path / "spec.toml", tmp_path / "laptop", workers=0, echo=lambda line: None)
     out, logs = tmp_path / "out", tmp_path / "out.jobs"
-    commits = out / "commits"
 
     # one job holds all; it is cancelled when some tasks are committed and some are not
     said = magpend("submit", "spec.toml", "--cluster", "one.toml", "--out", "out")
@@ -118,8 +118,8 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert job in shell("squeue", "-h", "-o", "%i")
     refused = magpend("submit", "spec.toml", "--cluster", "one.toml", "--out", "out", code=3)
     assert f"job {job} of this run is there already" in refused
-    wait(lambda: commits.is_dir() and len(list(commits.glob("*.json"))) >= 2, logs)
-    shell(*f"scancel {job}".split())
+    wait(lambda: is_run(out) and len(state(out).done) >= 2, logs)
+    shell("scancel", job)
     wait(lambda: not shell("squeue", "-h"), logs)
     assert "incomplete" in magpend("status", "out")
     assert "Stopped. What is committed" in (logs / f"coordinator-{job}.out").read_text()
@@ -133,7 +133,7 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert "Traceback" not in told
     assert "cells done before" in told
     assert "workers come in slurm jobs" in told
-    assert len(list(logs.glob("magpend-worker-*.out"))) == 2
+    assert 1 <= len(list(logs.glob("magpend-worker-*.out"))) <= 2
     assert bytes_of(out) == bytes_of(tmp_path / "laptop")
     assert "complete; nothing to send" in magpend(
         "submit", "spec.toml", "--cluster", "one.toml", "--out", "out"

@@ -244,7 +244,7 @@ def test_flipped_bit__is_never_read_as_data(made, name):
         chunk.write_bytes(damaged)
         with pytest.raises(DamagedError, match=rf"{key}: is not what was written"):
             run.cube()[name].values  # noqa: B018
-        with pytest.raises(Exception, match=r"(?i)checksum|crc32c"):
+        with pytest.raises(Exception, match=r"(?i)checksum|crc32c|is not what was written"):
             run.cube(check=False)[name].values  # noqa: B018
     found = verify_run(made.info.directory)
     assert not found.sound
@@ -342,13 +342,15 @@ def test_writer_lock__another_process(tmp_path):
     process.start()
     try:
         assert ready.wait(60)
-        with pytest.raises(LockedError, match="another magpend run"), writer_lock(tmp_path):
+        said = rf"another magpend run is writing here \(process {process.pid} on .+ since 20.+\)\. Wait"
+        with pytest.raises(LockedError, match=said), writer_lock(tmp_path):
             pass
     finally:
         process.kill()
         process.join()
     with writer_lock(tmp_path):
         pass
+    assert not (tmp_path / "lock.json").exists()
 
 
 def test_same_bytes__whatever_the_order(made, tmp_path, bytes_of):
@@ -380,3 +382,12 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
     again = parse_spec(read_run(tmp_path / "run").spec)
     assert list(again.axes) == list(spec.axes) == ["q", "frequency_hz", "eps_drive"]
     assert digest_of(identity_of(again, make_plan(again), "k")) == digest_of(identity)
+
+
+def test_write_task__refuses_damaged_metadata(made):
+    """Chunks that were encoded by them would be committed, and read as something else."""
+    path = made.info.directory / "cube.zarr/section/zarr.json"
+    path.write_text(path.read_text().replace('"little"', '"big"'))
+    with pytest.raises(DamagedError, match=r"section/zarr\.json: its content has changed"):
+        made.commit(0)
+    assert read_commits(made.info, made.plan) == {}

@@ -1,0 +1,119 @@
+"""More sections of cells that have some: integrated on from the last one, with the bits of a longer run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from magpend_core.engine import observers
+from magpend_core.engine.entry import integrate
+from magpend_core.engine.jit import kernel, part, specialise
+from magpend_core.engine.observers import FIRST_TURN, RECORD_LAST, Settings, closed_period, window_of
+from magpend_core.engine.system import System
+from magpend_core.sections import Sections
+
+
+def more_sections(
+    parameters: np.ndarray,
+    frequency_hz: np.ndarray,
+    last: np.ndarray,
+    step_size: np.ndarray,
+    *,
+    n_more: int,
+    rtol: float,
+    atol: float,
+    max_steps_per_period: int,
+    system: System,
+    quantities: Sequence[str] | None = None,
+) -> Sections:
+    """Sections of the drive periods that follow the last one that is known.
+
+    Parameters
+    ----------
+    parameters, frequency_hz
+        As for `run_branches`, of one point for each branch.
+    last
+        Last section of each cell, shape (cell, n_states).
+    step_size
+        What the error control would have tried next, shape (cell,) [s].
+    n_more
+        Sections to add.
+    rtol, atol, max_steps_per_period, system, quantities
+        As for `run_branches`.
+
+    Returns
+    -------
+    Sections
+        With leading dims (cell, 1). ``turns`` are those since `last`; what closes is not looked at:
+        ``orbit_period`` is 0, and a cell that did not fail is ``BOUNDED``. See `orbit_periods`.
+    """
+    # a window of no sections: nothing closes on them
+    settings = Settings(0, n_more, 0, 0.0, 1)
+    cells = integrate(
+        system, RECORD_LAST, settings, parameters=parameters, frequency_hz=frequency_hz,
+        initial_states=last, n_keep=n_more, n_measures=FIRST_TURN + system.n_states, rtol=rtol, atol=atol,
+        max_steps_per_period=max_steps_per_period, step_size=step_size, quantities=quantities,
+    )  # fmt: skip
+    angles = [i for i, is_angle in enumerate(system.is_angle) if is_angle]
+    return Sections(
+        section=cells.section,
+        turns=cells.turns[:, None, angles].astype(np.int32),
+        status=cells.status.astype(np.int8),
+        orbit_period=np.zeros(cells.status.shape, np.int16),
+        n_periods=cells.n_periods.astype(np.int32),
+        n_steps=cells.n_steps.astype(np.int32),
+        n_rejected=cells.n_rejected.astype(np.int32),
+        final_state=cells.final_state,
+        step_size=cells.next_step,
+        extremes=cells.watched if quantities is not None else None,
+    )
+
+
+def orbit_periods(
+    sections: np.ndarray, *, closure_tolerance: float, max_orbit_period: int, system: System
+) -> np.ndarray:
+    """Period of the orbit on which each cell closes, 0 if on none: what `run_branches` says at its end.
+
+    Parameters
+    ----------
+    sections
+        The last ones of each cell, shape (cell, n, n_states): `observers.window_of` of them, or as many as
+        there have been drive periods.
+    closure_tolerance, max_orbit_period
+        As for `run_branches`.
+    system
+        What was integrated.
+
+    Returns
+    -------
+    ndarray of int16, shape (cell,)
+    """
+    window = window_of(max_orbit_period)
+    settings = Settings(0, 0, max_orbit_period, closure_tolerance, window)
+    rings = np.zeros((len(sections), window * system.n_states))
+    flat = sections[:, -window:].reshape(len(sections), -1)
+    rings[:, : flat.shape[1]] = flat
+    found = np.zeros(len(sections), np.int16)
+    _judge_of(system)(rings, min(sections.shape[1], window), settings, found)
+    return found
+
+
+def judge(rings: Any, last: int, settings: Settings, found: Any) -> None:
+    """Look at each ring of sections for the orbit on which it closes."""
+    for i in range(len(rings)):
+        found[i] = closed_period(rings[i], last, settings)
+
+
+@cache
+def _judge_of(system: System) -> Callable[..., None]:
+    bindings: dict[str, Any] = {
+        "N": system.n_states,
+        "IS_ANGLE": system.is_angle,
+        "SCALES": system.scales,
+    }
+    for key in observers.HELPERS:
+        bindings[key] = part(specialise(getattr(observers, key), system.label, **bindings), True, True)
+    return kernel(specialise(judge, system.label, **bindings))

@@ -1,0 +1,131 @@
+"""Signals that end a command: Ctrl-C, SIGTERM, and SIGHUP from a terminal that closes.
+
+The first ends it in order: what is being computed is given up, workers end, files and folders of the
+moment are removed. The second ends it at once. Before a command has begun, the first does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+NUMBERS = tuple(getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n))
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal, treated like Ctrl-C.
+
+    Attributes
+    ----------
+    number : int
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(number)
+
+
+class InterruptedRunError(Exception):
+    """The run was stopped by a signal; what was committed stays.
+
+    Attributes
+    ----------
+    signal_number : int
+    """
+
+    def __init__(self, signal_number: int, message: str) -> None:
+        self.signal_number = signal_number
+        super().__init__(message)
+
+
+class _Listener:
+    """What the command line does on a signal."""
+
+    first: int | None = None
+    is_in_order = False
+
+    def __call__(self, number: int, frame: Any) -> None:
+        if self.first is None and self.is_in_order:
+            self.first = number
+            raise Stopped(number)
+        leave(number)
+
+
+_listener = _Listener()
+
+
+def listen() -> None:
+    """Take over the signals for a command line; what a parent process ignores stays ignored."""
+    for number in NUMBERS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _listener)
+
+
+@contextlib.contextmanager
+def in_order() -> Iterator[None]:
+    """Let the first signal raise `Stopped` inside."""
+    _listener.is_in_order = True
+    try:
+        yield
+    finally:
+        _listener.is_in_order = False
+
+
+def first_signal() -> int | None:
+    """Which signal came first, if one came."""
+    return _listener.first
+
+
+def leave(number: int) -> NoReturn:
+    """End this process now, and what it started."""
+    local: Any = sys.modules.get("pipeline.compute.local")
+    if hasattr(local, "abandon"):  # not while it is being imported
+        local.abandon()
+    shown = "\x1b[?25h" if sys.stderr.isatty() else ""
+    how = "stopped" if _listener.first is None else "stopped at once; what is committed stays"
+    with contextlib.suppress(OSError):
+        os.write(2, f"{shown}\nmagpend: {how}.\n".encode())
+    os._exit(128 + number)
+
+
+@contextlib.contextmanager
+def stoppable(directory: str | Path) -> Iterator[None]:
+    """Turn Ctrl-C, SIGTERM and SIGHUP into `InterruptedRunError`, after all that is inside has been closed.
+
+    Parameters
+    ----------
+    directory
+        Where what has been done is kept, for the message.
+    """
+    try:
+        with _raising():
+            yield
+    except KeyboardInterrupt as error:
+        number = error.number if isinstance(error, Stopped) else signal.SIGINT
+        message = f"Stopped. What is committed in {directory} stays; the same command goes on from there."
+        raise InterruptedRunError(number, message) from None
+
+
+@contextlib.contextmanager
+def _raising() -> Iterator[None]:
+    """Let signals that would kill this process raise `Stopped`, where nobody else has taken them over."""
+
+    def stop(number: int, frame: Any) -> None:
+        raise Stopped(number)
+
+    taken = []
+    with contextlib.suppress(ValueError):  # not the main thread: signals are somebody else's
+        for number in NUMBERS:
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, stop)
+                taken.append(number)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)

@@ -1,0 +1,394 @@
+"""The files of a run in an object store, by a URL such as ``s3://bucket/prefix``: put whole, markers once.
+
+Who may use the store is known from the environment alone (``AWS_ACCESS_KEY_ID`` and the other names that
+S3 clients read); nothing of it is kept, written or said.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from datetime import timedelta
+from itertools import islice
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import ObjectStore
+
+from pipeline.store.errors import DamagedError, RefusedError, UnreadableError
+
+T = TypeVar("T")
+
+CREDENTIALS = (
+    "AWS_ACCESS_KEY_ID", "AWS_SKIP_SIGNATURE", "AWS_WEB_IDENTITY_TOKEN_FILE", "AWS_METADATA_ENDPOINT",
+    "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI", "AWS_CONTAINER_CREDENTIALS_FULL_URI",
+)  # fmt: skip
+"""Names in the environment any of which says who may use the store."""
+
+AT_ONCE = 16
+"""Requests under way at the same time."""
+
+CONNECT_S, REQUEST_S = 5.0, 60.0
+"""How long reaching a store, and a whole request, may take, in seconds."""
+
+RETRIES, FIRST_WAIT_S, LONGEST_WAIT_S = 6, 0.2, 5.0
+"""How often a request is made again, and the seconds between: some ten in all."""
+
+_URL = re.compile(r"s3://([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])((?:/[^/?#@\s]+)*)/?")
+_AGAIN = "what is committed stays; give the same command again, it goes on."
+
+
+def parse_url(text: str) -> ObjectFiles:
+    """Return the files at a URL such as ``s3://bucket/prefix``.
+
+    Raises
+    ------
+    RefusedError
+        If it is no such URL, or the package or the credentials for it are missing.
+    """
+    if "@" in text or "?" in text:  # not repeated: it may hold a password
+        raise RefusedError("The URL of a run has no user, password or query: credentials are environment.")
+    match = _URL.fullmatch(text)
+    if match is None or {".", ".."} & set(text.split("/")):
+        raise RefusedError(f"{text}: must be s3://BUCKET/PREFIX, such as s3://measurements/runs/first.")
+    try:
+        import obstore  # noqa: F401
+    except ImportError:
+        raise RefusedError(
+            f"{text}: object stores need the package obstore; install it with: pip install 'magpend[s3]'"
+        ) from None
+    if not any(os.environ.get(name) for name in CREDENTIALS):
+        raise RefusedError(f"{text}: there are no credentials; {_CREDENTIALS_HELP}")
+    return ObjectFiles(match[1], match[2].strip("/"))
+
+
+_CREDENTIALS_HELP = (
+    "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY in the environment of magpend and of its workers "
+    "(AWS_SKIP_SIGNATURE=true for a bucket that is open to all)."
+)
+
+
+class ObjectFiles:
+    """Files of a run in a bucket, by key; see `pipeline.store.files.Files`.
+
+    Parameters
+    ----------
+    bucket, prefix
+        Where they are; the prefix has no slash at its ends and may be empty.
+    """
+
+    local = None
+
+    def __init__(self, bucket: str, prefix: str) -> None:
+        self.bucket, self.prefix = bucket, prefix
+        self.metadata: dict[str, Buffer] = {}
+        self._store: Any = None
+        self._below: dict[str, ObjectFiles] = {}
+        self._lines: dict[str, list[str]] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # what travels to another process is the place: it has credentials of its own
+        return ObjectFiles, (self.bucket, self.prefix)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ObjectFiles) and self.name == other.name
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+    def __repr__(self) -> str:
+        return f"ObjectFiles({self.name!r})"
+
+    @property
+    def name(self) -> str:
+        """The URL."""
+        return f"s3://{self.bucket}/{self.prefix}".rstrip("/")
+
+    @property
+    def place(self) -> str:
+        """The URL."""
+        return self.name
+
+    @property
+    def store(self) -> Any:
+        """What obstore knows the prefix by."""
+        if self._store is None:
+            self._store = _client(self.bucket, self.prefix)
+        return self._store
+
+    def below(self, prefix: str) -> ObjectFiles:
+        """Files below a prefix; the same ones every time, since each has connections of its own."""
+        if prefix not in self._below:
+            self._below[prefix] = ObjectFiles(self.bucket, f"{self.prefix}/{prefix}".lstrip("/"))
+        return self._below[prefix]
+
+    def path(self, key: str) -> str:
+        """URL of an object."""
+        return f"{self.name}/{key}".rstrip("/")
+
+    def names(self) -> list[str]:
+        """First parts of all keys, sorted."""
+        import obstore
+
+        found = self._ask("", lambda: obstore.list_with_delimiter(self.store))
+        names = sorted([*found["common_prefixes"], *(entry["path"] for entry in found["objects"])])
+        if not names:
+            raise FileNotFoundError(f"{self.name}: nothing is there")
+        return names
+
+    def is_there(self, key: str) -> bool:
+        """Whether an object is there."""
+        import obstore
+
+        try:
+            # GET, since the answer to HEAD does not tell a missing object from a missing bucket
+            self._ask(key, lambda: obstore.get(self.store, key))
+        except FileNotFoundError:
+            return False
+        return True
+
+    def read(self, key: str) -> bytes:
+        """Content of an object."""
+        import obstore
+
+        return self._ask(key, lambda: bytes(obstore.get(self.store, key).bytes()))
+
+    def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
+        """Contents, or why there is none, some at once."""
+
+        def read(key: str) -> bytes | FileNotFoundError:
+            try:
+                return self.read(key)
+            except FileNotFoundError as error:
+                return error
+
+        rest = iter(keys)
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            # no more of them lie in memory than are read at once
+            while some := list(islice(rest, AT_ONCE)):
+                yield from zip(some, pool.map(read, some), strict=True)
+
+    def write(self, key: str, content: bytes) -> None:
+        """Put an object, in the place of one that is there."""
+        import obstore
+
+        self._ask(key, lambda: obstore.put(self.store, key, content, use_multipart=False), writing=True)
+
+    def write_once(self, key: str, content: bytes) -> None:
+        """Put an object if there is none; one that is there must be the same.
+
+        Raises
+        ------
+        DamagedError
+            If another one is there.
+        """
+        import obstore
+
+        for attempt in range(RETRIES):
+            try:
+                obstore.put(self.store, key, content, mode="create", use_multipart=False)
+                return
+            except obstore.exceptions.AlreadyExistsError:
+                pass  # so is a conflict between two puts, of which none may have been done
+            except (obstore.exceptions.BaseError, OSError) as error:
+                # of a put whose answer was lost nobody knows whether it was done
+                explained = explain(self.path(key), error, writing=True)
+                if not isinstance(explained, UnreadableError) or attempt == RETRIES - 1:
+                    raise explained from None
+            if self._holds(key, content):
+                return
+            time.sleep(min(FIRST_WAIT_S * 2**attempt, LONGEST_WAIT_S))
+        raise UnreadableError(f"{self.path(key)}: cannot be written while others write it; {_AGAIN}")
+
+    def _holds(self, key: str, content: bytes) -> bool:
+        try:
+            found = self.read(key)
+        except FileNotFoundError:
+            return False
+        if found != content:
+            raise DamagedError(
+                f"{self.path(key)}: is there with another content, which nobody but the writer of its run "
+                "puts there; give the same command again."
+            )
+        return True
+
+    def append(self, key: str, line: str) -> None:
+        """Keep a line until the lock is released: objects do not grow, and it is no part of the result."""
+        self._lines.setdefault(key, []).append(line)
+
+    def put_lines(self) -> None:
+        """Put what `append` has kept, after what is there."""
+        for key, lines in self._lines.items():
+            before = b"".join(c for _, c in self.read_each([key]) if isinstance(c, bytes))
+            self.write(key, before + "".join(f"{line}\n" for line in lines).encode())
+        self._lines = {}
+
+    def sizes(self) -> dict[str, int]:
+        """Size of every object by key."""
+        import obstore
+
+        found = self._ask("", lambda: obstore.list(self.store, chunk_size=1000).collect())
+        return {entry["path"]: entry["size"] for entry in found}
+
+    def everything(self) -> list[str]:
+        """Keys of all objects, sorted."""
+        return sorted(self.sizes())
+
+    def remove(self, keys: Iterable[str]) -> None:
+        """Remove objects."""
+        import obstore
+
+        if gone := list(keys):
+            self._ask("", lambda: obstore.delete(self.store, gone), writing=True)
+
+    def sync(self, keys: Iterable[str]) -> None:
+        """Do nothing: what a store has answered for is durable."""
+
+    def prepare(self, prefix: str) -> None:
+        """Do nothing: there are no folders."""
+
+    def refuse_links(self, *prefixes: str) -> None:
+        """Do nothing: there are no links."""
+
+    def zarr(self, *, read_only: bool) -> Store:
+        """The prefix as zarr takes it."""
+        return RunStore(self, read_only=read_only)
+
+    def lock(self) -> AbstractContextManager[None]:
+        """Hold a lease; see `pipeline.store.lease`."""
+        from pipeline.store.lease import lease
+
+        return lease(self)
+
+    def _ask(self, key: str, request: Callable[[], T], *, writing: bool = False) -> T:
+        import obstore
+
+        try:
+            return request()
+        except (obstore.exceptions.BaseError, OSError) as error:
+            raise explain(self.path(key), error, writing=writing) from None
+
+
+class RunStore(ObjectStore[Any]):
+    """What zarr reads and writes: errors in magpend's words, metadata read once by those who write."""
+
+    def __init__(self, files: ObjectFiles, *, read_only: bool = False) -> None:
+        super().__init__(files.store, read_only=read_only)
+        self._files = files
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _run_store, (self._files, self.read_only)
+
+    def with_read_only(self, read_only: bool = False) -> RunStore:
+        """As in zarr."""
+        return RunStore(self._files, read_only=read_only)
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """As in zarr."""
+        kept = self._files.metadata
+        if key in kept and not self.read_only:
+            return kept[key]
+        try:
+            found = await super().get(key, prototype, byte_range)
+        except Exception as error:
+            raise explain(self._files.path(key), error) from None
+        if found is not None and key.endswith("zarr.json") and not self.read_only:
+            kept[key] = found
+        return found
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """As in zarr."""
+        try:
+            await super().set(key, value)
+        except Exception as error:
+            raise explain(self._files.path(key), error, writing=True) from None
+
+
+def _run_store(files: ObjectFiles, read_only: bool) -> RunStore:
+    return RunStore(files, read_only=read_only)
+
+
+def _client(bucket: str, prefix: str) -> Any:
+    """Open a bucket with what the environment says of endpoint, region and credentials."""
+    from obstore.exceptions import BaseError
+    from obstore.store import S3Store
+
+    try:
+        return S3Store(
+            bucket,
+            prefix=prefix or None,
+            client_options={
+                # whoever writes http:// in the environment means it
+                "allow_http": _endpoint().startswith("http://"),
+                "connect_timeout": timedelta(seconds=CONNECT_S),
+                "timeout": timedelta(seconds=REQUEST_S),
+            },
+            retry_config={
+                "max_retries": RETRIES,
+                "backoff": {
+                    "init_backoff": timedelta(seconds=FIRST_WAIT_S),
+                    "max_backoff": timedelta(seconds=LONGEST_WAIT_S),
+                },
+            },
+        )
+    except (BaseError, ValueError) as error:
+        raise explain(f"s3://{bucket}/{prefix}", error) from None
+
+
+def _endpoint() -> str:
+    names = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
+    return next((os.environ[name] for name in names if os.environ.get(name)), "")
+
+
+def explain(place: str, error: Exception, *, writing: bool = False) -> Exception:
+    """Return an error of a store in magpend's words: one line, and nothing that was sent.
+
+    Parameters
+    ----------
+    place
+        URL of what was asked for.
+    error
+        As obstore raises it. Its text has the whole answer, which may name an access key.
+    writing
+        Whether something was to be written.
+    """
+    text = str(error)
+    status = re.search(r"status code: (\d{3})", text)
+    code = re.search(r"<Code>([A-Za-z0-9]{1,60})</Code>", text)
+    said = " ".join(found[1] for found in (status, code) if found)
+    if "NoSuchBucket" in text or (writing and isinstance(error, FileNotFoundError)):
+        return RefusedError(f"{place}: there is no such bucket at {_where()}; make it, or correct the name.")
+    if isinstance(error, FileNotFoundError):
+        return FileNotFoundError(f"{place}: is not there")
+    if "/latest/" in text or "security-credentials" in text or "AssumeRole" in text:
+        return RefusedError(f"{place}: no credentials could be had; {_CREDENTIALS_HELP}")
+    if (status and status[1] in ("401", "403")) or type(error).__name__ == "UnauthenticatedError":
+        return RefusedError(
+            f"{place}: {_where()} refuses access ({said}); check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, "
+            "AWS_REGION and what they may do with the bucket."
+        )
+    if "redirect" in text:
+        return RefusedError(f"{place}: {_where()} has this bucket in another region; set AWS_REGION.")
+    if status and status[1] == "501":
+        return RefusedError(f"{place}: {_where()} cannot do what is needed here ({said}): put if absent.")
+    verb = "written" if writing else "read"
+    if said:
+        return UnreadableError(f"{place}: cannot be {verb}: {_where()} answers {said}; {_AGAIN}")
+    return UnreadableError(f"{place}: cannot be {verb}: {_where()} does not answer; {_AGAIN}")
+
+
+def _where() -> str:
+    """Name of the store's machine, without what else a URL may hold."""
+    parts = urlsplit(_endpoint())
+    try:
+        return f"{parts.hostname}:{parts.port}" if parts.port else parts.hostname or "the object store"
+    except ValueError:
+        return "the object store"

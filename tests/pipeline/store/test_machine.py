@@ -1,0 +1,230 @@
+"""A directory's life, drawn at random: tasks, kills, damage and repairs; it ends with the same bytes.
+
+``MAGPEND_LONG=1`` draws more and longer lives, ``HYPOTHESIS_PROFILE=fresh`` new ones.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from pipeline.layout.identity import identity_of
+from pipeline.layout.plan import make_plan
+from pipeline.runs.mending import sound_commits
+from pipeline.runs.status import state
+from pipeline.runs.verify import verify_run
+from pipeline.spec.parsing import load_spec
+from pipeline.store import commits, packing, records
+from pipeline.store.commits import read_commits, write_task
+from pipeline.store.errors import DamagedError, RefusedError, StoreError
+from pipeline.store.packing import Packer, pack_block
+from pipeline.store.run import Run
+from pipeline.store.setup import create, establish
+
+LONG = os.environ.get("MAGPEND_LONG") == "1"
+
+N_TASKS = 5
+SPEC = f"""
+kind = "sweep"
+model = "duffing"
+[axes]
+frequency_hz = {{ start = 0.15, stop = 0.25, num = {N_TASKS} }}
+[initial_conditions]
+kind = "grid"
+x = 0.1
+v = 0.1
+[integration]
+n_keep = 2
+[execution]
+trajectories_per_task = 1
+"""
+TASKS = st.integers(0, N_TASKS - 1)
+SEEDS = st.integers(0, 10_000)
+
+
+def silent(line):
+    pass
+
+
+class KilledError(Exception):
+    """Stands for SIGKILL."""
+
+
+class Directory:
+    """A run directory whose tasks compute made-up numbers."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "run"
+        (folder / "spec.toml").write_text(SPEC)
+        self.spec = load_spec(folder / "spec.toml")
+        self.plan = make_plan(self.spec)
+        self.identity = identity_of(self.spec, self.plan, "made-up")
+        self.info = create(self.path, self.spec, self.plan, self.identity, SPEC)
+
+    def values(self, index: int) -> dict[str, np.ndarray]:
+        rng = np.random.default_rng(index)
+        shape = tuple(s.stop - s.start for s in self.plan.task(index))
+        found = {}
+        for v in self.plan.variables:
+            own = tuple(self.plan.sizes[d] for d in v.own_dims)
+            found[v.name] = rng.uniform(1, 5, (*shape, *own)).astype(v.dtype)
+        return found
+
+    def commit(self, index: int) -> None:
+        write_task(self.info, self.plan, index, self.values(index), {"bounded": 1})
+
+    def go_on(self) -> None:
+        """What a run does."""
+        self.info = establish(self.path, self.spec, self.plan, self.identity, SPEC, silent)
+        found = sound_commits(self.info, self.plan, silent)
+        packer = Packer(self.info, self.plan, found)
+        for index in range(N_TASKS):
+            if index not in found:
+                self.commit(index)
+                packer.add(index)
+
+    def bytes(self) -> dict[str, bytes]:
+        files = [f for top in ("cube.zarr", "commits") for f in (self.path / top).rglob("*") if f.is_file()]
+        return {f.relative_to(self.path).as_posix(): f.read_bytes() for f in files}
+
+
+class Life(RuleBasedStateMachine):
+    """Rules do what happens to a directory; the invariant is what a reader may see."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.patches = [patch.object(module, "BLOCK", 2) for module in (records, commits, packing)]
+        for block in self.patches:
+            block.start()
+        self.folder = Path(tempfile.mkdtemp(prefix="life-"))
+        (self.folder / "model").mkdir()
+        model = Directory(self.folder / "model")
+        model.go_on()
+        self.wanted = model.bytes()
+        self.run = Directory(self.folder)
+
+    def teardown(self) -> None:
+        try:
+            self.finish()
+        finally:
+            for block in self.patches:
+                block.stop()
+            shutil.rmtree(self.folder)
+
+    @rule(index=TASKS)
+    def compute(self, index):
+        """A task, for the first time, once more, or late."""
+        with contextlib.suppress(DamagedError):  # metadata that are damaged at that moment
+            self.run.commit(index)
+
+    @rule(index=TASKS, step=st.integers(1, 9))
+    def kill(self, index, step):
+        """A worker dies after some of the steps of the protocol."""
+        files = type(self.run.info.files)
+        calls = []
+
+        def dying(name):
+            original = getattr(files, name)
+
+            def call(self, *arguments, **options):
+                calls.append(name)
+                if len(calls) == step:
+                    raise KilledError
+                return original(self, *arguments, **options)
+
+            return patch.object(files, name, call)
+
+        with dying("zarr"), dying("sync"), dying("write"):
+            try:
+                self.run.commit(index)
+            except (KilledError, DamagedError):
+                return
+
+    @rule(block=st.integers(0, 1), step=st.sampled_from(["write", "remove", "none"]))
+    def pack(self, block, step):
+        """The coordinator packs, or dies over it."""
+
+        def die(*arguments):
+            raise KilledError
+
+        if step == "none":
+            pack_block(self.run.info, self.run.plan, block)
+            return
+        with patch.object(type(self.run.info.files), step, die):
+            try:
+                pack_block(self.run.info, self.run.plan, block)
+            except KilledError:
+                return
+
+    @rule(seed=SEEDS, way=st.sampled_from(["flip", "cut", "zero", "delete", "swap", "foreign"]))
+    def damage(self, seed, way):
+        """Something happens to a file."""
+        rng = np.random.default_rng(seed)
+        files = sorted(f for f in self.run.path.rglob("*") if f.is_file() and f.name != "lock")
+        file = files[int(rng.integers(len(files)))]
+        content = file.read_bytes()
+        if way == "flip" and content:
+            place = int(rng.integers(len(content)))
+            file.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
+        elif way == "cut":
+            file.write_bytes(content[: len(content) // 2])
+        elif way == "zero":
+            file.write_bytes(bytes(len(content)))
+        elif way == "delete":
+            file.unlink()
+        elif way == "swap":
+            other = files[int(rng.integers(len(files)))]
+            file.write_bytes(other.read_bytes())
+            other.write_bytes(content)
+        else:
+            (self.run.path / "cube.zarr/status").mkdir(exist_ok=True, parents=True)
+            (self.run.path / "cube.zarr/status/c.77").write_bytes(b"stray")
+
+    @rule()
+    def repair(self):
+        """What is left counts, and is sound."""
+        try:
+            verify_run(self.run.path, repair=True)
+        except (DamagedError, RefusedError):  # run.json is not what it was
+            return
+        assert verify_run(self.run.path).sound
+
+    @rule()
+    def finish(self):
+        """Whatever happened: the same command ends with the bytes of a run that nothing happened to."""
+        self.run.go_on()
+        assert self.run.bytes() == self.wanted
+        found = verify_run(self.run.path)
+        assert (found.sound, found.n_committed, found.leftovers) == (True, N_TASKS, [])
+        assert state(self.run.path).complete
+
+    @invariant()
+    def is_read_as_written_or_not_at_all(self):
+        try:
+            opened = Run.open(self.run.path)
+            cube = opened.cube().load()
+        except StoreError:
+            return
+        committed = read_commits(opened.info, opened.plan)
+        for index in range(N_TASKS):
+            written, block = self.run.values(index), self.run.plan.task(index)
+            for variable in self.run.plan.variables:
+                expected = written[variable.name]
+                if index not in committed:
+                    expected = np.full_like(expected, variable.fill)
+                assert np.array_equal(cube[variable.name].values[block], expected, equal_nan=True)
+
+
+Life.TestCase.settings = settings(
+    max_examples=200 if LONG else 5, stateful_step_count=30 if LONG else 8, deadline=None
+)
+test_life = Life.TestCase
