@@ -205,8 +205,8 @@ def _kept(run: AnalysedRun, place: Files, result: xr.Dataset) -> xr.Dataset:
     try:
         write_product(place, result)
     except OSError as error:
-        name = place.name.rpartition("/")[2]
-        run.echo(f"{name}: not kept ({error}); what was found is shown all the same")
+        kept = place.name.rpartition("/")[2]
+        run.echo(f"{kept}: not kept ({error}); what was found is shown all the same")
         return result
     return _placed(open_product(place), place)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numcodecs.blosc
@@ -113,16 +112,16 @@ def _codecs_problem(codecs: tuple[Any, ...]) -> str:
     return f"names the codecs {', '.join(map(str, codecs))[:80]}, with which nothing is written here"
 
 
-def product_problem(folder: Path, files: Iterable[Path]) -> str | None:
+def product_problem(contents: Iterable[tuple[str, bytes]]) -> str | None:
     """Say what the files of a product declare that they must not; None if nothing."""
     chunk_bytes: dict[str, int] = {}
     total, on_disk = 0, 0
-    chunks = []
-    for file in files:
-        name, _, rest = file.relative_to(folder).as_posix().partition("/")
+    chunks: list[tuple[str, int]] = []
+    for key, content in contents:
+        name, _, rest = key.partition("/")
         if rest == METADATA:
             try:
-                data = json.loads(file.read_bytes())
+                data = json.loads(content)
                 codecs = tuple(codec["name"] for codec in data["codecs"])
                 shape, chunk = data["shape"], data["chunk_grid"]["configuration"]["chunk_shape"]
                 itemsize = np.dtype(data["data_type"]).itemsize
@@ -134,11 +133,9 @@ def product_problem(folder: Path, files: Iterable[Path]) -> str | None:
             chunk_bytes[name] = math.prod(chunk) * itemsize
             total += n_chunks * chunk_bytes[name]
         elif rest:
-            chunks.append((name, file))
-    for name, file in chunks:
-        on_disk += file.stat().st_size
-        with file.open("rb") as opened:
-            declared = declared_bytes(opened.read(_HEADER))
+            chunks.append((name, declared_bytes(content)))
+            on_disk += len(content)
+    for name, declared in chunks:
         if declared != chunk_bytes.get(name):
             return f"{name}: a chunk declares {declared} bytes, and has {chunk_bytes.get(name, 0)}"
     if total > max(MOST_PRODUCT_BYTES, MOST_RATIO * on_disk):

@@ -114,6 +114,7 @@ def open_product(place: Place) -> xr.Dataset:
         # all of it is read for the seal, so it is read once
         contents = dict(files.read_each(files.everything()))
         _sealed_attrs(files, contents.get(_GROUP), _digests_of(contents.items()))
+        _refuse_declared(files, contents.items())
         whole = ((key, value) for key, value in contents.items() if isinstance(value, bytes))
         store = MemoryStore({key: cpu.Buffer.from_bytes(value) for key, value in whole})
     else:
@@ -144,19 +145,21 @@ def read_product_attrs(place: Place) -> dict[str, Any]:
             raise DamagedError(f"{path}: is, or lies behind, a link")
         if not path.exists():
             raise FileNotFoundError(path)
-        links = [file for file in files_below(path) if file.is_symlink()] if path.is_dir() else [path]
-        if links:
-            raise DamagedError(f"{links[0]}: is a link, or no folder")
         try:
             attrs = _sealed_attrs(files, files.read(_GROUP), _digests(files))
+            _refuse_declared(files, files.read_each(files.everything()))
+            return attrs
         except (OSError, UnreadableError) as error:
             raise DamagedError(f"{path}: {error!r}") from None
-        if problem := product_problem(path, files_below(path)):
-            raise DamagedError(f"{path}: {problem}")
-        return attrs
     keys = files.everything()
     group = dict(files.read_each([_GROUP] if keys else []))
     return _sealed_attrs(files, group.get(_GROUP), _digests(files))
+
+
+def _refuse_declared(files: Files, contents: Iterable[tuple[str, bytes | FileNotFoundError]]) -> None:
+    """Refuse a product whose files declare more than they have."""
+    if problem := product_problem((key, value) for key, value in contents if isinstance(value, bytes)):
+        raise DamagedError(f"{files.name}: {problem}")
 
 
 def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests: Digests) -> dict[str, Any]:
