@@ -145,7 +145,7 @@ class CommittedStore(WrapperStore[Store]):
         ):
             raise self._damaged(key, "is not what was written: its content has changed")
         if problem := self._shown.declared.problem(key, content):
-            raise self._damaged(key, problem)
+            raise self._damaged(key, f"is not what was written: {problem}")
         return content
 
     def _damaged(self, key: str, problem: str) -> DamagedError:
