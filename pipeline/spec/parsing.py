@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from unicodedata import category
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -313,7 +314,7 @@ def _title(data: Mapping[str, Any], problems: list[str]) -> str:
     title = data.get("title", "")
     if not isinstance(title, str):
         problems.append(f"title = {shown(title)}: must be a text in quotes.")
-    elif not title.isprintable():
+    elif not all(c.isprintable() or category(c) == "Zs" for c in title):
         problems.append(f"title = {shown(title)}: has control characters or line breaks; take them out.")
     return str(title)
 

@@ -114,16 +114,16 @@ def test_describe_plan__complete_run_takes_nothing(write_spec, sweep_text, tmp_p
 
 @pytest.mark.parametrize("stops", [True, False])
 def test_estimate__compiles_no_kernel_that_the_run_does_not_need(monkeypatch, stops):
-    from pipeline.compute import task
+    from pipeline.compute import walking
 
     asked = []
-    original = task.run_branches
+    original = walking.run_branches
 
     def run_branches(*arguments, **options):
         asked.append((options["stop_when_closed"], options.get("quantities")))
         return original(*arguments, **options)
 
-    monkeypatch.setattr(task, "run_branches", run_branches)
+    monkeypatch.setattr(walking, "run_branches", run_branches)
     text = CLOSING if stops else CLOSING.replace("= true", "= false")
     estimate(*read(text))
     assert set(asked) == {(stops, None)}

@@ -31,6 +31,12 @@ trajectories_per_task = 16
 """
 
 
+def heed_signals():
+    """What runs the tests may ignore them, as `nohup` does, and processes inherit that."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 @pytest.fixture
 def begin(tmp_path):
     """Begin the run in a session and a folder for temporary files of its own."""
@@ -42,6 +48,7 @@ def begin(tmp_path):
         process = subprocess.Popen(
             [sys.executable, "-m", "pipeline.cli.main", "run", "spec.toml", "--out", "run", "--workers", "2"],
             cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+            preexec_fn=heed_signals,
             env=dict(os.environ, TMPDIR=str(tmp_path / "temporary")),
         )  # fmt: skip
         begun.append(process)
