@@ -15,6 +15,7 @@ import os
 import shutil
 import signal
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from multiprocessing import resource_tracker
@@ -72,29 +73,33 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
     from distributed import LocalCluster
 
     _start_tracker()
-    with (
-        _hushed(),
-        _scratch() as scratch,
-        dask.config.set({**SETTINGS, **({} if dashboard else NO_PAGES), "temporary-directory": str(scratch)}),
-        _loop() as loop,
-        LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=0,
-            threads_per_worker=1,
-            memory_limit=1.0 / n_workers,
-            processes=True,
-            host="127.0.0.1",
-            protocol="tls",
-            security=_security(scratch),
-            # The scheduler serves HTTP even without a dashboard: by default at port 8787, with a
-            # warning if another run is there.
-            scheduler_kwargs={"dashboard": dashboard, "dashboard_address": "127.0.0.1:0"},
-            local_directory=str(scratch),
-            silence_logs=50,
-            loop=loop,
-        ) as cluster,
-    ):
+    pages = {} if dashboard else NO_PAGES
+    with contextlib.ExitStack() as stack:
+        # a cluster that is half there could not be ended in order
+        with _signals_put_off():
+            stack.enter_context(_hushed())
+            scratch = stack.enter_context(_scratch())
+            settings = {**SETTINGS, **pages, "temporary-directory": str(scratch)}
+            stack.enter_context(dask.config.set(settings))
+            loop = stack.enter_context(_loop())
+            cluster = LocalCluster(  # type: ignore[no-untyped-call]
+                n_workers=0,
+                threads_per_worker=1,
+                memory_limit=1.0 / n_workers,
+                processes=True,
+                host="127.0.0.1",
+                protocol="tls",
+                security=_security(scratch),
+                # The scheduler serves HTTP even without a dashboard: by default at port 8787, with a
+                # warning if another run is there.
+                scheduler_kwargs={"dashboard": dashboard, "dashboard_address": "127.0.0.1:0"},
+                local_directory=str(scratch),
+                silence_logs=50,
+                loop=loop,
+            )
+            stack.enter_context(cluster)
         try:
-            cluster.scale(n_workers)
+            cluster.scale(n_workers)  # type: ignore[no-untyped-call]
             _await_one(cluster)
             yield cluster
         except BaseException:
@@ -203,6 +208,26 @@ def _start_tracker() -> None:
             del os.environ[name]
         else:
             os.environ[name] = before
+
+
+@contextlib.contextmanager
+def _signals_put_off() -> Iterator[None]:
+    """Keep signals that somebody handles until the end, when they are raised again."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are handled by the main thread alone
+        return
+    caught: list[int] = []
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    before = {number: handler for number, handler in before.items() if callable(handler)}
+    for number in before:
+        signal.signal(number, lambda number, frame: caught.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for late in caught:
+        signal.raise_signal(late)
 
 
 @contextlib.contextmanager
