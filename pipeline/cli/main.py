@@ -135,6 +135,7 @@ def main() -> None:
         if code is Exit.BUG:
             raise
         _complain(error)
+    stopping.end_if_stopped(int(code))
     if code != Exit.DONE:
         sys.exit(int(code))
 

@@ -7,6 +7,7 @@ moment are removed. The second ends it at once. Before a command has begun, the 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
 import sys
@@ -74,11 +75,24 @@ def in_order() -> Iterator[None]:
         yield
     finally:
         _listener.is_in_order = False
+        if _listener.first is not None:  # what is left is to say so: once, and with the first one's code
+            for number in NUMBERS:
+                signal.signal(number, signal.SIG_IGN)
 
 
 def first_signal() -> int | None:
     """Which signal came first, if one came."""
     return _listener.first
+
+
+def end_if_stopped(code: int) -> None:
+    """End this process if a signal came, once people have been told; nothing is left that could take long."""
+    if _listener.first is not None:
+        logging.shutdown()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
 
 
 def leave(number: int) -> NoReturn:
