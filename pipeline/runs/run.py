@@ -133,10 +133,13 @@ def carry_out(
     Exception
         As `run`.
     """
+    from pipeline.compute import clients
+
     plan = make_plan(spec)
     identity = identity_here(spec, plan)
     if check(files, identity) is None:
         check_space(plan, files.local)
+        clients.reach(where)  # before anything is created
     with stoppable(files.name), files.lock() as alone:
         is_alone = alone is not False
         info = establish(files, spec, plan, identity, text, echo, alone=is_alone)

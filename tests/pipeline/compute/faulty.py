@@ -49,16 +49,6 @@ def hanging(folder: str, index: int, number: int = 0, unlucky: tuple = (), poiso
     return {"task": index}
 
 
-def greedy(folder: str, index: int, poison: tuple = ()) -> dict:
-    """Some tasks take memory until they are stopped."""
-    log(folder, index)
-    kept = []
-    while index in poison:
-        kept.append(bytearray(20_000_000))
-        time.sleep(0.05)
-    return {"task": index}
-
-
 def slow(folder: str, index: int, seconds: float = 0.2) -> dict:
     log(folder, index)
     time.sleep(seconds)
