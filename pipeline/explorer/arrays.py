@@ -1,0 +1,67 @@
+"""Arrays as the page takes them: one run of bytes, read without copying.
+
+A little-endian uint32 says how long the header is; the header is JSON in UTF-8, padded with spaces so that
+what follows begins at a multiple of 8; then come the arrays in C order, each padded to 8 bytes::
+
+    {"attrs": {...}, "arrays": {"y": {"dtype": "float64", "shape": [3, 2], "offset": 0}, ...}}
+
+Offsets count from the end of the header. `page/src/arrays.js` is the other end.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+DTYPES = ("float64", "float32", "int32", "uint32", "int16", "uint16", "int8", "uint8")
+"""What a browser has typed arrays for; 64-bit integers are not among them."""
+
+_ALIGNMENT = 8
+
+
+def _padding(length: int) -> int:
+    return -length % _ALIGNMENT
+
+
+def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
+    """Return arrays and attributes as one run of bytes.
+
+    Parameters
+    ----------
+    arrays
+        By name, of a type in `DTYPES`.
+    attrs
+        What JSON can say; no NaN and no infinity: None stands for what has no value.
+
+    Raises
+    ------
+    ValueError
+        If an array's type is none of `DTYPES`, or an attribute has no place in JSON.
+    """
+    places, parts, offset = {}, [], 0
+    for name, values in arrays.items():
+        if values.dtype.name not in DTYPES:
+            raise ValueError(f"array {name} is of type {values.dtype}: one of {', '.join(DTYPES)} is needed")
+        data = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
+        places[name] = {"dtype": values.dtype.name, "shape": list(values.shape), "offset": offset}
+        parts += [data, bytes(_padding(len(data)))]
+        offset += len(data) + _padding(len(data))
+    header = json.dumps({"attrs": dict(attrs or {}), "arrays": places}, allow_nan=False).encode()
+    header += b" " * _padding(len(header) + 4)
+    return b"".join([len(header).to_bytes(4, "little"), header, *parts])
+
+
+def unpack_arrays(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return what `pack_arrays` was given: arrays by name, and attributes."""
+    begin = 4 + int.from_bytes(data[:4], "little")
+    header = json.loads(data[4:begin])
+    arrays = {}
+    for name, place in header["arrays"].items():
+        shape = tuple(place["shape"])
+        dtype = np.dtype(place["dtype"]).newbyteorder("<")
+        count = int(np.prod(shape, dtype=np.int64))
+        arrays[name] = np.frombuffer(data, dtype, count, begin + place["offset"]).reshape(shape)
+    return arrays, header["attrs"]

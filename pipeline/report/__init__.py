@@ -1,0 +1,1 @@
+"""Reports: what a study found as one HTML page, and the paper's figures computed and judged."""
