@@ -7,6 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from pipeline.explorer.jobs import Work
+from pipeline.explorer.slices import slice_of
 from pipeline.explorer.starting import start
 
 if TYPE_CHECKING:
@@ -15,4 +16,4 @@ if TYPE_CHECKING:
 
 def works(live: LiveRun) -> Mapping[str, Work]:
     """Return what does each kind of job, with what a session remembers between them."""
-    return {"start": partial(start, live)}
+    return {"start": partial(start, live), "slice": partial(slice_of, live)}

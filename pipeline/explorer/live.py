@@ -78,8 +78,8 @@ class LiveRun:
             raise RequestError(problem)
         self.run, self.model, self.spec = run, run.model, run.spec
         self.integration = run.spec.integration
-        threads = max(1, min(os.cpu_count() or 1, MOST_THREADS))
-        self.pool = ThreadPoolExecutor(threads, "magpend-live")
+        self.threads = max(1, min(os.cpu_count() or 1, MOST_THREADS))
+        self.pool = ThreadPoolExecutor(self.threads, "magpend-live")
         self._lock = threading.Lock()
         self._catalogs: OrderedDict[tuple[float, ...], Catalog] = OrderedDict()
         self._attractors: xr.Dataset | None = None

@@ -14,6 +14,7 @@ from pipeline.explorer.jobs import Job
 from pipeline.explorer.messages import StartRequest
 from pipeline.explorer.series import SAMPLES, fixed_points, series
 from pipeline.explorer.settling import Flight, Place, conclude, run_start, system_at
+from pipeline.layout.vocabulary import ABSENT
 
 if TYPE_CHECKING:
     from pipeline.explorer.live import LiveRun
@@ -55,7 +56,8 @@ def _end(live: LiveRun, job: Job, place: Place, block: Block, number: int, perio
     catalog = live.catalog(place)
     entry, legend = catalog.entry(number), live.legend(catalog)
     line = legend.line(entry)
-    motion = int(catalog.motions(block)[0])
+    # of a start that was run on, the sections kept are those of the way there
+    motion = entry.motion if entry.kind != ABSENT else int(catalog.motions(block)[0])
     job.tell(
         "done", label=line["label"], colour=line["colour"], attractor=entry.attractor, number=number,
         period=entry.period or int(block.orbit_period[0]), status=Status(int(block.status[0])).name.lower(),
