@@ -80,6 +80,7 @@ class LiveRun:
         self.integration = run.spec.integration
         self.threads = max(1, min(os.cpu_count() or 1, MOST_THREADS))
         self.pool = ThreadPoolExecutor(self.threads, "magpend-live")
+        self.region_lock = threading.Lock()
         self._lock = threading.Lock()
         self._catalogs: OrderedDict[tuple[float, ...], Catalog] = OrderedDict()
         self._attractors: xr.Dataset | None = None
