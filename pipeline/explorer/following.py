@@ -1,9 +1,9 @@
 """Periodic orbits that follow a parameter which is dragged, stable or not.
 
-The orbit is a fixed point of the stroboscopic or return map. From one value of the parameter to the next it is
-predicted along its tangent and corrected by Newton's method at that value (`branches.arclength.correct`); a step
-that fails is halved. At a fold the orbit turns back, so that beyond it there is none: it is lost. What goes round
-folds is `magpend analyse branches`.
+The orbit is a fixed point of the stroboscopic or return map. From one value of the parameter to the next it
+is predicted along its tangent and corrected by Newton's method at that value
+(`branches.arclength.correct`); a step that fails is halved. At a fold the orbit turns back, so that beyond
+it there is none: it is lost. What goes round folds is `magpend analyse branches`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pipeline.explorer.messages import CellPoint, FollowRequest, RequestError
 from pipeline.explorer.series import fixed_points, orbit_series
 from pipeline.explorer.settling import Place, system_at
 from pipeline.layout.cells import parameter_axes
-from pipeline.layout.vocabulary import CLOSED_ORBIT, axis_name, split_dims
+from pipeline.layout.vocabulary import CLOSED_ORBIT, axis_name
 
 if TYPE_CHECKING:
     from pipeline.explorer.live import LiveRun
@@ -117,8 +117,8 @@ class Follower:
         assert isinstance(request, FollowRequest)
         if self._live.model.autonomous and self._live.model.crossing is None:
             raise RequestError(
-                f"{self._live.model.name} is a flow seen at even times, where orbits are no points; make a run "
-                "with a [section] to follow them."
+                f"{self._live.model.name} is a flow seen at even times, where orbits are no points; make a "
+                "run with a [section] to follow them."
             )
         held = self._origin(request)
         name = self._name(request.parameter)
@@ -220,7 +220,8 @@ def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
     period = int(one["orbit_period"].values) or _period_of_attractor(live, at)
     if not period:
         raise RequestError(
-            f"cell {cell} has no orbit to follow: its sections close on none; take a point of a periodic motion."
+            f"cell {cell} has no orbit to follow: its sections close on none; take a point of a periodic "
+            "motion."
         )
     return Held(place, period, section[point])
 
@@ -232,7 +233,6 @@ def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
         return 0
     here = attractors.isel({d: i for d, i in at.items() if d in attractors["attractor_id"].dims})
     number = int(here["attractor_id"].values)
-    dims, _ = split_dims(attractors["attractor_id"])
     if number < 0 or int(here["kind"].isel(attractor=number).values) != CLOSED_ORBIT:
         return 0
     return int(here["orbit_period"].isel(attractor=number).values)
@@ -252,7 +252,9 @@ def _followed(family: Family, state: np.ndarray, begin: float, target: float, jo
         job.check()
         if time.perf_counter() > until:
             reached = float(here.u[-1] * scale)
-            return Reached(reached, here, f"followed to {reached:.6g} in the time; ask again to go on.", False)
+            return Reached(
+                reached, here, f"followed to {reached:.6g} in the time; ask again to go on.", False
+            )
         left = goal - here.u[-1]
         move = left if abs(left) <= step else np.copysign(step, left)
         there = _step(problem, here, move, normal)
@@ -299,8 +301,8 @@ def _why(point: Point, family: Family, target: float) -> str:
     if np.abs(multipliers - 1.0).min() < NEAR_ONE:
         half = ", or joins that of half its period" if family.period % 2 == 0 else ""
         return (
-            f"lost at {name} = {value:.7g} on the way to {target:.6g}: a multiplier is near 1, as at a fold, where "
-            f"an orbit turns back{half}."
+            f"lost at {name} = {value:.7g} on the way to {target:.6g}: a multiplier is near 1, as at a fold, "
+            f"where an orbit turns back{half}."
         )
     return f"lost at {name} = {value:.7g} on the way to {target:.6g}: Newton's method finds no orbit beyond."
 

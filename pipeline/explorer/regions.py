@@ -62,7 +62,10 @@ def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
 def zoom_toml(run: Run, region: Region) -> str:
     """Return the specification of a region as a TOML text, with a line that says where it is from."""
     spec, notes = zoomed(run, region)
-    head = [f"# Zoom into a run, digest {run.info.digest}.", *(f"# note: {_one_line(note)}" for note in notes)]
+    head = [
+        f"# Zoom into a run, digest {run.info.digest}.",
+        *(f"# note: {_one_line(note)}" for note in notes),
+    ]
     return "\n".join([*head, to_toml(spec)])
 
 
@@ -81,7 +84,9 @@ def changes_of(run: Run, region: Region) -> Changes:
             continue
         values = swept[key].values
         if not 0 <= index < len(values):
-            raise RequestError(f"at.{name} = {index}: the axis has {len(values)} values, 0 to {len(values) - 1}.")
+            raise RequestError(
+                f"at.{name} = {index}: the axis has {len(values)} values, 0 to {len(values) - 1}."
+            )
         pins[key] = float(values[index])
     return Changes(ranges, pins)
 
@@ -228,6 +233,8 @@ def _group(words: list[str], folder: Path, said: Any) -> Iterator[subprocess.Pop
 
 def _end_group(process: subprocess.Popen[bytes]) -> None:
     """End a process and all that it started: in order, and after a while by force."""
+    if process.poll() == 0:
+        return
     if process.poll() is None:
         _signal(process, signal.SIGTERM)
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -242,4 +249,3 @@ def _signal(process: subprocess.Popen[bytes], number: int) -> None:
             os.killpg(process.pid, number)
         elif process.poll() is None:
             process.send_signal(number)
-
