@@ -105,7 +105,7 @@ export class Follow {
       this.job = this.live.job("follow", { from, parameter, value }, (kind, found) => kind === "orbit" && (piece = found));
       try {
         const end = await this.job.done;
-        if (from === this.from && !end.cancelled) this.take(piece, end);
+        if (from === this.from && !end.cancelled) this.take(piece);
       } catch (error) {
         if (from === this.from) this.tell(error.message, true);
       }
@@ -113,19 +113,18 @@ export class Follow {
     this.busy = false;
   }
 
-  take(piece, end) {
-    const attrs = piece?.attrs ?? end;
-    if (attrs.lost) {
-      this.tell(attrs.sentence ?? `The orbit was lost before ${number(attrs.value, 6)}.`, true);
-      if (!piece?.arrays.time) return;
-    }
-    if (!piece) return;
+  take(piece) {
+    const attrs = piece?.attrs;
+    if (!piece?.arrays.time) return;
     const orbit = new Orbit(piece, this.view.model);
     this.orbit = orbit;
     if (attrs.orbit !== undefined && attrs.orbit !== null) this.from = { orbit: attrs.orbit };
     this.back.disabled = false;
     const stability = { true: "stable", false: "unstable" }[String(orbit.stable)] ?? "of unknown stability";
-    if (!attrs.lost) this.tell(`Followed to ${this.parameter.text} = ${number(attrs.value ?? this.valueOf(orbit), 6)}: ${stability}.`);
+    const place = number(attrs.value ?? this.valueOf(orbit), 6);
+    if (attrs.lost) this.tell(`Lost: ${attrs.sentence ?? `there is no orbit beyond ${place}`}`, true);
+    else if (attrs.sentence) this.tell(attrs.sentence);
+    else this.tell(`Followed to ${this.parameter.text} = ${place}: ${stability}.`);
     if (this.wanted === null && document.activeElement !== this.slider) this.mark(this.valueOf(orbit));
     this.panels.show(orbit);
   }

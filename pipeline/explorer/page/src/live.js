@@ -75,11 +75,11 @@ export class LiveClient {
       this.jobs.delete(id);
       return job.reject(new LiveError(piece.attrs.error));
     }
-    if (kind === "done") {
-      this.jobs.delete(id);
-      return job.resolve(piece.attrs);
-    }
-    return job.onPiece(kind, piece);
+    if (kind !== "done") job.onPiece(kind, piece);
+    // a followed orbit comes whole and is the end of its job
+    if (kind !== "done" && kind !== "orbit") return undefined;
+    this.jobs.delete(id);
+    return job.resolve(piece.attrs);
   }
 
   /**

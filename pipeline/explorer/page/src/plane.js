@@ -2,12 +2,12 @@
 // is computed while one watches; a click integrates that start.
 
 import { el, freshId, labelledSelect, show } from "./dom.js";
-import { Frame } from "./frame.js";
+import { extent, Frame } from "./frame.js";
 import { number } from "./facts.js";
 import { axisOf, indicesOf } from "./orbit.js";
 import { brokenLines } from "./wrapping.js";
 
-const RESOLUTIONS = [64, 128, 256, 512];
+const RESOLUTIONS = [64, 128, 256, 512], COARSEST = 16;
 const TURN = 2 * Math.PI;
 export const NO_LIVE = "Live integration is off in this copy: open the run with magpend explore to integrate starts, compute slices and drag parameters.";
 
@@ -117,8 +117,8 @@ export class Plane {
   }
 
   take(map, problem = "") {
-    this.map = map;
-    this.limits = map?.u.length ? [...edges(map.u), ...edges(map.v)] : this.usualLimits();
+    [this.map, this.below] = [map, null];
+    this.limits = map?.box ?? this.usualLimits();
     this.frame.fit(...this.limits, 0);
     this.fixed = this.usualFixed();
     if (this.live) this.fillBounds();
@@ -173,7 +173,7 @@ export class Plane {
 
   paint(ctx, frame, colours) {
     if (this.image) {
-      const [x0, x1] = edges(this.map.u), [y0, y1] = edges(this.map.v);
+      const [x0, x1, y0, y1] = this.map.box;
       ctx.imageSmoothingEnabled = false;
       ctx.drawImage(this.image, frame.x(x0), frame.y(y1), frame.x(x1) - frame.x(x0), frame.y(y0) - frame.y(y1));
     } else if (this.map?.dots) this.paintStarts(ctx, frame, colours);
@@ -226,7 +226,7 @@ export class Plane {
   showLegend() {
     if (!this.map) return this.legend.replaceChildren();
     const counts = new Map();
-    for (const id of this.map.label ?? this.map.dots ?? []) counts.set(id, (counts.get(id) ?? 0) + 1);
+    for (const id of this.map.label ?? this.map.dots) if (id >= 0) counts.set(id, (counts.get(id) ?? 0) + 1);
     const total = [...counts.values()].reduce((a, b) => a + b, 0);
     const items = this.map.labels.filter((entry) => counts.has(entry.id)).map((entry) => {
       const swatch = el("span", { class: "swatch", "aria-hidden": "true" });
@@ -282,11 +282,8 @@ export class Plane {
 
   labelAt([x, y]) {
     if (!this.map?.label) return "";
-    const { u, v, label, labels } = this.map;
-    const [x0, x1] = edges(u), [y0, y1] = edges(v);
-    const i = Math.floor(((x - x0) / (x1 - x0)) * u.length), j = Math.floor(((y - y0) / (y1 - y0)) * v.length);
-    if (i < 0 || j < 0 || i >= u.length || j >= v.length) return "";
-    return labels.find((entry) => entry.id === label[j * u.length + i])?.label ?? "";
+    const id = idAt(this.map, x, y) ?? -1;
+    return this.map.labels.find((entry) => entry.id === (id < 0 && this.below ? idAt(this.below, x, y) : id))?.label ?? "";
   }
 
   // ---- computing ---------------------------------------------------------------------------
@@ -352,6 +349,7 @@ export class Plane {
     this.forgetStart();
     this.working(true);
     this.told.textContent = "Computing ...";
+    this.below = null;
     const job = (this.job = this.live.job("slice", request, (kind, piece) => job === this.job && this.refine(kind, piece, resolution)));
     try {
       const end = await job.done;
@@ -371,31 +369,37 @@ export class Plane {
   }
 
   refine(kind, piece, wanted) {
-    const part = piece.attrs.share_done ?? piece.attrs.done / piece.attrs.total;
-    if (Number.isFinite(part)) this.progress.value = part;
     if (kind !== "slice") return;
+    const { resolution, share_done: share } = piece.attrs, before = resolution > COARSEST ? (resolution / 2) ** 2 : 0;
+    this.progress.value = (before + share * (resolution ** 2 - before)) / wanted ** 2;
     this.map = mapOf({ ...piece, attrs: { ...piece.attrs, states: this.pair, fixed: this.fixed, source: "slice" } }, this.limits);
-    this.image = imageOf(this.map);
+    this.image = imageOf(this.map, this.below?.image);
+    if (share >= 1) this.below = { ...this.map, image: this.image };
     this.showLegend();
-    const { resolution } = piece.attrs;
     if (resolution < wanted) this.told.textContent = `${resolution} × ${resolution} of ${wanted} × ${wanted} starts`;
     this.frame.repaint();
   }
 }
 
-/** What the source says of a plane. */
-function mapOf({ attrs, arrays, shapes }, limits = null) {
-  if (!attrs.source || !arrays.label?.length) return null;
+/** What a plane holds: a grid of labels or single starts, and the box that they fill. */
+function mapOf({ attrs, arrays, shapes }, box = null) {
+  const { u, v, label } = arrays;
+  if (!attrs.source || !label?.length) return null;
   const isGrid = shapes.label.length === 2;
-  const [nv, nu] = isGrid ? shapes.label : [0, 0];
-  const { u = centres(limits, 0, nu), v = centres(limits, 2, nv) } = arrays;
-  const labels = attrs.labels ?? [];
-  const common = { states: attrs.states, fixed: attrs.fixed ?? {}, labels, source: attrs.source, u, v };
-  return isGrid ? { ...common, label: arrays.label } : { ...common, dots: arrays.label };
+  const common = { states: attrs.states, fixed: attrs.fixed ?? {}, labels: attrs.labels ?? [], source: attrs.source, u, v };
+  if (isGrid) return { ...common, label, box: box ?? [...edges(u), ...edges(v)] };
+  return { ...common, dots: Array.from(label), box: [...widened(u), ...widened(v)] };
 }
 
-function centres(limits, k, n) {
-  return Array.from({ length: n }, (_, i) => limits[k] + ((i + 0.5) / n) * (limits[k + 1] - limits[k]));
+/** Id at a place of a grid of labels; null beyond it. */
+function idAt({ u, v, label, box: [x0, x1, y0, y1] }, x, y) {
+  const i = Math.floor(((x - x0) / (x1 - x0)) * u.length), j = Math.floor(((y - y0) / (y1 - y0)) * v.length);
+  return i < 0 || j < 0 || i >= u.length || j >= v.length ? null : label[j * u.length + i];
+}
+
+function widened(values) {
+  const [low, high] = extent(values), room = 0.08 * (high - low) || 0.5;
+  return [low - room, high + room];
 }
 
 /** Outer bounds of cells whose centres these are. */
@@ -405,11 +409,15 @@ function edges(values) {
   return [first - half, last + half];
 }
 
-function imageOf({ u, v, label, labels }) {
+/** Labels as colours, one pixel each; where there is none yet, what is `below` shines through. */
+function imageOf({ u, v, label, labels }, below = null) {
   const [nu, nv] = [u.length, v.length];
   const canvas = document.createElement("canvas");
   [canvas.width, canvas.height] = [nu, nv];
-  const ctx = canvas.getContext("2d"), image = ctx.createImageData(nu, nv);
+  const ctx = canvas.getContext("2d");
+  ctx.imageSmoothingEnabled = false;
+  if (below) ctx.drawImage(below, 0, 0, nu, nv);
+  const image = ctx.getImageData(0, 0, nu, nv);
   const colours = new Map(labels.map((entry) => [entry.id, [1, 3, 5].map((k) => parseInt(entry.colour.slice(k, k + 2), 16))]));
   for (let j = 0; j < nv; j++) {
     for (let i = 0; i < nu; i++) {
