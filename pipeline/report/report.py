@@ -1,0 +1,85 @@
+"""One page on one or several runs: ``magpend report``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import metadata
+
+from pipeline.products.registry import ANALYSES
+from pipeline.report.page import Block, Grid, Page, Part
+from pipeline.report.runs import CHEAP, SHOWN, part_of
+from pipeline.runs.derive import AnalysedRun
+from pipeline.spec.problems import SpecError, unknown_name
+
+Echo = Callable[[str], None]
+
+
+def report(
+    directories: Sequence[str],
+    *,
+    title: str = "",
+    also: Sequence[str] = (),
+    only_stored: bool = False,
+    echo: Echo = print,
+) -> Page:
+    """Return the page on some runs.
+
+    Parameters
+    ----------
+    directories
+        Run directories; each is opened before anything is computed.
+    title
+        Of the page; by default that of the run, or how many there are.
+    also
+        Analyses that are computed besides those of `pipeline.report.runs.CHEAP`, as ``magpend analyse`` does.
+    only_stored
+        Compute nothing: draw and list what stands in the cubes and in ``derived/``.
+    echo
+        Prints a line.
+
+    Raises
+    ------
+    SpecError
+        If an analysis is unknown.
+    RefusedError, DamagedError, UnreadableError
+        As `pipeline.store.run.Run.open`.
+    """
+    unknown = [unknown_name("analysis", name, SHOWN) for name in also if name not in SHOWN]
+    if unknown:
+        raise SpecError(unknown)
+    computed = () if only_stored else (*CHEAP, *also)
+    runs = [AnalysedRun.of(directory, echo) for directory in directories]
+    parts = [part_of(run, echo, computed) for run in runs]
+    return Page(title or _title(parts), list(_summary(runs)), parts, made_by())
+
+
+def made_by() -> str:
+    """Program and version."""
+    return f"magpend {metadata.version('magpend')}"
+
+
+def _title(parts: Sequence[Part]) -> str:
+    return parts[0].title if len(parts) == 1 else f"{len(parts)} runs"
+
+
+def _summary(runs: Sequence[AnalysedRun]) -> list[Block]:
+    """What is compared on the page, if there are several runs."""
+    if len(runs) < 2:
+        return []
+    rows = [
+        (
+            run.info.title or run.name,
+            run.name,
+            run.model.name,
+            run.spec.kind,
+            str(run.plan.n_cells),
+            run.digest[:12],
+        )
+        for run in runs
+    ]
+    return [Grid(("run", "directory", "model", "kind", "cells", "digest of the cube"), rows)]
+
+
+def available() -> list[str]:
+    """Names of the analyses that a report can compute."""
+    return [name for name in SHOWN if name in ANALYSES]
