@@ -191,9 +191,9 @@ def write(page: Page, path: Path) -> None:
 def anchored(parts: Sequence[Part], prefix: str = "part") -> list[dict[str, Any]]:
     """Return the sections with an anchor each, for the list of contents."""
     return [
-        {"title": p.title, "blocks": p.blocks, "anchor": f"{prefix}-{i}", "parts": anchored(p.parts, f"{prefix}-{i}")}
-        for i, p in enumerate(parts, 1)
-    ]  # fmt: skip
+        {"title": part.title, "blocks": part.blocks, "anchor": name, "parts": anchored(part.parts, name)}
+        for name, part in ((f"{prefix}-{i}", part) for i, part in enumerate(parts, 1))
+    ]
 
 
 @cache
@@ -224,10 +224,9 @@ def grid_of(
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[text_of(row.get(name)) for name in names] for row in rows[:most]]
     kept = [k for k in range(len(names)) if any(line[k] not in ("", "-") for line in cells)]
-    return Grid(
-        [names[k].replace("_", " ") for k in kept], [[line[k] for k in kept] for line in cells], caption, command,
-        max(0, len(rows) - most),
-    )  # fmt: skip
+    shown = [[line[k] for k in kept] for line in cells]
+    heads = [names[k].replace("_", " ") for k in kept]
+    return Grid(heads, shown, caption, command, max(0, len(rows) - most))
 
 
 def text_of(value: Any) -> str:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from importlib import metadata
 
-from pipeline.products.registry import ANALYSES
-from pipeline.report.page import Block, Grid, Page, Part
+from pipeline.report.page import Grid, Page
 from pipeline.report.runs import CHEAP, SHOWN, part_of
 from pipeline.runs.derive import AnalysedRun
 from pipeline.spec.problems import SpecError, unknown_name
@@ -50,7 +49,9 @@ def report(
     computed = () if only_stored else (*CHEAP, *also)
     runs = [AnalysedRun.of(directory, echo) for directory in directories]
     parts = [part_of(run, echo, computed) for run in runs]
-    return Page(title or _title(parts), list(_summary(runs)), parts, made_by())
+    if len(parts) == 1:  # its title is the page's
+        return Page(title or parts[0].title, parts[0].blocks, parts[0].parts, made_by())
+    return Page(title or f"{len(parts)} runs", [_summary(runs)], parts, made_by())
 
 
 def made_by() -> str:
@@ -58,14 +59,8 @@ def made_by() -> str:
     return f"magpend {metadata.version('magpend')}"
 
 
-def _title(parts: Sequence[Part]) -> str:
-    return parts[0].title if len(parts) == 1 else f"{len(parts)} runs"
-
-
-def _summary(runs: Sequence[AnalysedRun]) -> list[Block]:
-    """What is compared on the page, if there are several runs."""
-    if len(runs) < 2:
-        return []
+def _summary(runs: Sequence[AnalysedRun]) -> Grid:
+    """What is on the page, if there are several runs."""
     rows = [
         (
             run.info.title or run.name,
@@ -77,9 +72,4 @@ def _summary(runs: Sequence[AnalysedRun]) -> list[Block]:
         )
         for run in runs
     ]
-    return [Grid(("run", "directory", "model", "kind", "cells", "digest of the cube"), rows)]
-
-
-def available() -> list[str]:
-    """Names of the analyses that a report can compute."""
-    return [name for name in SHOWN if name in ANALYSES]
+    return Grid(("run", "directory", "model", "kind", "cells", "digest of the cube"), rows)

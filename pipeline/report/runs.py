@@ -1,7 +1,8 @@
-"""Sections of a report on one run: parameters, diagram, attractors, bifurcations, exponents, where all comes from.
+"""Sections of a report on one run: diagram, attractors, bifurcations, exponents, parameters, provenance.
 
-What stands in the cube and in ``derived/`` is shown. The attractors, and of a continuation its hysteresis, are
-found first if they were not, as ``magpend analyse`` does; whatever else is missing is named, with its command.
+What stands in the cube and in ``derived/`` is shown. The attractors, and of a continuation its hysteresis,
+are found first if they were not, as ``magpend analyse`` does; whatever else is missing is named, with its
+command.
 """
 
 from __future__ import annotations
@@ -14,29 +15,45 @@ import numpy as np
 
 from pipeline.analysis.tabular import axis_ranges, distinct, number
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import FREQUENCY, is_grid_dim, parameter_name, split_dims
+from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
 from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES, FIGURES
-from pipeline.report.page import Block, Facts, Grid, Note, Part, Picture, Source, grid_of, picture_of
+from pipeline.report.page import Block, Facts, Grid, Note, Part, Source, grid_of, picture_of
 from pipeline.report.stored import stored_options
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.drawing import figure
 from pipeline.runs.status import state
 from pipeline.spec.problems import SpecError
+from pipeline.spec.tables import FREQUENCY
 
 if TYPE_CHECKING:
     import xarray as xr
 
-CHEAP = ("attractors", "hysteresis")
+CHEAP = ("attractors", "hysteresis", "basins")
 """Analyses that a report computes unless it is told not to."""
 
 SHOWN = ("attractors", "hysteresis", "basins", "branches", "curves", "chaos", "dimension", "settling")
 """Analyses in the order in which a report has them."""
 
 _HEADINGS = {
-    "hysteresis": "Hysteresis", "basins": "Basins", "branches": "Bifurcations", "curves": "Curves of bifurcations",
-    "chaos": "Regular and chaotic", "dimension": "Dimensions", "settling": "Transient or attractor",
-}  # fmt: skip
+    "hysteresis": "Hysteresis",
+    "basins": "Basins",
+    "branches": "Bifurcations",
+    "curves": "Curves of bifurcations",
+    "chaos": "Regular and chaotic",
+    "dimension": "Dimensions",
+    "settling": "Transient or attractor",
+}
+
+_CAPTIONS = {
+    "hysteresis": "Jumps of the walks: from where to where, from which attractor to which",
+    "basins": "What the initial states of the grid end on",
+    "branches": "Located bifurcations",
+    "curves": "Curves of bifurcations",
+    "chaos": "What kind of motion each attractor is",
+    "dimension": "Correlation dimensions of the bounded sets that stay",
+    "settling": "Bounded sets that were run on",
+}
 
 
 class Shown:
@@ -88,11 +105,11 @@ def part_of(
     shown = Shown(AnalysedRun.of(source, echo), computed)
     title = shown.run.info.title or shown.run.name.rpartition("/")[2]
     parts = [
-        Part("Parameters", list(_parameters(shown))),
         Part("Diagram", list(_diagram(shown))),
         Part("Attractors", list(_attractors(shown))),
         *_analyses(shown),
         Part("Exponents", list(_exponents(shown))),
+        Part("Parameters", list(_parameters(shown))),
         Part("Where this comes from", list(provenance_of(shown.run))),
     ]
     return Part(title, list(_state(shown)), [part for part in parts if part.blocks])
@@ -212,15 +229,16 @@ def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, flo
     """Values of the axes at which most attractors coexist, the first of equals."""
     counts: dict[tuple[float, ...], int] = {}
     for row in rows:
-        place = tuple(row[name] for name in axes)
+        place: tuple[float, ...] = tuple(row[name] for name in axes)
         counts[place] = counts.get(place, 0) + 1
-    return dict(zip(axes, max(counts, key=lambda place: counts[place]), strict=True))
+    best = max(counts, key=counts.__getitem__)
+    return dict(zip(axes, best, strict=True))
 
 
 def _attractor_grid(
     ds: xr.Dataset, rows: list[dict[str, Any]], axes: tuple[str, ...]
 ) -> tuple[list[str], list[list[str]]]:
-    """Return a line per attractor: kind, period, motion, where it exists, its largest share with the interval."""
+    """Return a line per attractor: kind, period, motion, where it exists, largest share with its interval."""
     motion, sampled = any("side" in r for r in rows), any("fraction" in r for r in rows)
     names = ["", "kind", "period", *(["motion"] if motion else []), *axes, "cells"]
     names += ["share (95 % interval)"] if sampled else []
@@ -274,15 +292,26 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     except SpecError as error:
         yield Note(str(error))
         return
-    rows = function_of(ANALYSES[name].table)(found).rows
+    rows = [_with_letters(row) for row in function_of(ANALYSES[name].table)(found).rows]
     command = _command(f"analyse {name}", options, shown)
     if rows:
-        yield grid_of(rows, ANALYSES[name].help.partition("\n")[0], command)
+        yield grid_of(rows, _CAPTIONS[name], command)
     else:
         yield Note("Nothing of this kind was found.", command)
     drawn = ANALYSES[name].figure
     if drawn and drawn not in ("attractors", "lyapunov"):
-        yield from _drawn(shown, drawn, FIGURES[drawn].help.partition("\n")[0], **options)
+        at = {d: float(shown.cube[d].values[0]) for d in shown.axes} if drawn == "basins" else {}
+        where = " at the first values of the axes" if any(shown.cube.sizes[d] > 1 for d in at) else ""
+        yield from _drawn(shown, drawn, f"{_CAPTIONS[name]}{where}", **options, **({"at": at} if at else {}))
+
+
+def _with_letters(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row in which attractors have the letters of the figures."""
+    found = {}
+    for name, value in row.items():
+        is_id = name in ("attractor_id", "from_id", "to_id", "mirror_partner")
+        found[name.removesuffix("_id")] = ("-" if value < 0 else letter(int(value))) if is_id else value
+    return found
 
 
 def _exponents(shown: Shown) -> Iterator[Block]:
@@ -325,17 +354,12 @@ def _drawn(shown: Shown, name: str, caption: str, **options: Any) -> Iterator[Bl
         return
     notes = "".join(f" {note}." for note in drawn.notes)
     words = f"{caption} of {shown.run.info.title or shown.run.name}"
-    picture: Picture = picture_of(
-        drawn, words, f"{caption}.{notes}", _command(f"plot {name}", options, shown)
-    )
-    yield picture
+    yield picture_of(drawn, words, f"{caption}.{notes}", _command(f"plot {name}", options, shown))
 
 
 def _missing(shown: Shown, name: str) -> Note:
-    return Note(
-        f"{ANALYSES[name].help.partition(chr(10))[0]} This was not computed.",
-        f"magpend analyse {name} {shown.directory}",
-    )
+    does = ANALYSES[name].help.partition("\n")[0]
+    return Note(f"Not computed. To {does[0].lower()}{does[1:]}", f"magpend analyse {name} {shown.directory}")
 
 
 def _command(words: str, options: Mapping[str, Any], shown: Shown) -> str:
