@@ -104,7 +104,7 @@ def test_report__several_runs(folder, command):
 def test_report__what_is_refused(folder, command):
     with pytest.raises(SpecError, match="unknown analysis 'branch'; did you mean branches"):
         report([str(folder / "run")], also=["branch"], echo=lambda _: None)
-    with pytest.raises(AssertionError, match="suffix must be .html"):
+    with pytest.raises(AssertionError, match=r"suffix must be \.html"):
         command(folder, "report", "run", "--out", "page.pdf")
     with pytest.raises(AssertionError, match="no run directory"):
         command(folder, "report", "nowhere")
