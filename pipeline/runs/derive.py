@@ -155,9 +155,12 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
     """
     run = Run.open(source)
     folder = run.info.files.below(DERIVED)
+    places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
+    if not places:  # then the version, which takes a moment, does not matter
+        return None
     current = {"cube_digest": run.digest, "analysis_version": code_version(name), "derived_product": name}
     found: xr.Dataset | None = None
-    for place in sorted(products_in(folder), key=lambda place: place.name):
+    for place in sorted(places, key=lambda place: place.name):
         try:
             attrs = read_product_attrs(place)
             if any(attrs.get(key) != value for key, value in current.items()):
