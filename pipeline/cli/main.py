@@ -17,6 +17,7 @@ from pipeline.cli.analyse import analyse_app
 from pipeline.cli.common import EXIT_HELP, CommandError
 from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
+from pipeline.cli.explore import explore
 from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.identify import identify_app
@@ -27,6 +28,7 @@ from pipeline.cli.models import models, presets
 from pipeline.cli.options import speaking
 from pipeline.cli.plot import plot_app
 from pipeline.cli.recordings import recordings_app
+from pipeline.cli.report import report
 from pipeline.cli.running import run, status, verify
 from pipeline.cli.simulate import EXTRA, simulate
 from pipeline.cli.submit import submit
@@ -63,8 +65,8 @@ def _main(
 
 for _command, _settings in (
     (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
-    (models, {}),
-    (presets, {}), (fit_magnet, {}),
+    (explore, {}), (report, {}),
+    (models, {}), (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
 app.add_typer(analyse_app, name="analyse")
