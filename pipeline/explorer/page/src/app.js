@@ -68,7 +68,7 @@ function build(source, root, view, messages) {
   mountPanels(state, source, right).catch((error) => messages.problem(error));
   keepAddress(state, view);
   diagram.load();
-  window.magpend = { state, source };
+  window.magpend = { state, source, diagram };
 }
 
 function header(view, state) {
