@@ -1,4 +1,4 @@
-"""The columns of a copy in one file: exact where they fit, else shorter numbers, else fewer sections, and said so."""
+"""The columns of a copy in one file: exact where they fit, else rounded, else fewer sections; and said so."""
 
 from __future__ import annotations
 
@@ -60,8 +60,9 @@ class Fitted:
             each = self.level.each
             rest = "all sections" if each == 1 else f"every {_ordinal(each)} section, the last one among them"
             found.append(
-                f"Sections were left out: this copy has {self.kept:,} of {self.total:,} points. Of {self.closed:,} "
-                f"cells on closed orbits it has the last period; of {self.others:,} other cells {rest}. "
+                f"Sections were left out: this copy has {self.kept:,} of {self.total:,} points. Of "
+                f"{self.closed:,} cells on closed orbits it has the last period; of {self.others:,} others "
+                f"{rest}. "
                 "magpend export --folder leaves nothing out."
             )
         return found

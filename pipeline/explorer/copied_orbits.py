@@ -1,4 +1,4 @@
-"""Orbits of a copy: integrated once, one for each attractor at each parameter point, as far as there is room."""
+"""Orbits of a copy: integrated when it is made, one for each attractor at each parameter point."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline.products.reporting import report
 
 NONE = np.uint32(0xFFFFFFFF)
 SAME_ATTRACTOR, ALIKE, NEAREST = 1, 2, 3
-"""What a cell's orbit is to it: that of its attractor, of a cell like it at its parameters, or the nearest."""
+"""What an orbit is to a cell: of its attractor, of a cell like it at its parameters, or the nearest."""
 
 BLOCK = 32
 """Orbits in an object."""
@@ -105,7 +105,7 @@ def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
-    """Number of each cell's parameter point, and the places of the points on the axes, scaled to their lengths."""
+    """Number of each cell's parameter point, and where the points lie on the axes, each from 0 to 1."""
     swept = [a.name for a in run.axes if a.swept]
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in swept]
     index = dict(zip(run.plan.dims, np.indices(run.plan.shape).reshape(len(run.plan.dims), -1), strict=True))
@@ -119,7 +119,7 @@ def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
 def _nearest(
     groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For each group of cells the orbit that stands for it: its own, else the nearest, of its label if there is one."""
+    """The orbit that stands for each group of cells: its own, else the nearest, of its label if it can be."""
     number = np.full(len(groups), NONE, np.uint32)
     means = np.full(len(groups), NEAREST, np.uint8)
     number[taken], means[taken] = np.arange(len(taken)), same
@@ -189,7 +189,7 @@ def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray) -> float:
 
 
 def _orbit(run: ExploredRun, cell: int, count: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The orbit from a cell's last section, in numbers that are right to seven digits: no picture needs more."""
+    """The orbit from a cell's last section, to seven digits: no picture needs more."""
     arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
     return {
         name: values.astype(np.float32) if values.dtype.kind == "f" else values

@@ -30,8 +30,8 @@ MOST_ORBITS = 2000
 ORBITS_SHARE, PLANES_SHARE = 0.25, 0.15
 """What orbits and planes may take of a copy in one file."""
 
-RESERVE = 30_000
-"""For what the page says of itself [bytes]."""
+RESERVE = 10_000
+"""For what the page says of its columns [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -86,31 +86,42 @@ def export_page(
         If what is read of the run is not what was written.
     """
     check_place(out, force)
-    run = ExploredRun.of(source)
-    copied = gather(run)
+    copied = gather(ExploredRun.of(source))
     columns, layers = read_columns(copied)
     copied.objects["cells"] = packed(layers)
     add_planes(copied, PLANES_SHARE * most_bytes * 3 / 4)
     orbits = add_all_orbits(copied, columns, layers, most_orbits, ORBITS_SHARE * most_bytes * 3 / 4)
-    generator = f"magpend {copied.view['version']}"
-    title = run.info.title
-    frame = len(inline_html(title, generator, copied.objects).encode()) + RESERVE
-    room = (most_bytes - frame) * 3 / 4
-    fitted = fit(columns, periods(run), room) if room > 0 else None
-    if fitted is None:
-        raise RefusedError(
-            f"{run.name}: even one section of each cell does not fit into {most_bytes / 1e6:g} MB beside the rest "
-            "of the page. Make a folder instead (--folder OUT), or a zoom of the run."
-        )
-    _place_columns(copied, fitted)
-    finish(copied)
-    html = inline_html(title, generator, copied.objects).encode()
+    fitted = _fitted(copied, columns, most_bytes)
+    for i, (name, content) in enumerate(fitted.objects.items()):
+        copied.about["columns"][name] = f"column-{i}"
+        copied.objects[f"column-{i}"] = content
+    copied.sentences += fitted.sentences()
+    html = _html(copied)
     if len(html) > most_bytes:
         raise RefusedError(
-            f"{run.name}: the page takes {len(html):,} bytes of {most_bytes:,}; use --folder OUT."
+            f"{source.name}: the page takes {len(html):,} bytes of {most_bytes:,}; use --folder OUT."
         )
     write_atomically(out, html)
     return Exported(out, len(html), orbits, copied.sentences)
+
+
+def _html(copied: Copied) -> bytes:
+    """The page with all that was copied so far."""
+    generator = f"magpend {copied.view['version']}"
+    return inline_html(copied.run.info.title, generator, finished(copied)).encode()
+
+
+def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> Fitted:
+    """As much of the columns as fits beside the rest of the page."""
+    # base64 makes four of three
+    room = (most_bytes - len(_html(copied)) - RESERVE) * 3 / 4
+    found = fit(columns, periods(copied.run), room) if room > 0 else None
+    if found is None:
+        raise RefusedError(
+            f"{copied.run.name}: even one section of each cell does not fit into {most_bytes / 1e6:g} MB beside "
+            "the rest of the page. Make a folder instead (--folder OUT), or a zoom of the run."
+        )
+    return found
 
 
 def check_place(out: Path, force: bool) -> None:
@@ -159,27 +170,17 @@ def add_all_orbits(
     return add_orbits(copied, lambda n: choose(run, known, count, n), count, Room(most, most_bytes))
 
 
-def _place_columns(copied: Copied, fitted: Fitted) -> None:
-    for i, (name, content) in enumerate(fitted.objects.items()):
-        copied.about["columns"][name] = f"column-{i}"
-        copied.objects[f"column-{i}"] = content
-    copied.sentences += fitted.sentences()
-
-
-def finish(copied: Copied) -> None:
-    """Put first what the copy says of itself."""
-    copied.about["notice"] = notice(copied)
-    rest = dict(copied.objects)
-    copied.objects.clear()
-    copied.objects["view"] = packed_json({"view": copied.view, "about": copied.about})
-    copied.objects.update(rest)
+def finished(copied: Copied) -> dict[str, bytes]:
+    """All objects, what the copy says of itself first."""
+    about = {**copied.about, "notice": notice(copied)}
+    return {"view": packed_json({"view": copied.view, "about": about}), **copied.objects}
 
 
 def notice(copied: Copied) -> str:
     """What a reader must know of a copy."""
     view = copied.view
     first = (
-        f"This is a copy of the run {view['name']} (digest {view['digest'][:12]}), made by magpend {view['version']}. "
-        "Nothing is computed here: live integration is off."
+        f"This is a copy of the run {view['name']} (digest {view['digest'][:12]}), made by "
+        f"magpend {view['version']}. Nothing is computed here: live integration is off."
     )
     return " ".join([first, *copied.sentences])

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.explorer.copy_html import folder_html
 from pipeline.explorer.explored import ExploredRun
-from pipeline.explorer.export import Exported, add_all_orbits, finish, read_columns
+from pipeline.explorer.export import Exported, add_all_orbits, finished, read_columns
 from pipeline.explorer.gather import Copied, add_planes, gather, place_of
 from pipeline.explorer.verticals import verticals
 from pipeline.store.consolidate import write_cube
@@ -100,11 +100,10 @@ def _write(run: ExploredRun, folder: Path, most_orbits: int) -> Exported:
     for vertical in verticals(run):
         variable, own = place_of(run, vertical)
         copied.about["columns"][vertical.name] = {"variable": variable, "own": own}
-    finish(copied)
     along = next((a.name for a in run.axes if a.swept), None)
     entries = write_cube(run, folder, along, _layers_of(copied, layers))
     (folder / DATA).mkdir()
-    for name, content in copied.objects.items():
+    for name, content in finished(copied).items():
         key = f"{DATA}/{name}.bin"
         (folder / key).write_bytes(content)
         entries[key] = entry_of(content)

@@ -1,4 +1,4 @@
-"""What a copy of a run is made of besides its columns: the view, answers for every place of the axes, layers."""
+"""What a copy is made of: the view, answers for every place of the axes, planes, columns, layers."""
 
 from __future__ import annotations
 
@@ -228,8 +228,10 @@ def place_of(run: ExploredRun, vertical: Vertical) -> tuple[str, list[int | None
     own = [str(d) for d in source.dims if d not in run.plan.dims]
     shape = [source.sizes[d] for d in own]
     numbers = xr.DataArray(
-        np.arange(math.prod(shape)).reshape(shape), dims=own, coords={d: source.coords[d] for d in own if d in source.coords}
-    )  # fmt: skip
+        np.arange(math.prod(shape)).reshape(shape),
+        dims=own,
+        coords={d: source.coords[d] for d in own if d in source.coords},
+    )
     first = int(vertical.values(xr.Dataset({vertical.variable: numbers})).isel(period_index=0))
     index = np.unravel_index(first, shape)
     return vertical.variable, [
