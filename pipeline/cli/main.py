@@ -17,6 +17,7 @@ from pipeline.cli.analyse import analyse_app
 from pipeline.cli.common import EXIT_HELP, CommandError
 from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
+from pipeline.cli.export import export
 from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.identify import identify_app
@@ -63,6 +64,7 @@ def _main(
 
 for _command, _settings in (
     (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
+    (export, {}),
     (models, {}),
     (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip

@@ -118,8 +118,8 @@ def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> F
     found = fit(columns, periods(copied.run), room) if room > 0 else None
     if found is None:
         raise RefusedError(
-            f"{copied.run.name}: even one section of each cell does not fit into {most_bytes / 1e6:g} MB beside "
-            "the rest of the page. Make a folder instead (--folder OUT), or a zoom of the run."
+            f"{copied.run.name}: even one section of each cell does not fit into {most_bytes / 1e6:g} MB "
+            "beside the rest of the page. Make a folder instead (--folder OUT), or a zoom of the run."
         )
     return found
 
