@@ -13,10 +13,10 @@ const STATIC = join(here, "..", "static");
 const ENTRIES = { explorer: "src/main.js" };
 
 /** Style sheets in the order in which they apply. */
-const STYLES = ["node_modules/uplot/dist/uPlot.min.css", "explorer.css", "panels.css"];
+const STYLES = ["explorer.css", "panels.css"];
 
 /** Packages whose code is in the scripts, with their licences. */
-const VENDORED = ["uplot", "zarrita", "@zarrita/storage", "numcodecs", "reference-spec-reader", "unzipit", "fflate"];
+const VENDORED = ["zarrita", "@zarrita/storage", "numcodecs", "reference-spec-reader", "unzipit", "fflate"];
 
 const OPTIONS = {
   bundle: true, format: "iife", minify: true, target: ["es2022"], charset: "utf8", legalComments: "none",

@@ -28,6 +28,7 @@ export class Curves {
       const { curves } = await this.source.curves({ x, at });
       if (wanted !== this.wanted) return;
       for (const strip of this.strips) strip.take(curves.filter(({ group }) => group === strip.group));
+      this.onLoaded?.();
     } catch (error) {
       if (wanted === this.wanted) this.reader.say(error.message);
     }

@@ -36,7 +36,7 @@ export class Diagram {
     }, this.lower, this.upper, this.tip, this.note);
     this.full = [0, 1, 0, 1];
     [this.base, this.detail, this.data, this.branches, this.selection] = [null, null, null, null, null];
-    [this.width, this.height, this.asked, this.version] = [0, 0, 0, 0];
+    [this.width, this.height, this.asked, this.version, this.skipped] = [0, 0, 0, 0, 0];
     this.listen();
   }
 
@@ -94,10 +94,12 @@ export class Diagram {
     this.data = { x: x.slice(), at: at.slice(), first: first.slice(), cell: cell.slice(), status: status.slice(), colours, attrs };
     const { extent, count } = await this.points.ask("load", { data: { x, at, first, y } }, this.points.worker ? [y.buffer] : []);
     if (asked !== this.asked) return;
-    this.full = fullOf(this.data.x, extent, attrs.covers ?? null, this.horizontal);
+    this.full = fullOf(this.data.x, attrs.extent ?? extent, this.horizontal);
+    // a diagram of very many points has the last sections of each cell only
+    this.skipped = (attrs.n_keep ?? 0) - (attrs.kept ?? attrs.n_keep ?? 0);
     this.count = count;
     this.reader.problem(null);
-    this.reader.told({ count, cells: at.length, attrs, empty: extent === null });
+    this.reader.told({ count, data: this.data, attrs });
     this.note.hidden = extent !== null;
     this.note.textContent = extent === null ? this.emptiness() : "";
     [this.base, this.detail] = [null, null];
@@ -359,7 +361,7 @@ export class Diagram {
     const code = data.colours[colouring?.name]?.[index];
     const category = colouring?.categories.find(({ id }) => id === code);
     if (category) lines.push(category.label);
-    lines.push(`cell ${data.cell[index]}, section ${point + 1}`);
+    lines.push(`cell ${data.cell[index]}, section ${point + this.skipped + 1}`);
     return lines;
   }
 
@@ -372,7 +374,7 @@ export class Diagram {
   /** Select a point; a selection outside of the window brings it there. */
   choose(found) {
     this.selection = found;
-    this.state.set({ selected: { cell: this.data.cell[found.index], point: found.point } });
+    this.state.set({ selected: { cell: this.data.cell[found.index], point: found.point + this.skipped } });
     this.reader.say(this.described(found).join(", "));
     this.bringIn(found);
     this.repaint();
@@ -401,7 +403,7 @@ export class Diagram {
   async findSelection() {
     const { selected } = this.state.get();
     const index = selected && this.data ? this.data.cell.indexOf(selected.cell) : -1;
-    this.selection = index < 0 ? null : await this.points.ask("locate", { index, point: selected.point });
+    this.selection = index < 0 ? null : await this.points.ask("locate", { index, point: selected.point - this.skipped });
     this.repaint();
   }
 
@@ -430,7 +432,7 @@ function placed(box, shown, [x0, x1, y0, y1]) {
 }
 
 /** All there is, with some room about it. */
-function fullOf(x, extent, covers, axis) {
+function fullOf(x, extent, axis) {
   const values = axis?.values.length ? axis.values : x;
   let [x0, x1] = [Math.min(values[0], values.at(-1)), Math.max(values[0], values.at(-1))];
   let [y0, y1] = extent ?? [0, 1];

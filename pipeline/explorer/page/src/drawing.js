@@ -11,11 +11,14 @@ export function lowerBound(values, bound, begin = 0, end = values.length) {
   return begin;
 }
 
-/** Radius of a point in pixels by how many are in the window: few points are discs, many are pixels. */
-export function dotRadius(count, scale) {
-  if (count <= 3e3) return Math.round(2 * scale);
-  if (count <= 6e4) return Math.max(1, Math.round(scale));
-  return scale > 1 && count <= 1e6 ? 1 : 0;
+/**
+ * How far a point reaches in pixels: half its height by the distance from its middle. Few points are discs; many
+ * are as high as a pixel, and as wide as their columns are apart.
+ */
+export function dotShape(count, scale, spacing) {
+  const radius = Math.round(count <= 3e3 ? 2 * scale : scale);
+  if (count <= 6e4) return Array.from({ length: radius + 1 }, (_, d) => Math.floor(Math.sqrt((radius + 0.3) ** 2 - d * d)));
+  return new Array(1 + Math.max(0, Math.min(radius, Math.floor((spacing - 1) / 2)))).fill(0);
 }
 
 export class Drawing {
@@ -66,12 +69,15 @@ export class Drawing {
    */
   render(bounds, width, height, scale, most = Infinity) {
     const [x0, x1] = bounds, px = width / (x1 - x0);
-    const { count } = this.columns(x0, x1);
-    const radius = dotRadius(count, scale), part = Math.min(1, most / Math.max(1, count));
+    const shown = this.columns(x0, x1), { count } = shown;
+    const half = dotShape(count, scale, width / Math.max(1, shown.to - shown.from)), radius = half.length - 1;
+    const part = Math.min(1, most / Math.max(1, count)), cells = this.begin[shown.to] - this.begin[shown.from];
     const { from, to } = this.columns(x0 - (radius + 1) / px, x1 + (radius + 1) / px);
     const place = new Int32Array(to - from);
     for (let i = from; i < to; i++) place[i - from] = Math.floor((this.x[i] - x0) * px);
-    const column = new Column(bounds, height, radius, (count * part) / (width * height));
+    const column = new Column(bounds, height, {
+      half, density: (count * part) / (width * height), bold: Math.max(6, (count * part) / Math.max(1, cells) / 8), reach: Math.round(scale),
+    });
     const image = new Uint32Array(width * height);
     let a = from, b = from;
     for (let c = 0; c < width; c++) {
@@ -121,7 +127,7 @@ export class Drawing {
   /** Where a point of a cell is; null if the cell has no such point. */
   locate(index, point) {
     const k = this.first[index] + point;
-    if (index >= this.at.length || k >= this.first[index + 1]) return null;
+    if (index >= this.at.length || point < 0 || k >= this.first[index + 1]) return null;
     return { index, point, x: this.x[this.at[index]], y: this.y[k] };
   }
 
@@ -173,13 +179,12 @@ export class Drawing {
 
 /** One column of pixels: how many points each has, and the colour of one of them. */
 class Column {
-  constructor([, , y0, y1], height, radius, density) {
-    Object.assign(this, { height, radius, y1, scale: height / (y1 - y0) });
+  constructor([, , y0, y1], height, { half, density, bold, reach }) {
+    Object.assign(this, { height, half, bold, reach, y1, scale: height / (y1 - y0) });
     this.count = new Uint32Array(height);
     this.lot = new Uint32Array(height);
     this.colour = new Uint32Array(height);
-    this.half = Array.from({ length: radius + 1 }, (_, d) => Math.floor(Math.sqrt((radius + 0.3) ** 2 - d * d)));
-    this.opacity = opacities(density * (2 * radius + 1) ** 2);
+    this.opacity = opacities(density * half.reduce((sum, h, d) => sum + (d ? 2 : 1) * (2 * h + 1), 0));
     [this.low, this.high] = [height, -1];
   }
 
@@ -194,7 +199,7 @@ class Column {
       const top = row > half ? row - half : 0, bottom = row + half < height ? row + half : height - 1;
       if (top < low) low = top;
       if (bottom > high) high = bottom;
-      const drawn = (Math.imul(k, 2654435761) >>> 0) | 1;
+      const drawn = (Math.imul(k, 2654435761) | 1) >>> 0;
       for (let r = top; r <= bottom; r++) {
         count[r]++;
         if (drawn > lot[r]) {
@@ -206,15 +211,27 @@ class Column {
     [this.low, this.high] = [low, high];
   }
 
+  // a pixel to which an orbit comes back again and again is drawn higher than one: lines of closed orbits stay
+  // lines beside clouds of chaos
   write(image, c, width) {
-    const { count, lot, colour, opacity, low, high } = this, most = opacity.length - 1;
+    const { count, lot, colour, opacity, low, high, bold, height } = this, most = opacity.length - 1;
+    const reach = this.half[0] === 0 ? this.reach : 0;
     for (let r = low; r <= high; r++) {
       if (count[r] === 0) continue;
-      const n = count[r] < most ? count[r] : most;
-      image[r * width + c] = ((colour[r] & 0xffffff) | (opacity[n] << 24)) >>> 0;
-      count[r] = lot[r] = 0;
+      const n = count[r] < most ? count[r] : most, word = ((colour[r] & 0xffffff) | (opacity[n] << 24)) >>> 0;
+      image[r * width + c] = word;
+      if (reach && count[r] >= bold) {
+        for (let d = 1; d <= reach; d++) {
+          if (r >= d && count[r - d] === 0) image[(r - d) * width + c] = word;
+          if (r + d < height && count[r + d] === 0) image[(r + d) * width + c] = word;
+        }
+      }
     }
-    [this.low, this.high] = [this.height, -1];
+    if (low <= high) {
+      count.fill(0, low, high + 1);
+      lot.fill(0, low, high + 1);
+    }
+    [this.low, this.high] = [height, -1];
   }
 }
 

@@ -71,7 +71,8 @@ function seeds(orbit, view) {
 /** Fill an element with what is known of an orbit. */
 export function showFacts(body, orbit, view) {
   const parameters = parameterRows(orbit, view), shown = parameters.filter((row) => row[2]), rest = parameters.filter((row) => !row[2]);
-  const children = [list([...shown, ...rows(orbit, view)]), seeds(orbit, view)];
+  const note = orbit.attrs.note ? el("p", { class: "note", text: orbit.attrs.note }) : null;
+  const children = [list([...shown, ...rows(orbit, view)]), note, seeds(orbit, view)];
   if (rest.length) children.push(el("details", {}, el("summary", { text: `All other parameters: ${rest.length}` }), list(rest)));
   body.replaceChildren(...children.filter(Boolean));
 }

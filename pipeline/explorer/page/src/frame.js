@@ -155,6 +155,16 @@ export class Frame {
     });
   }
 
+  /** Paint all of the picture onto a context of the same size, for a file. */
+  paintInto(ctx) {
+    this.place();
+    ctx.lineJoin = ctx.lineCap = "round";
+    ctx.font = FONT;
+    if (this.options.axes !== false) this.paintAxes(ctx);
+    this.clipped(ctx, this.paintBack);
+    this.clipped(ctx, this.paintFront);
+  }
+
   begin(canvas) {
     const ctx = canvas.getContext("2d");
     ctx.setTransform(this.pixels, 0, 0, this.pixels, 0, 0);
@@ -189,7 +199,7 @@ export class Frame {
   paintAxes(ctx) {
     const { left, top, width, height } = this.box, [x0, x1, y0, y1] = this.limits, colours = theme();
     const xs = (this.xAxis.angle ? angleTicks : ticks)(x0, x1, Math.max(2, width / 70));
-    const ys = (this.yAxis.angle ? angleTicks : ticks)(y0, y1, Math.max(2, height / 36));
+    const ys = (this.yAxis.angle ? angleTicks : ticks)(y0, y1, Math.max(3, height / 36));
     ctx.lineWidth = 1;
     ctx.strokeStyle = colours.grid;
     ctx.beginPath();

@@ -45,14 +45,19 @@ export class Portrait {
   }
 
   /** Begin to show a start that is being integrated. */
-  beginLive(path) {
-    this.live = { path, x: [], y: [] };
+  beginLive() {
+    this.live = { paths: [], x: [], y: [] };
     this.arrange();
   }
 
-  /** Add section points of the start that is being integrated. */
-  addLive(piece) {
+  /** Add the next part of the path of that start, or section points of it. */
+  addLive(kind, piece) {
     if (!this.live) return;
+    if (kind === "path") {
+      this.live.paths.push(piece);
+      this.arrange();
+      return;
+    }
     this.live.x.push(...piece.section(this.pair[0]));
     this.live.y.push(...piece.section(this.pair[1]));
     for (const key of ["x", "y"]) this.live[key] = this.live[key].slice(-LIVE_KEPT);
@@ -60,33 +65,26 @@ export class Portrait {
   }
 
   arrange() {
-    const [nx, ny] = this.pair, { xAxis, yAxis } = this.frame;
-    const main = this.orbit ?? this.live?.path;
-    if (!main) return;
-    this.wx = wrappingOf(main.column(nx), xAxis.angle);
-    this.wy = wrappingOf(main.column(ny), yAxis.angle);
-    this.lines = this.orbit ? brokenLines(main.column(nx), main.column(ny), this.wx, this.wy) : [];
-    this.points = this.orbit ? this.places(main.section(nx), main.section(ny)) : [];
-    const lx = this.live ? wrappingOf(this.live.path.column(nx), xAxis.angle) : null;
-    const ly = this.live ? wrappingOf(this.live.path.column(ny), yAxis.angle) : null;
-    this.liveLines = this.live ? brokenLines(this.live.path.column(nx), this.live.path.column(ny), lx, ly) : [];
-    const all = [...this.lines, ...this.liveLines, this.points.flat()];
-    const xs = all.flatMap((line) => line.filter((_, i) => i % 2 === 0));
-    const ys = all.flatMap((line) => line.filter((_, i) => i % 2 === 1));
-    [this.xs, this.ys] = [extent(xs), extent(ys)];
-    this.frame.fit(...this.xs, ...this.ys);
+    const { orbit, live } = this, paths = live?.paths ?? [];
+    if (!orbit && !paths.length) return;
+    const columns = (name) => [...(orbit ? [orbit] : []), ...paths].map((part) => part.column(name));
+    const [xs, ys] = this.pair.map(columns);
+    this.wx = sharedWrapping(xs, this.frame.xAxis.angle);
+    this.wy = sharedWrapping(ys, this.frame.yAxis.angle);
+    const lines = xs.map((x, k) => brokenLines(x, ys[k], this.wx[k], this.wy[k]));
+    this.lines = orbit ? lines.shift() : [];
+    this.liveLines = lines.flat();
+    this.points = orbit ? this.places(orbit.section(this.pair[0]), orbit.section(this.pair[1])) : [];
+    let bounds = [Infinity, -Infinity, Infinity, -Infinity];
+    for (const line of [...this.lines, ...this.liveLines, this.points.flat()]) bounds = reach(line, bounds);
+    this.frame.fit(...bounds);
     this.label();
   }
 
   places(x, y) {
-    const [ax, ay] = [this.frame.xAxis.angle, this.frame.yAxis.angle];
-    return Array.from(x, (value, i) => [this.shown(value, this.wx, ax, "x"), this.shown(y[i], this.wy, ay, "y")]);
-  }
-
-  shown(value, wrapping, isAngle, side) {
-    const main = (this.orbit ?? this.live?.path).column(this.pair[side === "x" ? 0 : 1]);
-    const near = main.length ? main[0] + wrapping.shift : 0;
-    return wrapped(value, wrapping, isAngle, near);
+    const main = this.orbit ?? this.live.paths[0], [ax, ay] = [this.frame.xAxis.angle, this.frame.yAxis.angle];
+    const near = this.pair.map((name, k) => (main?.n ? main.column(name)[0] + (k ? this.wy : this.wx)[0].shift : 0));
+    return Array.from(x, (value, i) => [wrapped(value, this.wx[0], ax, near[0]), wrapped(y[i], this.wy[0], ay, near[1])]);
   }
 
   paint(ctx, frame, colours) {
@@ -106,7 +104,7 @@ export class Portrait {
       dots(ctx, frame, this.points, colours, this.points.length > 40 ? 1.6 : 3.6);
     }
     if (this.live) {
-      const places = this.places(this.live.x, this.live.y);
+      const places = this.live.paths.length ? this.places(this.live.x, this.live.y) : [];
       ctx.fillStyle = colours.warn;
       for (const [x, y] of places) ctx.fillRect(frame.x(x) - 1.5, frame.y(y) - 1.5, 3, 3);
     }
@@ -116,7 +114,7 @@ export class Portrait {
     if (!this.orbit || this.orbit.n < 2) return;
     const [x, y] = this.pair.map((name) => this.now(name));
     ctx.beginPath();
-    ctx.arc(frame.x(wrapped(x, this.wx)), frame.y(wrapped(y, this.wy)), 5, 0, 2 * Math.PI);
+    ctx.arc(frame.x(wrapped(x, this.wx[0])), frame.y(wrapped(y, this.wy[0])), 5, 0, 2 * Math.PI);
     ctx.fillStyle = colours.card;
     ctx.strokeStyle = colours.ink;
     ctx.lineWidth = 2;
@@ -129,6 +127,26 @@ export class Portrait {
     const values = this.orbit.column(name);
     return values[low] + part * (values[high] - values[low]);
   }
+}
+
+/** One wrapping for each of several lines in a picture: all are cut if together they span more than a turn. */
+function sharedWrapping(columns, isAngle) {
+  const own = columns.map((values) => wrappingOf(values, isAngle));
+  if (!isAngle) return own;
+  let [low, high] = [Infinity, -Infinity];
+  columns.forEach((values, k) => {
+    const [a, b] = extent(values);
+    [low, high] = [Math.min(low, a + own[k].shift), Math.max(high, b + own[k].shift)];
+  });
+  const cut = own.some((entry) => entry.cut) || high - low >= 2 * Math.PI;
+  return cut ? own.map(() => ({ shift: 0, cut: true })) : own;
+}
+
+function reach(line, [x0, x1, y0, y1]) {
+  for (let i = 0; i + 1 < line.length; i += 2) {
+    [x0, x1, y0, y1] = [Math.min(x0, line[i]), Math.max(x1, line[i]), Math.min(y0, line[i + 1]), Math.max(y1, line[i + 1])];
+  }
+  return [x0, x1, y0, y1];
 }
 
 function dots(ctx, frame, points, colours, radius) {
@@ -151,22 +169,19 @@ export class Portraits {
     this.view = view;
     const pairs = view.model.portraits.slice(0, 3);
     this.all = pairs.map((pair) => new Portrait(this.host, view, pair, clock));
-    this.chosen = this.chooser(body, view, clock, pairs);
+    this.chosen = null;
+    this.chooser(body, view, clock);
   }
 
-  chooser(body, view, clock, pairs) {
+  /** Choice of a further pair; the two fields are of no use where all pairs are shown. */
+  chooser(body, view, clock) {
     const names = [...view.model.states, ...(view.model.quantities ?? [])];
-    if (names.length < 3 && pairs.length) return null;
+    if (names.length < 3) return;
     const options = names.map((entry) => [entry.name, entry.label || entry.name]);
-    const pair = [names[0].name, (names[1] ?? names[0]).name];
-    const change = (side) => (name) => {
-      pair[side] = name;
-      this.replace([...pair], clock);
-    };
-    const across = labelledSelect("Another: across", [["", "none"], ...options], "", (name) => (name ? change(0)(name) : this.replace(null)));
-    const upwards = labelledSelect("upwards", options, pair[1], (name) => (across.select.value ? change(1)(name) : (pair[1] = name)));
+    const change = () => this.replace(across.select.value ? [across.select.value, upwards.select.value] : null, clock);
+    const across = labelledSelect("Another: across", [["", "none"], ...options], "", change);
+    const upwards = labelledSelect("upwards", options, names[1].name, change);
     body.append(el("div", { class: "controls" }, across.element, upwards.element));
-    return null;
   }
 
   replace(pair, clock) {
@@ -186,12 +201,16 @@ export class Portraits {
     for (const portrait of this.all) portrait.show(orbit);
   }
 
-  beginLive(path) {
-    for (const portrait of this.all) portrait.beginLive(path);
+  beginLive() {
+    for (const portrait of this.all) portrait.beginLive();
   }
 
-  addLive(piece) {
-    for (const portrait of this.all) portrait.addLive(piece);
+  addLive(kind, piece) {
+    for (const portrait of this.all) portrait.addLive(kind, piece);
+  }
+
+  get frames() {
+    return this.all.map((portrait) => portrait.frame);
   }
 
   destroy() {

@@ -1,6 +1,7 @@
 // States and quantities against time, one strip for each, with the cursor of the shared clock.
 
 import { el, labelledSelect } from "./dom.js";
+import { number } from "./facts.js";
 import { extent, Frame } from "./frame.js";
 import { axisOf, colourOf } from "./orbit.js";
 import { brokenLines, wrapped, wrappingOf } from "./wrapping.js";
@@ -28,6 +29,10 @@ export class Series {
   destroy() {
     this.forget();
     for (const strip of this.strips) strip.frame.destroy();
+  }
+
+  get frames() {
+    return this.strips.map((strip) => strip.frame);
   }
 
   chooser() {
@@ -120,7 +125,7 @@ export class Series {
   move() {
     for (const strip of this.strips) strip.frame.refresh();
     if (!this.orbit || this.orbit.n < 2 || this.clock.playing) return;
-    const parts = this.strips.map(({ name, frame, wrapping }) => `${frame.yAxis.label.split(" [")[0]} = ${wrapped(this.value(name), wrapping).toPrecision(4)}`);
+    const parts = this.strips.map(({ name, frame, wrapping }) => `${frame.yAxis.label.split(" [")[0]} = ${number(wrapped(this.value(name), wrapping))}`);
     this.readout.textContent = `t = ${this.clock.time.toFixed(3)} s: ${parts.join(", ")}`;
   }
 }

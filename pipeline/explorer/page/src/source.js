@@ -31,6 +31,7 @@ export class ServerSource {
     this.token = token;
     this.live = live;
     this.notice = null;
+    this.formats = ["csv", "nc"];
     this.described = null;
   }
 
