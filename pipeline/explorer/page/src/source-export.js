@@ -14,6 +14,7 @@ export class ExportSource {
     this.formats = ["csv"];
     this.notice = null;
     this.kept = new Map();
+    this.begun = null;
   }
 
   /** Content of an object of data, decompressed: an ArrayBuffer. */
@@ -53,18 +54,22 @@ export class ExportSource {
     return this.once(name, unpackData);
   }
 
-  /** Read what the copy says of itself; before anything else. */
+  /** What the run is; with the first question the copy says what it is itself. */
+  view() {
+    this.begun ??= this.begin().catch((error) => {
+      this.begun = null;
+      throw error;
+    });
+    return this.begun;
+  }
+
   async begin() {
     const { view, about } = await this.json("view");
     this.described = view;
     this.about = about;
     this.cells = new Cells(about.dims, view.axes);
     this.notice = about.notice;
-    return this;
-  }
-
-  async view() {
-    return this.described;
+    return view;
   }
 
   async diagram({ x, y, at, window = null }) {

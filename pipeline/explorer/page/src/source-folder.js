@@ -43,7 +43,13 @@ class Objects {
   }
 
   async list() {
-    this.listed ??= this.fetched(LIST, this.digest).then((bytes) => JSON.parse(new TextDecoder().decode(bytes)));
+    this.listed ??= this.fetched(LIST, this.digest).then(
+      (bytes) => JSON.parse(new TextDecoder().decode(bytes)),
+      (error) => {
+        this.listed = null;
+        throw error;
+      },
+    );
     return this.listed;
   }
 
@@ -73,11 +79,11 @@ export class FolderSource extends ExportSource {
   }
 
   async begin() {
-    await super.begin();
+    const view = await super.begin();
     this.notice = `${this.notice} ${this.objects.verifies ? VERIFIED : UNVERIFIED}`;
     const store = await withConsolidatedMetadata(new CubeStore(this.objects), { format: "v3" });
     this.group = root(store);
-    return this;
+    return view;
   }
 
   async object(name) {
@@ -154,9 +160,4 @@ export class FolderSource extends ExportSource {
 function asSourceError(error) {
   for (let cause = error; cause; cause = cause.cause) if (cause instanceof SourceError) return cause;
   return new SourceError(`The cube cannot be read: ${error.message}`);
-}
-
-/** The source of a page that lies in an exported folder. */
-export function folderSource(app = document.getElementById("app")) {
-  return new FolderSource(app.dataset.objects).begin();
 }

@@ -58,8 +58,3 @@ export class InlineSource extends ExportSource {
     return found;
   }
 }
-
-/** The source of a page that has its data in itself. */
-export function inlineSource(page = document) {
-  return new InlineSource(page).begin();
-}
