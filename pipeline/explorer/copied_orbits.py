@@ -22,6 +22,12 @@ SAME_ATTRACTOR, ALIKE, NEAREST = 1, 2, 3
 BLOCK = 32
 """Orbits in an object."""
 
+SERIES = ("time", "states", "quantities", "drawing")
+"""Arrays of an orbit that run over time."""
+
+BRIEF_PERIODS = 5
+"""Periods that a page shows of a motion that does not close."""
+
 SAMPLE = 6
 """Orbits by which the size of all is judged."""
 
@@ -35,10 +41,13 @@ class Room:
     orbits : int
     n_bytes : float
         Before they are written as text.
+    brief : bool
+        Whether fewer digits and periods are kept, so that there are more of them.
     """
 
     orbits: int
     n_bytes: float
+    brief: bool
 
 
 @dataclass(frozen=True)
@@ -148,7 +157,7 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
     """
     chosen = choosing(room.orbits)
     try:
-        each = _bytes_each(copied, chosen, count)
+        each = _bytes_each(copied, chosen, count, room)
     except ExplorerError as error:
         copied.about["orbits"] = {"blocks": [], "missing": str(error)}
         copied.sentences.append(f"This copy has no orbits: {error}")
@@ -162,7 +171,7 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
         held: dict[str, np.ndarray] = {}
         said: dict[str, Any] = {}
         for k in range(first, min(first + BLOCK, n)):
-            arrays, said[str(k)] = _orbit(copied.run, int(chosen.cells[k]), count)
+            arrays, said[str(k)] = _orbit(copied.run, int(chosen.cells[k]), count, room)
             held |= {f"{k}.{name}": values for name, values in arrays.items()}
             report("integrating orbits", k + 1, n)
         copied.objects[f"orbits-{number}"] = packed(held, said)
@@ -178,20 +187,44 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
     return n
 
 
-def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray) -> float:
+def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -> float:
     """What an orbit takes, by some of them; at least 1."""
     some = chosen.cells[:: max(1, len(chosen.cells) // SAMPLE)][:SAMPLE]
     sizes = []
     for cell in some.tolist():
-        arrays, attrs = _orbit(copied.run, cell, count)
+        arrays, attrs = _orbit(copied.run, cell, count, room)
         sizes.append(len(packed(arrays, attrs)))
     return max(1.0, float(np.mean(sizes))) if sizes else 1.0
 
 
-def _orbit(run: ExploredRun, cell: int, count: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The orbit from a cell's last section, to seven digits: no picture needs more."""
+def _orbit(
+    run: ExploredRun, cell: int, count: np.ndarray, room: Room
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The orbit from a cell's last section, in the digits and at the instants that there is room for."""
     arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
+    if room.brief:
+        arrays = brief(arrays, closed=attrs["period"] is not None)
     return {
-        name: values.astype(np.float32) if values.dtype.kind == "f" else values
+        name: rounded(values, room.brief) if values.dtype.kind == "f" else values
         for name, values in arrays.items()
     }, attrs
+
+
+def brief(arrays: Mapping[str, np.ndarray], closed: bool) -> dict[str, np.ndarray]:
+    """An orbit for a page: where it does not close, its first periods, at every second instant."""
+    sections = arrays["section_times"][: BRIEF_PERIODS + 1]
+    if closed or len(sections) <= BRIEF_PERIODS:
+        return dict(arrays)
+    n = int(np.searchsorted(arrays["time"], sections[-1], side="right"))
+    series = {name: values[:n:2] for name, values in arrays.items() if name in SERIES}
+    return {**arrays, **series, "section_times": sections}
+
+
+def rounded(values: np.ndarray, short: bool) -> np.ndarray:
+    """Numbers to 24 bits; for a page to 16, which no picture shows, and gzip makes a third smaller."""
+    single = np.ascontiguousarray(values, np.float32)
+    if not short:
+        return single
+    bits = single.view(np.uint32)
+    shorter = ((bits + np.uint32(0x80)) & np.uint32(0xFFFFFF00)).view(np.float32)
+    return np.where(np.isfinite(single), shorter, single)

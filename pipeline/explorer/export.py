@@ -90,7 +90,8 @@ def export_page(
     columns, layers = read_columns(copied)
     copied.objects["cells"] = packed(layers)
     add_planes(copied, PLANES_SHARE * most_bytes * 3 / 4)
-    orbits = add_all_orbits(copied, columns, layers, most_orbits, ORBITS_SHARE * most_bytes * 3 / 4)
+    room = Room(most_orbits, ORBITS_SHARE * most_bytes * 3 / 4, brief=True)
+    orbits = add_all_orbits(copied, columns, layers, room)
     fitted = _fitted(copied, columns, most_bytes)
     for i, (name, content) in enumerate(fitted.objects.items()):
         copied.about["columns"][name] = f"column-{i}"
@@ -157,17 +158,13 @@ def periods(run: ExploredRun) -> np.ndarray:
 
 
 def add_all_orbits(
-    copied: Copied,
-    columns: Mapping[str, Column],
-    layers: Mapping[str, np.ndarray],
-    most: int,
-    most_bytes: float,
+    copied: Copied, columns: Mapping[str, Column], layers: Mapping[str, np.ndarray], room: Room
 ) -> int:
     """Integrate the orbits that stand for the cells' and add them; returns how many."""
     run = copied.run
     count = columns[next(iter(columns))].count
     known = {**layers, "orbit_period": periods(run)}
-    return add_orbits(copied, lambda n: choose(run, known, count, n), count, Room(most, most_bytes))
+    return add_orbits(copied, lambda n: choose(run, known, count, n), count, room)
 
 
 def finished(copied: Copied) -> dict[str, bytes]:

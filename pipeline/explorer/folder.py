@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.explorer.copied_orbits import Room
 from pipeline.explorer.copy_html import folder_html
 from pipeline.explorer.explored import ExploredRun
 from pipeline.explorer.export import Exported, add_all_orbits, finished, read_columns
@@ -96,7 +97,7 @@ def _write(run: ExploredRun, folder: Path, most_orbits: int) -> Exported:
     copied = gather(run)
     columns, layers = read_columns(copied)
     add_planes(copied, MOST_BYTES)
-    orbits = add_all_orbits(copied, columns, layers, most_orbits, MOST_BYTES)
+    orbits = add_all_orbits(copied, columns, layers, Room(most_orbits, MOST_BYTES, brief=False))
     for vertical in verticals(run):
         variable, own = place_of(run, vertical)
         copied.about["columns"][vertical.name] = {"variable": variable, "own": own}
