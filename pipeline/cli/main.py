@@ -29,6 +29,7 @@ from pipeline.cli.models import models, presets
 from pipeline.cli.options import speaking
 from pipeline.cli.plot import plot_app
 from pipeline.cli.recordings import recordings_app
+from pipeline.cli.report import report
 from pipeline.cli.running import run, status, verify
 from pipeline.cli.simulate import EXTRA, simulate
 from pipeline.cli.submit import submit
@@ -65,8 +66,8 @@ def _main(
 
 for _command, _settings in (
     (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
-    (explore, {}), (export, {}), (models, {}),
-    (presets, {}), (fit_magnet, {}),
+    (explore, {}), (report, {}), (export, {}),
+    (models, {}), (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
 app.add_typer(analyse_app, name="analyse")

@@ -166,6 +166,7 @@ export class Diagram {
 
   moved() {
     this.tip.hidden = true;
+    this.hovered = null;
     this.repaint();
     this.draw(false);
     const covers = this.data?.attrs.covers;

@@ -16,7 +16,7 @@ export function lowerBound(values, bound, begin = 0, end = values.length) {
  * are as high as a pixel, and as wide as their columns are apart.
  */
 export function dotShape(count, scale, spacing) {
-  const radius = Math.round(count <= 3e3 ? 2 * scale : scale);
+  const radius = Math.round(count <= 800 ? 3 * scale : count <= 1e4 ? 2 * scale : scale);
   if (count <= 6e4) return Array.from({ length: radius + 1 }, (_, d) => Math.floor(Math.sqrt((radius + 0.3) ** 2 - d * d)));
   return new Array(1 + Math.max(0, Math.min(radius, Math.floor((spacing - 1) / 2)))).fill(0);
 }
@@ -58,6 +58,14 @@ export class Drawing {
     return { from, to, count: this.first[this.begin[to]] - this.first[this.begin[from]] };
   }
 
+  /** Share of the points of some columns that are between the vertical bounds, by a sample of them. */
+  shareWithin({ from, to, count }, [, , y0, y1]) {
+    const begin = this.first[this.begin[from]], step = Math.max(1, Math.floor(count / 4096)) | 1;
+    let seen = 0, within = 0;
+    for (let k = begin; k < begin + count; k += step, seen++) if (this.y[k] >= y0 && this.y[k] <= y1) within++;
+    return seen ? within / seen : 1;
+  }
+
   /**
    * Draw a window.
    * @param {number[]} bounds x0, x1, y0, y1
@@ -70,7 +78,7 @@ export class Drawing {
   render(bounds, width, height, scale, most = Infinity) {
     const [x0, x1] = bounds, px = width / (x1 - x0);
     const shown = this.columns(x0, x1), { count } = shown;
-    const half = dotShape(count, scale, width / Math.max(1, shown.to - shown.from)), radius = half.length - 1;
+    const half = dotShape(count * this.shareWithin(shown, bounds), scale, width / Math.max(1, shown.to - shown.from)), radius = half.length - 1;
     const part = Math.min(1, most / Math.max(1, count)), cells = this.begin[shown.to] - this.begin[shown.from];
     const { from, to } = this.columns(x0 - (radius + 1) / px, x1 + (radius + 1) / px);
     const place = new Int32Array(to - from);
