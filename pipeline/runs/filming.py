@@ -11,7 +11,7 @@ from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model
 from magpend_core.models.presets import Preset
 from pipeline.products.animation import AnimationOptions
-from pipeline.runs import moving
+from pipeline.runs import instants, moving
 from pipeline.runs.derive import AnalysedRun, Echo, Source
 from pipeline.runs.naming import named
 from pipeline.spec.problems import SpecError, validated
@@ -105,10 +105,10 @@ def animation(
         portraits_of(shown[0].parameters.model, wanted.portrait, len(shown), wanted.degrees)
     except ValueError as error:
         raise SpecError([str(error)]) from None
-    plan = moving.schedule(shown, wanted)
+    plan = instants.schedule(shown, wanted)
     for line in notes:
         (echo or _silent)(line)
-    data = with_provenance(moving.filmed(shown, plan).assign_attrs(fps=wanted.fps), told)
+    data = with_provenance(instants.filmed(shown, plan).assign_attrs(fps=wanted.fps), told)
     return plot_animation(data, degrees=wanted.degrees, portrait=wanted.portrait, size=wanted.size)
 
 
@@ -119,7 +119,7 @@ def _silent(_: str) -> None:
 def _of_run(
     run: AnalysedRun, options: AnimationOptions, attractors: Sequence[str], cells: Sequence[int],
     start: Start | None,
-) -> tuple[list[moving.Moving], list[str]]:  # fmt: skip
+) -> tuple[list[instants.Moving], list[str]]:  # fmt: skip
     from pipeline.compute.simulate import start_of
 
     if cells:
@@ -131,7 +131,7 @@ def _of_run(
     return [moving.of_start(parameters, frequency, state, start.transient)], notes
 
 
-def _alone(start: Start) -> moving.Moving:
+def _alone(start: Start) -> instants.Moving:
     """A start without a run."""
     import numpy as np
 

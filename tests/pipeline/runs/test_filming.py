@@ -14,7 +14,7 @@ import magpend
 from pipeline.cli.exits import Exit
 from pipeline.plots.films import durations
 from pipeline.products.animation import AnimationOptions
-from pipeline.runs import moving
+from pipeline.runs import instants
 from pipeline.runs.filming import Start, animation
 from pipeline.spec.problems import SpecError
 
@@ -216,22 +216,22 @@ def test_animate__refuses_in_one_sentence(main, run, tmp_path, words, said):
 
 def one_moving(period):
     parameters = magpend.load_model("duffing").load()
-    return moving.Moving("", "0", parameters, 0.5, np.zeros(2), np.empty((0, 2)), period)
+    return instants.Moving("", "0", parameters, 0.5, np.zeros(2), np.empty((0, 2)), period)
 
 
 def test_schedule__whole_periods_where_they_fit():
     """Orbits of 2 and 3 drive periods of 2 s: 12 s together, at 1 s/s the nearest multiple of it."""
     both = [one_moving(4.0), one_moving(6.0)]
-    plan = moving.schedule(both, AnimationOptions(seconds=13.0, fps=10.0, speed=1.0))
+    plan = instants.schedule(both, AnimationOptions(seconds=13.0, fps=10.0, speed=1.0))
     assert (plan.duration, plan.n_frames, plan.repeats) == (12.0, 120, True)
     assert plan.times.size == plan.n_frames * plan.substeps + 1
-    short = moving.schedule(both, AnimationOptions(seconds=5.0, fps=10.0, speed=1.0))
+    short = instants.schedule(both, AnimationOptions(seconds=5.0, fps=10.0, speed=1.0))
     assert (short.duration, short.repeats) == (5.0, False)
-    chaos = moving.schedule([*both, one_moving(np.nan)], AnimationOptions(seconds=13.0, speed=1.0))
+    chaos = instants.schedule([*both, one_moving(np.nan)], AnimationOptions(seconds=13.0, speed=1.0))
     assert (chaos.duration, chaos.repeats) == (13.0, False)
-    rest = moving.schedule([one_moving(0.0)], AnimationOptions(seconds=3.0, speed=1.0))
+    rest = instants.schedule([one_moving(0.0)], AnimationOptions(seconds=3.0, speed=1.0))
     assert (rest.duration, rest.repeats) == (3.0, True)
-    assert moving.schedule(both, AnimationOptions()).speed == 1.0
+    assert instants.schedule(both, AnimationOptions()).speed == 1.0
 
 
 def test_durations__add_up():
