@@ -18,6 +18,7 @@ from pipeline.cli.animate import animate
 from pipeline.cli.common import EXIT_HELP, CommandError
 from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
+from pipeline.cli.explore import explore
 from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.identify import identify_app
@@ -64,8 +65,7 @@ def _main(
 
 for _command, _settings in (
     (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
-    (animate, EXTRA),
-    (models, {}),
+    (animate, EXTRA), (explore, {}), (models, {}),
     (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))

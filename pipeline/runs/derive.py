@@ -137,6 +137,47 @@ def derive(
     return _kept(run, place, _compute(run, analysis, wanted).assign_attrs(key))
 
 
+def stored(source: Source, name: str) -> xr.Dataset | None:
+    """Return what is kept of an analysis of a run's cells as they are now; nothing is computed.
+
+    Parameters
+    ----------
+    source
+        Run directory, or an opened run.
+    name
+        One of `pipeline.products.registry.ANALYSES`.
+
+    Returns
+    -------
+    Dataset or None
+        In memory: the result for the default options if that is kept, else any other that is sound and of
+        these cells and this version of the code; None if there is none.
+    """
+    run = Run.open(source)
+    folder = run.info.files.below(DERIVED)
+    current = {"cube_digest": run.digest, "analysis_version": code_version(name), "derived_product": name}
+    found: xr.Dataset | None = None
+    for place in sorted(products_in(folder), key=lambda place: place.name):
+        try:
+            attrs = read_product_attrs(place)
+            if any(attrs.get(key) != value for key, value in current.items()):
+                continue
+            if found is None or attrs.get("derived_key") == _default_key(run, name):
+                found = _placed(open_product(place), place)
+        except (DamagedError, FileNotFoundError):
+            continue
+    return found
+
+
+def _default_key(run: Run, name: str) -> str | None:
+    """Name of the result for the default options; None if the run has not what it takes."""
+    try:
+        options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {}))
+    except SpecError:
+        return None
+    return _key(run, ANALYSES[name], options)["derived_key"]
+
+
 def _refuse_recorded(run: Run, name: str) -> None:
     """Refuse a run under a recorded drive: an analysis runs cells on, under a drive that goes on."""
     if run.spec.recorded is not None:
