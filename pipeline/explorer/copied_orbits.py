@@ -108,9 +108,9 @@ def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray
 def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
     """A number by which the cells of a parameter point are told apart."""
     if "colour_attractor" in layers:
-        return layers["colour_attractor"].astype(np.int64)
+        return np.asarray(layers["colour_attractor"], np.int64)
     motion = layers.get("colour_motion", np.zeros_like(layers["status"])).astype(np.int64)
-    return (motion * 1000 + layers["orbit_period"].astype(np.int64)) * 100 + layers["status"]
+    return np.asarray((motion * 1000 + layers["orbit_period"].astype(np.int64)) * 100 + layers["status"])
 
 
 def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:

@@ -145,7 +145,8 @@ def check_place(out: Path, force: bool) -> None:
 
 def read_columns(copied: Copied) -> tuple[dict[str, Column], dict[str, np.ndarray]]:
     """Read all vertical axes, and status and colours by cell."""
-    columns, layers = {}, {}
+    columns: dict[str, Column] = {}
+    layers: dict[str, np.ndarray] = {}
     names = [str(v["name"]) for v in copied.view["verticals"]]
     for name in track(names, "copying columns"):
         columns[name], layers = column(copied.run, copied.x, name)

@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,7 @@ def gather(run: ExploredRun) -> Copied:
         If what is read of the run is not what was written.
     """
     view = describe_view(run, live=False)
-    about = {
+    about: dict[str, Any] = {
         "dims": [{"name": d, "size": n} for d, n in zip(run.plan.dims, run.plan.shape, strict=True)],
         "drawn": [int(s) for s in DRAWN],
         "status": {int(s): s.name.lower().replace("_", " ") for s in Status},
@@ -91,19 +92,19 @@ def gather(run: ExploredRun) -> Copied:
             f"The run was not complete: {cells['pending']:,} of {cells['total']:,} cells were not computed."
         )
     lines = [(a.name, place) for a in run.axes for place in places(run, but=a.name)]
-    _answers(
-        copied, "curves", ((place_key(run, at, x), lambda x=x, at=at: curves(run, x, at)) for x, at in lines)
-    )
+    _answers(copied, "curves", ((place_key(run, at, x), partial(curves, run, x, at)) for x, at in lines))
     if view["has"]["branches"]:
         heights = [str(v["name"]) for v in view["verticals"]]
-        _answers(copied, "branches", (
-            (f"y={y}&{place_key(run, at, x)}", lambda x=x, y=y, at=at: branches(run, x, y, at))
-            for y in heights for x, at in lines
-        ))  # fmt: skip
+        asked = (
+            (f"y={y}&{place_key(run, at, x)}", partial(branches, run, x, y, at))
+            for y in heights
+            for x, at in lines
+        )
+        _answers(copied, "branches", asked)
     if view["has"]["attractors"]:
-        _answers(copied, "attractors", (
-            (place_key(run, at), lambda at=at: attractors(run, at)) for at in places(run)
-        ))  # fmt: skip
+        _answers(
+            copied, "attractors", ((place_key(run, at), partial(attractors, run, at)) for at in places(run))
+        )
     for kind in ("curves", "branches", "attractors"):
         about["answers"].setdefault(kind, {"blocks": {}, "missing": ""})
     return copied
@@ -147,7 +148,8 @@ def _answers(copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], 
 
 def add_planes(copied: Copied, most_bytes: float) -> None:
     """Add the planes of initial states, as long as they take less than so many bytes together."""
-    run, objects, size, none = copied.run, {}, 0, None
+    run, size, none = copied.run, 0, None
+    objects: dict[str, str] = {}
     found = list(itertools.islice(places(run), MOST_PLACES + 1))
     for at in track(found[:MOST_PLACES], "copying planes"):
         arrays, attrs = unpack_arrays(plane(run, at))
@@ -216,7 +218,7 @@ def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Return ``first[0], first[0] + 1, ...``, `count[0]` of them, then likewise from ``first[1]`` on."""
     ends = np.cumsum(count, dtype=np.int64)
     total = int(ends[-1]) if len(ends) else 0
-    return np.arange(total) + np.repeat(np.asarray(first, np.int64) - (ends - count), count)
+    return np.asarray(np.arange(total) + np.repeat(np.asarray(first, np.int64) - (ends - count), count))
 
 
 def place_of(run: ExploredRun, vertical: Vertical) -> tuple[str, list[int | None]]:
