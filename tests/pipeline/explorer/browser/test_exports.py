@@ -82,8 +82,12 @@ def _compare(page, run):
             found = _asked(page, "diagram", query)
             assert set(found["arrays"]) == set(arrays)
             for name, values in arrays.items():
-                np.testing.assert_array_equal(np.array(found["arrays"][name]), values, err_msg=f"{query} {name}")
-            assert {k: found["attrs"][k] for k in ("x", "y", "unit", "at")} == {k: attrs[k] for k in ("x", "y", "unit", "at")}
+                np.testing.assert_array_equal(
+                    np.array(found["arrays"][name]), values, err_msg=f"{query} {name}"
+                )
+            assert {k: found["attrs"][k] for k in ("x", "y", "unit", "at")} == {
+                k: attrs[k] for k in ("x", "y", "unit", "at")
+            }
 
 
 @pytest.mark.parametrize("form", ["file", "folder"])
@@ -177,7 +181,9 @@ def test_folder__an_edited_list_of_digests_is_noticed(visit, copies, hosted, tmp
 def test_file__of_which_an_object_is_damaged_says_so(visit, copies, tmp_path):
     text = (copies / "copy.html").read_text("utf-8")
     place = text.index('id="data-column-0">') + 600
-    (tmp_path / "copy.html").write_text(f"{text[:place]}{'A' if text[place] != 'A' else 'B'}{text[place + 1 :]}", "utf-8")
+    (tmp_path / "copy.html").write_text(
+        f"{text[:place]}{'A' if text[place] != 'A' else 'B'}{text[place + 1 :]}", "utf-8"
+    )
     page = visit((tmp_path / "copy.html").as_uri()).page
     page.locator(".banner", has_text="damaged").wait_for()
 
