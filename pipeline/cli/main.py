@@ -14,6 +14,7 @@ if __name__ == "__main__":
 import typer
 
 from pipeline.cli.analyse import analyse_app
+from pipeline.cli.animate import animate
 from pipeline.cli.common import EXIT_HELP, CommandError
 from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
@@ -66,7 +67,7 @@ def _main(
 
 for _command, _settings in (
     (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
-    (explore, {}), (report, {}), (export, {}),
+    (explore, {}), (export, {}), (animate, EXTRA), (report, {}),
     (models, {}), (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))

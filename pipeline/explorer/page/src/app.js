@@ -68,7 +68,7 @@ function build(source, root, view, messages) {
   mountPanels(state, source, right).catch((error) => messages.problem(error));
   keepAddress(state, view);
   diagram.load();
-  window.magpend = { state, source };
+  window.magpend = { state, source, diagram };
 }
 
 function header(view, state) {
@@ -91,7 +91,7 @@ function factsOf(view, count, data, attrs) {
 function notesOf(source, view) {
   const notes = [], { total, pending } = view.cells;
   if (source.notice) notes.push(source.notice);
-  if (pending) {
+  if (pending && !source.notice) {
     const share = told((100 * (total - pending)) / total);
     notes.push(`This run is not complete: ${pending.toLocaleString("en")} of ${total.toLocaleString("en")} cells are pending (${share} % done). Go on with magpend run, then reload this page.`);
   }
