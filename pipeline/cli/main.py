@@ -31,6 +31,7 @@ from pipeline.cli.options import speaking
 from pipeline.cli.plot import plot_app
 from pipeline.cli.recordings import recordings_app
 from pipeline.cli.report import report
+from pipeline.cli.reproduce import reproduce
 from pipeline.cli.running import run, status, verify
 from pipeline.cli.simulate import EXTRA, simulate
 from pipeline.cli.submit import submit
@@ -67,7 +68,7 @@ def _main(
 
 for _command, _settings in (
     (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
-    (explore, {}), (export, {}), (animate, EXTRA), (report, {}),
+    (explore, {}), (export, {}), (animate, EXTRA), (report, {}), (reproduce, {}),
     (models, {}), (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
