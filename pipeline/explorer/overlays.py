@@ -54,7 +54,7 @@ def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``curves``: each with a name, a title, a unit, a group (``exponents`` or ``fractions``), a colour, ``x``
+        ``curves``: each with a name, a title, a unit, a group (``exponents``, ``fractions``), a colour, ``x``
         rising, and ``y`` with None for gaps; ``low`` and ``high`` where an interval is known.
 
     Raises
