@@ -307,7 +307,8 @@ def test_diagram__pictures_to_keep(page: Any, cube: xr.Dataset) -> None:
 def test_diagram__legend_switches_points_off(page: Any) -> None:
     one = page.page
     one.select_option("select[name=colour]", "attractor")
-    ask = "magpend.diagram.points.ask('points', {bounds: magpend.diagram.window, most: 1e6}).then((p) => p.length / 3)"
+    asked = "magpend.diagram.points.ask('points', { bounds: magpend.diagram.window, most: 1e6 })"
+    ask = f"{asked}.then((found) => found.length / 3)"
     before = one.evaluate(ask)
     entry = one.locator(".legend-entry").first
     entry.click()
@@ -341,13 +342,14 @@ def test_diagram__a_refusal_is_shown_as_the_server_says_it(page: Any) -> None:
 CONTRAST = """() => {
     const parse = (colour) => colour.match(/[\\d.]+/g).map(Number);
     const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
-    const light = ([r, g, b]) => 0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
+    const weights = [0.2126, 0.7152, 0.0722];
+    const light = (rgb) => weights.reduce((sum, weight, k) => sum + weight * linear(rgb[k] / 255), 0);
     const ground = (element) => getComputedStyle(element).backgroundColor;
     const found = [];
     for (const element of document.querySelectorAll("h1, h2, p, button, summary, label, select, .run-name")) {
         if (!element.checkVisibility() || !element.textContent.trim()) continue;
         let behind = element;
-        while (behind.parentElement && /rgba\\(0, 0, 0, 0\\)/.test(ground(behind))) behind = behind.parentElement;
+        while (behind.parentElement && ground(behind) === "rgba(0, 0, 0, 0)") behind = behind.parentElement;
         const pair = [getComputedStyle(element).color, ground(behind)].map((c) => light(parse(c)) + 0.05);
         found.push([element.textContent.trim().slice(0, 40), Math.max(...pair) / Math.min(...pair)]);
     }
