@@ -10,8 +10,8 @@ import numpy as np
 
 from magpend_core.engine import observers
 from magpend_core.engine.entry import integrate
-from magpend_core.engine.jit import kernel, part, specialise
-from magpend_core.engine.observers import FIRST_TURN, RECORD_LAST, Settings, closed_period, window_of
+from magpend_core.engine.jit import bound_part, kernel, specialise
+from magpend_core.engine.observers import FIRST_TURN, RECORD, Settings, closed_period, window_of
 from magpend_core.engine.system import System
 from magpend_core.sections import Sections
 
@@ -53,7 +53,7 @@ def more_sections(
     # a window of no sections: nothing closes on them
     settings = Settings(0, n_more, 0, 0.0, 1)
     cells = integrate(
-        system, RECORD_LAST, settings, parameters=parameters, frequency_hz=frequency_hz,
+        system, RECORD, settings, parameters=parameters, frequency_hz=frequency_hz,
         initial_states=last, n_keep=n_more, n_measures=FIRST_TURN + system.n_states, rtol=rtol, atol=atol,
         max_steps_per_period=max_steps_per_period, step_size=step_size, quantities=quantities,
     )  # fmt: skip
@@ -115,5 +115,5 @@ def _judge_of(system: System) -> Callable[..., None]:
         "SCALES": system.scales,
     }
     for key in observers.HELPERS:
-        bindings[key] = part(specialise(getattr(observers, key), system.label, **bindings), True, True)
+        bindings[key] = bound_part(getattr(observers, key), system.label, bindings, True, True)
     return kernel(specialise(judge, system.label, **bindings))

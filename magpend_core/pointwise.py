@@ -10,7 +10,7 @@ import numpy as np
 
 from magpend_core.engine.checks import check_system
 from magpend_core.engine.events import event_bindings
-from magpend_core.engine.jit import keeping, kernel, part, specialise
+from magpend_core.engine.jit import bound_part, keeping, kernel, specialise
 from magpend_core.engine.modes import mode_bindings
 from magpend_core.engine.simd import WIDTH, load, load_rows, store_rows
 from magpend_core.engine.system import System
@@ -98,8 +98,8 @@ def _evaluator(system: System, kind: str) -> Any:
         "quantities": system.quantities,
     }
     label = f"{system.label}_{kind}"
-    bindings["_set_modes"] = part(specialise(_set_modes, label, **bindings), True)
-    bindings["quantity"] = part(specialise(_KINDS[kind], label, **bindings), True)
+    bindings["_set_modes"] = bound_part(_set_modes, label, bindings, True)
+    bindings["quantity"] = bound_part(_KINDS[kind], label, bindings, True)
     return kernel(specialise(_evaluate, label, **bindings), keeping(*system.functions))
 
 

@@ -19,7 +19,7 @@ from magpend_core.engine.driven import LEVEL, with_recorded_drive
 from magpend_core.engine.entry import N_LANES, check_quantities, integrate
 from magpend_core.engine.jit import keeping, kernel, specialise
 from magpend_core.engine.lanes import Cells, engine_bindings
-from magpend_core.engine.observers import FIRST_TURN, RECORD_LAST, Settings
+from magpend_core.engine.observers import FIRST_TURN, RECORD, Settings
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from magpend_core.pointwise import evaluate_packed
@@ -120,7 +120,7 @@ def recorded_sections(
             break
         points, frequency = _points(own, drive, packed[walk.alive], slice(first, stop))
         cells = integrate(
-            own, RECORD_LAST, Settings(0, 1, 1, settings.tolerance, 1), parameters=points,
+            own, RECORD, Settings(0, 1, 1, settings.tolerance, 1), parameters=points,
             frequency_hz=frequency, initial_states=walk.state[walk.alive], n_keep=1,
             n_measures=FIRST_TURN + own.n_states, rtol=rtol, atol=atol,
             max_steps_per_period=max_steps_per_period, step_size=walk.step[walk.alive], n_lanes=n_lanes,
@@ -233,7 +233,7 @@ def _judge(sections: Any, settings: Any, out: Any) -> None:
 
 @cache
 def _judge_of(system: System) -> Callable[..., None]:
-    bindings = engine_bindings(replace(system, method="dopri5"), RECORD_LAST)
+    bindings = engine_bindings(replace(system, method="dopri5"), RECORD)
     return kernel(specialise(_judge, f"{system.label}_judge", **bindings), keeping(*system.functions))
 
 

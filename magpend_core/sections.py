@@ -13,8 +13,7 @@ from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.observers import (
     FIRST_TURN,
     ORBIT_PERIOD,
-    RECORD_CLOSED,
-    RECORD_LAST,
+    RECORD,
     Settings,
     window_of,
 )
@@ -160,8 +159,10 @@ def run_branches(
     n_keep = check_count("n_keep", n_keep, 1)
     max_orbit_period = check_count("max_orbit_period", max_orbit_period, 1)
     tolerance = check_tolerance("closure_tolerance", closure_tolerance)
-    observer = RECORD_CLOSED if check_flag("stop_when_closed", stop_when_closed) else RECORD_LAST
-    settings = Settings(n_transient, n_keep, max_orbit_period, tolerance, window_of(max_orbit_period))
+    settings = Settings(
+        n_transient, n_keep, max_orbit_period, tolerance, window_of(max_orbit_period),
+        check_flag("stop_when_closed", stop_when_closed),
+    )  # fmt: skip
     if method is not None:
         system = replace(system, method=method)
     if section is not None:
@@ -169,7 +170,7 @@ def run_branches(
             raise ValueError("frequency_hz must be None with a section by crossing: its periods are returns.")
         system, parameters, frequency_hz = section.applied(check_array("parameters", parameters, 3), system)
     cells = integrate(
-        system, observer, settings,
+        system, RECORD, settings,
         parameters=parameters, frequency_hz=frequency_hz, initial_states=initial_states,
         n_keep=n_keep, n_measures=FIRST_TURN + system.n_states, rtol=rtol, atol=atol,
         max_steps_per_period=max_steps_per_period, step_size=step_size, n_lanes=n_lanes,

@@ -25,7 +25,7 @@ from magpend_core.engine.lanes import (
     ZERO,
     engine_bindings,
 )
-from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.observers import RECORD
 from magpend_core.engine.simd import WIDTH
 from magpend_core.engine.system import System
 from magpend_core.engine.tableau import DENSE, N_STAGES
@@ -112,7 +112,7 @@ def follow(
 
 @cache
 def _follower(system: System) -> Callable[..., int]:
-    bindings = engine_bindings(replace(system, method="dopri5"), RECORD_LAST)
+    bindings = engine_bindings(replace(system, method="dopri5"), RECORD)
     for template in (prepare, fill):
         bindings[template.__name__] = njit(**OPTIONS)(specialise(template, system.label, **bindings))
     return kernel(specialise(follow, system.label, **bindings), keeping(*system.functions))

@@ -19,16 +19,21 @@ Environment variables, read once at import:
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
+import threading
 import types as pytypes
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import CodeType
 from typing import Any, TypeVar
 
 import llvmlite
 import numba
+import numpy as np
 from numba import njit
+from numba.core import event
 
 from magpend_core.engine.digests import PACKAGE, functions_digest
 from magpend_core.engine.kept import keep
@@ -99,6 +104,92 @@ def part(function: F, dissolves: bool, short: bool = False) -> F:
     compiler = RawCompiler if short else PartCompiler
     options = {"no_cpython_wrapper": True, "pipeline_class": compiler, **UNCOUNTED, **WITHOUT_C}
     return njit(forceinline=dissolves, **options)(function)
+
+
+class _Uncollected(event.Listener):
+    """Lets the garbage collector rest while numba compiles: its trees live until the end, and are many.
+
+    A tenth of the time went into looking at them again and again.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._depth, self._resumes = threading.Lock(), 0, False
+
+    def on_start(self, event: Any) -> None:
+        """Compilation begins, of a function or of one that it calls."""
+        with self._lock:
+            if self._depth == 0:
+                self._resumes = gc.isenabled()
+                gc.disable()
+            self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        """It has ended."""
+        with self._lock:
+            self._depth -= 1
+            if self._depth == 0 and self._resumes:
+                gc.enable()
+
+
+event.register("numba:compiler_lock", _Uncollected())
+
+_PARTS: dict[Any, tuple[Any, Any]] = {}
+"""Parts by what they are made of, each with what must live as long: identities are in its key."""
+
+
+def bound_part(
+    template: Callable[..., Any], name: str, bindings: Mapping[str, Any], dissolves: bool,
+    short: bool = False,
+) -> Any:  # fmt: skip
+    """Bind a template and compile it as a part; a part of the same template and values is the same one.
+
+    Half of what an engine is made of knows no equations: where two engines agree in what a part uses, it is
+    compiled once for both.
+
+    Parameters
+    ----------
+    template
+        A plain function; its free names in `bindings` are bound, the others are its module's.
+    name
+        Of the engine: one name, one content, also of what other processes have kept. Their machine code and
+        that of this process are linked by names, so that two parts of one name would be taken for each other.
+    bindings
+        More than it uses may be in there.
+    dissolves, short
+        See `part`.
+    """
+    names = _names_in(template.__code__)
+    used = {name: bindings[name] for name in sorted(names) if name in bindings}
+    values = tuple((name, _identity(value, names)) for name, value in used.items())
+    key = template.__code__, id(template.__globals__), dissolves, short, values
+    if key not in _PARTS:
+        function = specialise(template, name, **used)
+        _PARTS[key] = part(function, dissolves, short), (template, used)
+    return _PARTS[key][0]
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """Names that a function looks up, and those that functions within it do."""
+    within = (_names_in(c) for c in code.co_consts if isinstance(c, CodeType))
+    return set(code.co_names).union(*within)
+
+
+def _identity(value: Any, names: set[str]) -> Any:
+    """What decides how a value is compiled: equal numbers of two types are two things.
+
+    Of a tuple with named fields it is the fields that are in `names`: they are looked up by name alone.
+    """
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if hasattr(value, "_fields"):
+        return type(value), tuple(
+            (k, _identity(getattr(value, k), names)) for k in value._fields if k in names
+        )
+    if isinstance(value, tuple):
+        return type(value), tuple(_identity(v, names) for v in value)
+    if isinstance(value, bool | int | float | str):
+        return type(value), repr(value)
+    return id(value)
 
 
 def is_covered(*functions: Callable[..., Any]) -> bool:

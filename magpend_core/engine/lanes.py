@@ -28,7 +28,7 @@ from magpend_core.engine import modes as mode_templates
 from magpend_core.engine import observers
 from magpend_core.engine.digests import code_length
 from magpend_core.engine.events import LANDED, TAKE_BACK, event_bindings
-from magpend_core.engine.jit import inline, keeping, kernel, part, specialise
+from magpend_core.engine.jit import bound_part, inline, keeping, kernel, specialise
 from magpend_core.engine.modes import mode_bindings
 from magpend_core.engine.observers import Observer
 from magpend_core.engine.simd import (
@@ -90,7 +90,6 @@ class Rows(NamedTuple):
     state: int
     slopes: int  # N_STAGES * n_states rows
     trial: int  # the stage's state, at the end the new state
-    constants: int
     forcing: int  # at the last stage's time
     time: int  # s, since the last section
     wish: int  # s, step size that the error control wants
@@ -126,6 +125,7 @@ class Rows(NamedTuple):
     ahead: int  # s, from the begin of the step to where `passed` is of
     resolution: int  # s, of the instant that is looked for; 0 if none is
     level: int  # of the section
+    constants: int  # last, so that systems with few and with many agree in all other rows
     size: int
 
 
@@ -133,10 +133,9 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
     """Lay out a group for a system of which `n_watched` quantities are watched."""
     n = system.n_events
     counts = [
-        system.n_states, system.tableau.n_stages * system.n_states, system.n_states,
+        system.n_states, system.tableau.n_stages * system.n_states, system.n_states, *[1] * 18,
+        system.n_states if n_watched else 0, *[n_watched] * 6, *[2 * n] * 3, *[n] * 3, *[1 if n else 0] * 4,
         system.n_constants + system.n_modes,
-        *[1] * 18, system.n_states if n_watched else 0, *[n_watched] * 6, *[2 * n] * 3, *[n] * 3,
-        *[1 if n else 0] * 4,
     ]  # fmt: skip
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
     return Rows(*(int(x) for x in offsets))
@@ -261,8 +260,8 @@ def unrolled_stages(system: System) -> Callable[..., None]:
         lines.append(f"k{s} = rhs(trial, u, c)")
         lines.append(f"store_rows(w, base + ROWS.slopes + {s * n * WIDTH}, k{s})")
     lines.append("store_rows(w, base + ROWS.trial, trial)")
-    scope = dict(globals())
-    exec("\n    ".join(lines), scope)
+    scope: dict[str, Any] = {}
+    exec("\n    ".join(lines), globals(), scope)
     function: Callable[..., None] = scope["run_stages"]
     return function
 
@@ -802,9 +801,9 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
     }
     short = code_length(system.rhs) + code_length(system.forcing) <= UNROLLED_LENGTH
     for key in observers.HELPERS:
-        bindings[key] = part(specialise(getattr(observers, key), name, **bindings), True, short)
-    bindings["observe"] = part(specialise(observer.observe, name, **bindings), True, short)
-    bindings["renew"] = part(specialise(observer.renew, name, **bindings), True, short)
+        bindings[key] = bound_part(getattr(observers, key), name, bindings, True, short)
+    bindings["observe"] = bound_part(observer.observe, name, bindings, True, short)
+    bindings["renew"] = bound_part(observer.renew, name, bindings, True, short)
     templates: dict[str, Any] = {}
     for module in (event_templates, mode_templates):
         templates |= {key: getattr(module, key) for key in (*module.INLINE, *module.CALLED)}
@@ -815,8 +814,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         templates["squared_error"] = squared_error_of_two
     dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *_INLINE}
     for key, template in templates.items():
-        function = specialise(template, name, **bindings)
-        bindings[key] = part(function, key in dissolving, short)
+        bindings[key] = bound_part(template, name, bindings, key in dissolving, short)
     return bindings
 
 

@@ -46,6 +46,7 @@ class Settings(NamedTuple):
     max_orbit_period: int
     tolerance: float
     window: int
+    stops_early: bool = False
 
 
 def window_of(max_orbit_period: int) -> int:
@@ -198,15 +199,15 @@ def _record(
 ) -> int:
     """Keep `n_keep` sections after the transient, and say whether the orbit closes.
 
-    The transient lasts `n_transient` periods or, where `STOP_EARLY` is set, until the orbit has
-    closed (see `closed_period`; looked at every quarter window), if that comes first.
+    The transient lasts `n_transient` periods or, with `stops_early`, until the orbit has closed (see
+    `closed_period`; looked at every quarter window), if that comes first.
     """
     ring = memory[_RING:]
     slot = ((i_period - 1) % settings.window) * N
     for k in range(N):
         ring[slot + k] = section[k]
     if i_period <= settings.n_transient and memory[_SETTLED] == 0.0:
-        if STOP_EARLY and i_period >= settings.window and i_period % (settings.window // 4) == 0:
+        if settings.stops_early and i_period >= settings.window and i_period % (settings.window // 4) == 0:
             memory[_PERIOD] = closed_period(ring, i_period, settings)
             memory[_SETTLED] = min(memory[_PERIOD], 1.0)
         return PENDING
@@ -241,12 +242,5 @@ def _keeps_next(i_period: int, memory: Any, settings: Settings) -> bool:
     return i_period >= settings.n_transient or memory[_SETTLED] != 0.0
 
 
-RECORD_LAST = Observer(
-    "record_last", _record, _memory_size, {"STOP_EARLY": False}, n_kept=_n_kept, keeps_next=_keeps_next
-)
-"""Keep `n_keep` sections after exactly `n_transient` periods."""
-
-RECORD_CLOSED = Observer(
-    "record_closed", _record, _memory_size, {"STOP_EARLY": True}, n_kept=_n_kept, keeps_next=_keeps_next
-)
-"""Keep `n_keep` sections as soon as the orbit has closed, after `n_transient` periods at the latest."""
+RECORD = Observer("record", _record, _memory_size, n_kept=_n_kept, keeps_next=_keeps_next)
+"""Keep `n_keep` sections after the transient, see `_record`."""

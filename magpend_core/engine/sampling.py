@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from magpend_core.engine.jit import keeping, kernel, part, specialise
+from magpend_core.engine.jit import bound_part, keeping, kernel, specialise
 from magpend_core.engine.lanes import (
     CROSSED,
     DIVERGED,
@@ -30,7 +30,7 @@ from magpend_core.engine.lanes import (
     TOO_MANY_STEPS,
     engine_bindings,
 )
-from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.observers import RECORD
 from magpend_core.engine.simd import WIDTH, load, store
 from magpend_core.engine.system import System
 from magpend_core.engine.tableau import DENSE, N_STAGES
@@ -280,8 +280,7 @@ _CALLED = ("begin_interval", "begin_trajectory", "write_due", "go_on", "end_traj
 @cache
 def sampler_of(system: System) -> Callable[..., None]:
     """Compile `follow_all` for a system."""
-    bindings = engine_bindings(replace(system, method="dopri5"), RECORD_LAST)
+    bindings = engine_bindings(replace(system, method="dopri5"), RECORD)
     for key in (*_INLINE, *_CALLED):
-        function = specialise(globals()[key], system.label, **bindings)
-        bindings[key] = part(function, key in _INLINE)
+        bindings[key] = bound_part(globals()[key], system.label, bindings, key in _INLINE)
     return kernel(specialise(follow_all, system.label, **bindings), keeping(*system.functions))

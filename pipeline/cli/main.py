@@ -14,9 +14,12 @@ if __name__ == "__main__":
 import typer
 
 from pipeline.cli.analyse import analyse_app
+from pipeline.cli.animate import animate
 from pipeline.cli.common import EXIT_HELP, CommandError
 from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
+from pipeline.cli.explore import explore
+from pipeline.cli.export import export
 from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.identify import identify_app
@@ -65,8 +68,8 @@ def _main(
 
 for _command, _settings in (
     (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
-    (models, {}),
-    (presets, {}), (fit_magnet, {}), (report, {}), (reproduce, {}),
+    (explore, {}), (export, {}), (animate, EXTRA), (report, {}), (reproduce, {}),
+    (models, {}), (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
 app.add_typer(analyse_app, name="analyse")

@@ -137,6 +137,50 @@ def derive(
     return _kept(run, place, _compute(run, analysis, wanted).assign_attrs(key))
 
 
+def stored(source: Source, name: str) -> xr.Dataset | None:
+    """Return what is kept of an analysis of a run's cells as they are now; nothing is computed.
+
+    Parameters
+    ----------
+    source
+        Run directory, or an opened run.
+    name
+        One of `pipeline.products.registry.ANALYSES`.
+
+    Returns
+    -------
+    Dataset or None
+        In memory: of the sound results of these cells and this version of the code that with the fewest
+        options other than by default, the first by its name among equals; None if there is none.
+    """
+    run = Run.open(source)
+    folder = run.info.files.below(DERIVED)
+    places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
+    if not places:  # then the version, which takes a moment, does not matter
+        return None
+    current = {"cube_digest": run.digest, "analysis_version": code_version(name), "derived_product": name}
+    found = []
+    for place in places:
+        with contextlib.suppress(DamagedError, FileNotFoundError):
+            attrs = read_product_attrs(place)
+            if all(attrs.get(key) == value for key, value in current.items()):
+                found.append((_changed_options(run, name, attrs), place.name, place))
+    for _, _, place in sorted(found, key=lambda entry: entry[:2]):
+        with contextlib.suppress(DamagedError, FileNotFoundError):
+            return _placed(open_product(place), place)
+    return None
+
+
+def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
+    """Number of options of a result that are other than by default."""
+    try:
+        options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {})).plain()
+    except SpecError:  # the run has not what they take
+        options = {}
+    given = json.loads(str(attrs.get("derived_options", "{}")))
+    return sum(options.get(key) != value for key, value in given.items())
+
+
 def _refuse_recorded(run: Run, name: str) -> None:
     """Refuse a run under a recorded drive: an analysis runs cells on, under a drive that goes on."""
     if run.spec.recorded is not None:

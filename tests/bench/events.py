@@ -2,7 +2,7 @@
 
 Run it alone on a machine that does nothing else::
 
-    python tests/bench/events.py [--trajectories 512] [--periods 40] [--rounds 5]
+    python tests/bench/events.py [--trajectories 512] [--periods 40] [--rounds 5] [--flows lorenz ...]
 
 For shipped flows of two and three states, whose steps cost next to nothing, so that this is the most that
 events can cost: attempts per return, how many of them are there because of the crossing, CPU time of an
@@ -70,7 +70,8 @@ def runner(
 def print_crossings(args: argparse.Namespace) -> None:
     """Table of the flows."""
     print("flow           rtol  attempts/return  for the crossing  CPU/attempt  CPU  off the level")
-    for name, (section, duration) in FLOWS.items():
+    for name in args.flows:
+        section, duration = FLOWS[name]
         parameters = load_model(name).load()
         column = parameters.model.system.state_names.index(section.of)
         for rtol in TOLERANCES:
@@ -114,6 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--trajectories", type=int, default=512)
     parser.add_argument("--periods", type=int, default=40)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--flows", nargs="+", choices=FLOWS, default=list(FLOWS))
     args = parser.parse_args(arguments)
     print_crossings(args)
     print()

@@ -5,7 +5,7 @@ import pytest
 
 from magpend_core import Status, run_branches, sections
 from magpend_core.engine.lanes import engine_of
-from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.observers import RECORD
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-11}
@@ -199,4 +199,4 @@ def test_run_branches__read_only_memory_compiles_nothing_more(preset):
         array.flags.writeable = False
     frozen = run_branches(packed, frequency, start, **settings)
     assert frozen.section.tobytes() == found.section.tobytes()
-    assert len(engine_of(PENDULUM_FITTED, RECORD_LAST).signatures) == 1
+    assert len(engine_of(PENDULUM_FITTED, RECORD).signatures) == 1

@@ -1,14 +1,21 @@
 """The compile cache: named by the sources, switched off by the environment; and without the compiler."""
 
 import dataclasses
+import gc
 import re
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from numba.core.compiler_lock import global_compiler_lock
 
 import magpend_core
 from magpend_core import accelerations, sections
-from magpend_core.engine.jit import is_covered, source_digest, specialise
+from magpend_core.engine import jit
+from magpend_core.engine.jit import bound_part, is_covered, source_digest, specialise
+from magpend_core.engine.lanes import engine_bindings
+from magpend_core.engine.observers import RECORD
+from magpend_core.engine.variational import with_tangents
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 
 SCRIPT = """
@@ -130,3 +137,49 @@ def test_label__follows_the_data(changes):
     assert changed.name == PENDULUM_FITTED.name
     assert changed.label != PENDULUM_FITTED.label
     assert dataclasses.replace(PENDULUM_FITTED).label == PENDULUM_FITTED.label
+
+
+class _Rows(NamedTuple):
+    state: int
+    size: int
+
+
+def _shifted(w):
+    return w + OFFSET + ROWS.state  # noqa: F821 # bound by bound_part
+
+
+def test_bound_part__is_shared_where_all_that_it_uses_agrees():
+    first = bound_part(_shifted, "first", {"OFFSET": 7, "ROWS": _Rows(1, 2), "other": 1}, True)
+    assert bound_part(_shifted, "first", {"OFFSET": 7, "ROWS": _Rows(1, 3), "other": 2}, True) is first
+    for differs in (
+        {"OFFSET": 7.0, "ROWS": _Rows(1, 2)}, {"OFFSET": True, "ROWS": _Rows(1, 2)},
+        {"OFFSET": 7, "ROWS": _Rows(0, 2)}, {"OFFSET": np.array([7]), "ROWS": _Rows(1, 2)},
+    ):  # fmt: skip
+        assert bound_part(_shifted, "first", differs, True) is not first
+    assert bound_part(_shifted, "first", {"OFFSET": 7, "ROWS": _Rows(1, 2)}, False) is not first
+    zero, minus = ({"OFFSET": x, "ROWS": _Rows(1, 2)} for x in (0.0, -0.0))
+    assert bound_part(_shifted, "first", zero, True) is not bound_part(_shifted, "first", minus, True)
+
+
+def test_bound_part__no_two_have_one_name(monkeypatch):
+    """Kept machine code and that of this process are linked by names: one name must be one content."""
+    monkeypatch.setattr(jit, "_PARTS", {})
+    for system in (PENDULUM_FITTED, with_tangents(PENDULUM_FITTED, 4)):
+        engine_bindings(system, RECORD)
+    parts = [part.py_func for part, _ in jit._PARTS.values()]
+    names = [f"{f.__module__}.{f.__qualname__}" for f in parts]
+    assert len(names) > 40
+    assert len(set(names)) == len(names)
+
+
+def test_compilation__leaves_garbage_alone_and_the_collector_as_it_was():
+    with global_compiler_lock, global_compiler_lock:
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with global_compiler_lock:
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from magpend_core import Status, load_preset, run_branches, sections, trajectory
 from magpend_core.engine.jit import OPTIONS, inline
 from magpend_core.engine.lanes import FADED, engine_bindings, rows_of
-from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.observers import RECORD
 from magpend_core.engine.simd import WIDTH, store
 from magpend_core.engine.tableau import ERROR, N_STAGES, NODES, STAGES
 from magpend_core.trajectory import DENSE
@@ -76,7 +76,7 @@ def test_dense__ends_at_the_step_and_has_order_4():
 @pytest.fixture(scope="module")
 def stepper(oscillator):
     """Integrate the oscillator from t = 0 with steps of fixed size; the engine's own stages."""
-    bindings = engine_bindings(oscillator, RECORD_LAST)
+    bindings = engine_bindings(oscillator, RECORD)
     run_stage, finish_step = bindings["run_stage"], bindings["finish_step"]
     squared_error = bindings["squared_error"]
     rows = rows_of(oscillator)
@@ -208,7 +208,7 @@ def limits(slack, x, rate, passed, remaining, widths, ratios, fades):
 @pytest.mark.parametrize("fades", [False, True])
 def test_choose_step__keeps_the_distance_from_layers_and_edges(oscillator, fades):
     system = dataclasses.replace(oscillator, n_edges=2, has_layers=True, layers=_one_layer, layers_fade=fades)
-    part, rows = engine_bindings(system, RECORD_LAST)["choose_step"], rows_of(system)
+    part, rows = engine_bindings(system, RECORD)["choose_step"], rows_of(system)
     choose_step = njit(lambda w, base, slack: part(w, base, slack))
     rng = np.random.default_rng(5)
     slack, tightest = 1e-3, np.zeros(4, int)
@@ -329,11 +329,11 @@ import hashlib
 import numpy as np
 from magpend_core import run_branches
 from magpend_core.engine.lanes import engine_of
-from magpend_core.engine.observers import RECORD_LAST
+from magpend_core.engine.observers import RECORD
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 packed, frequency, starts = (np.load("many.npz")[k] for k in ("packed", "frequency", "starts"))
 found = run_branches(packed, frequency, starts, n_transient=7, n_keep=3, rtol=1e-7, atol=1e-7)
-code = "".join(engine_of(PENDULUM_FITTED, RECORD_LAST, ()).inspect_asm().values())
+code = "".join(engine_of(PENDULUM_FITTED, RECORD, ()).inspect_asm().values())
 digest = hashlib.sha256(found.section.tobytes() + found.n_steps.tobytes()).hexdigest()
 print(digest, "zmm" in code, "ymm" in code)
 """

@@ -11,7 +11,7 @@ from magpend_core import Status, lyapunov_exponents, polish_orbits, run_branches
 from magpend_core.engine.entry import integrate
 from magpend_core.engine.jit import CACHE_FOLDER, inline, is_covered
 from magpend_core.engine.lanes import engine_of
-from magpend_core.engine.observers import RECORD_LAST, Observer
+from magpend_core.engine.observers import RECORD, Observer
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.engine.vecmath import TWO_PI, sincos
@@ -102,9 +102,9 @@ def test_engine_of__keeps_systems_from_outside_apart(oscillator):
     assert not is_covered(*with_tangents(mixed, 1).functions)
     # a kept function has a cache with a path, one from outside in a folder of its own
     if CACHE_FOLDER is not None:
-        kept = Path(engine_of(PENDULUM_FITTED, RECORD_LAST)._cache.cache_path)
+        kept = Path(engine_of(PENDULUM_FITTED, RECORD)._cache.cache_path)
         assert kept.parent == CACHE_FOLDER
-        outside = Path(engine_of(oscillator, RECORD_LAST)._cache.cache_path)
+        outside = Path(engine_of(oscillator, RECORD)._cache.cache_path)
         assert outside.parent.parent == CACHE_FOLDER
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -127,8 +129,13 @@ def figure_of(done, folder):
 
 
 @pytest.mark.slow
-def test_branches__command(magpend, tmp_path):
+def test_branches__command(main, tmp_path):
     """The shipped workflow's small size, its table, a figure."""
+
+    def magpend(*words):
+        code, out, notes = main(*words)
+        return SimpleNamespace(returncode=code, stdout=out, stderr=notes)
+
     assert magpend("run", "branches_2_3hz", "--smoke", "--workers", 0, "--out", "run").returncode == 0
     options = ("--from", 2.45, "--to", 2.7, "--period", 2, "--generations", 1)
     done = magpend("analyse", "branches", "run", *options, "--csv", "table.csv")

@@ -33,7 +33,7 @@ def text_spec(own, write_spec, tmp_path):
 
 
 @pytest.fixture
-def command(environment):
+def process(environment):
     """Run the command line in a folder of one's choice."""
 
     def call(folder: Path, *arguments):
@@ -56,26 +56,22 @@ def rewritten(directory: Path, change) -> None:
 
 
 @pytest.mark.slow
-def test_run__text_from_the_specification_to_the_figure(text_spec, tmp_path, command):
-    """Elsewhere, in other processes, with the shared file gone: the run explains itself."""
+def test_run__text_from_the_specification_to_the_figure(text_spec, tmp_path, process, command):
+    """Elsewhere, in another process, with the shared file gone: the run explains itself."""
     directory, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
     elsewhere.mkdir()
-    done = command(tmp_path, "run", text_spec, "--out", directory, "--workers", 2)
+    done = process(tmp_path, "run", text_spec, "--out", directory, "--workers", 2)
     assert done.returncode == 0, done.stderr
     (tmp_path / "shared.toml").unlink()
-    assert "complete" in command(elsewhere, "status", directory).stdout
-    assert "intact" in command(elsewhere, "verify", directory).stdout
-    table = json.loads(command(elsewhere, "analyse", "attractors", directory, "--json").stdout)
+    assert "complete" in process(elsewhere, "status", directory).stdout
+    assert "intact" in command(elsewhere, "verify", directory)[0]
+    table = json.loads(command(elsewhere, "analyse", "attractors", directory, "--json")[0])
     assert "closed_orbit" in {row["kind"] for row in table}
-    found = command(elsewhere, "analyse", "basins", directory, "--json")
-    assert found.returncode == 0, found.stderr
-    drawn = command(elsewhere, "plot", "basins", directory)
-    assert drawn.returncode == 0, drawn.stderr
+    command(elsewhere, "analyse", "basins", directory, "--json")
+    command(elsewhere, "plot", "basins", directory)
     assert (directory / "figures" / "basins.png").is_file()
-    zoomed = command(elsewhere, "zoom", directory, "--x", "-0.5", "0.5", "--out", "closer.toml")
-    assert zoomed.returncode == 0, zoomed.stderr
-    again = command(elsewhere, "run", "closer.toml", "--workers", 0)
-    assert again.returncode == 0, again.stderr
+    command(elsewhere, "zoom", directory, "--x", "-0.5", "0.5", "--out", "closer.toml")
+    command(elsewhere, "run", "closer.toml", "--workers", 0)
     assert open_run(elsewhere / "runs" / "closer").x_0.values.max() == 0.5
 
 
@@ -195,13 +191,13 @@ def test_open_run__stranger_s_object_is_never_imported(own, text_spec, tmp_path,
 
 
 @pytest.mark.slow
-def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, command):
+def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, process):
     """The module lies beside the specification alone; the run is made from elsewhere."""
     project, elsewhere = tmp_path / "project", tmp_path / "elsewhere"
     trace = own.write_module(project, "mine")
     elsewhere.mkdir()
     (project / "spec.toml").write_text(own.spec('model = "mine:MINE"'))
-    done = command(elsewhere, "run", project / "spec.toml", "--out", "run", "--workers", 2)
+    done = process(elsewhere, "run", project / "spec.toml", "--out", "run", "--workers", 2)
     assert done.returncode == 0, done.stderr
     ds = open_run(elsewhere / "run")
     cell, f = ds.isel(x_0=1, v_0=2), float(ds.frequency)
@@ -212,17 +208,17 @@ def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, co
     assert cell.section.values == pytest.approx(found, abs=2e-5)
     named = "--import-model", "mine:MINE"
     trace.unlink()
-    assert command(elsewhere, "analyse", "attractors", "run").returncode == 2
+    assert process(elsewhere, "analyse", "attractors", "run").returncode == 2
     assert not trace.exists()
-    found = command(project, "analyse", "attractors", elsewhere / "run", *named, "--json")
+    found = process(project, "analyse", "attractors", elsewhere / "run", *named, "--json")
     assert [row["orbit_period"] for row in json.loads(found.stdout)] == [1]
     module = project / "mine.py"
     module.write_text(module.read_text().replace("- y[0]", "- 1.1 * y[0]"))
-    again = command(elsewhere, "run", project / "spec.toml", "--out", "run")
+    again = process(elsewhere, "run", project / "spec.toml", "--out", "run")
     assert again.returncode == 2
     assert "model_digest" in again.stderr
-    found = command(project, "analyse", "attractors", elsewhere / "run", *named, "--json")
+    found = process(project, "analyse", "attractors", elsewhere / "run", *named, "--json")
     assert found.returncode == 0  # what was kept needs no object
-    found = command(project, "analyse", "settling", elsewhere / "run", *named)
+    found = process(project, "analyse", "settling", elsewhere / "run", *named)
     assert found.returncode == 2
     assert "restore the code" in found.stderr

@@ -142,19 +142,20 @@ def test_pooled_autocorrelation__leaves_out_what_was_not_measured(rng):
     )  # fmt: skip
 
 
-def coverage(ringdown, seeds: int, estimator=None, **rig) -> tuple[np.ndarray, set[str]]:
-    """Share of seeds whose interval holds the truth, by parameter."""
-    inside, chosen = np.zeros(2), set()
+def coverage(ringdown, seeds: int, *estimators, **rig) -> tuple[np.ndarray, list[set[str]]]:
+    """Share of seeds whose interval holds the truth, by estimator and parameter; and what was chosen."""
+    inside, chosen = np.zeros((len(estimators), 2)), [set() for _ in estimators]
     for seed in range(seeds):
         found = ringdown.fit(*ringdown.record(np.random.default_rng(seed), **rig), noise=0.01)
-        covariance = st.covariance_of(found.linear, SCALE, estimator)
-        chosen.add(covariance.estimator)
-        inside += np.abs(found.theta - ringdown.TRUTH) <= covariance.critical * covariance.errors
+        for i, estimator in enumerate(estimators):
+            covariance = st.covariance_of(found.linear, SCALE, estimator)
+            chosen[i].add(covariance.estimator)
+            inside[i] += np.abs(found.theta - ringdown.TRUTH) <= covariance.critical * covariance.errors
     return inside / seeds, chosen
 
 
 def test_coverage__white_noise_quantised_with_a_dead_band(ringdown):
-    share, _ = coverage(ringdown, 200, noise=0.002, bits=12, dead_band=True)
+    (share,), _ = coverage(ringdown, 200, None, noise=0.002, bits=12, dead_band=True)
     assert ((share >= 0.92) & (share <= 0.98)).all(), share
 
 
@@ -162,8 +163,7 @@ def test_coverage__white_noise_quantised_with_a_dead_band(ringdown):
 def test_coverage__autocorrelated_noise(ringdown, n_pieces, n):
     """Where residuals remember, intervals of independent ones are far too narrow; ours are not."""
     rig = {"n_pieces": n_pieces, "n": n, "memory": 0.9}
-    plain, _ = coverage(ringdown, 100, "white", **rig)
-    share, chosen = coverage(ringdown, 100, **rig)
+    (plain, share), (_, chosen) = coverage(ringdown, 100, "white", None, **rig)
     assert chosen == {"pieces" if n_pieces > 2 else "newey-west"}
     assert (share >= 0.9).all(), share
     assert (plain < 0.9).any(), plain

@@ -1,0 +1,401 @@
+"""What attracts at a parameter point, as far as it is known, and which of it a live trajectory has reached.
+
+Where the run's attractors are kept in ``derived/``, those of the point are taken from there with their ids,
+and a trajectory is matched as `pipeline.analysis.attractors` matches the cube's cells: closed or on its way
+to a polished orbit (`deciding.decide`), at an equilibrium, on a limit cycle, or one of a bounded set by the
+boxes that its sections occupy. What closes elsewhere is polished and becomes an entry of its own, without
+an id: so live trajectories are told apart by the same rules where no analysis was made. There is no search
+for bounded sets then; bounded cells have one entry for each motion that the model's classifier tells.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.model import Model
+from magpend_core.status import Status
+from pipeline.analysis.attractors import features
+from pipeline.analysis.attractors.bounded import Clouds, Rule, Sets, assign, find_sets
+from pipeline.analysis.attractors.cells import Block
+from pipeline.analysis.attractors.cycles import tell_cycles
+from pipeline.analysis.attractors.deciding import STRICT, decide
+from pipeline.analysis.attractors.equilibria import tell_rest
+from pipeline.analysis.attractors.orbits import Orbit, number_of, polish, raw_orbit
+from pipeline.analysis.attractors.points import Point
+from pipeline.analysis.attractors.spirals import Recurrence
+from pipeline.analysis.sets import Geometry, mean_distance
+from pipeline.explorer.series import orbit_series
+from pipeline.explorer.settling import Place
+from pipeline.layout.vocabulary import ABSENT, BOUNDED_SET, CLOSED_ORBIT, EQUILIBRIUM, split_dims
+from pipeline.products.attractors import IdentifyOptions
+
+MOST_ENTRIES = 64
+"""Attractors told apart besides those of the run; what closes elsewhere is told by its period alone."""
+
+SAME_REST = 1e-5
+"""Largest scaled distance between an equilibrium of the run and the same one found again."""
+
+SAME_SECONDS = 1e-6
+"""Largest relative difference between the periods of a limit cycle found twice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """Something that trajectories end on.
+
+    Attributes
+    ----------
+    number : int
+        By which slices name it: the run's id of an attractor, and larger numbers for everything else.
+    attractor : int or None
+        The run's id.
+    kind : int
+        Of `vocabulary.KINDS`; absent for a class of cells that is no attractor.
+    period : int
+        Drive periods or returns; 0 if not closed.
+    motion : int
+        Code of the model's classifier.
+    status : int
+        Code of `Status`, of a class of cells that ended; 0 else.
+    points : ndarray, (n, state)
+        Section points; none of a class of cells.
+    seconds : float
+        Period of a limit cycle; NaN else.
+    """
+
+    number: int
+    attractor: int | None
+    kind: int
+    period: int
+    motion: int
+    status: int
+    points: np.ndarray
+    seconds: float = np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What a run's analysis says of a parameter point.
+
+    Attributes
+    ----------
+    attractors : Dataset or None
+        Of all points of the run.
+    cells : Dataset or None
+        The cube at the point; None where it has no such point.
+    index : tuple of int or None
+        Of the point.
+    """
+
+    attractors: xr.Dataset | None = None
+    cells: xr.Dataset | None = None
+    index: tuple[int, ...] | None = None
+
+    def here(self) -> xr.Dataset | None:
+        """Attractors at the point."""
+        if self.attractors is None or self.index is None or self.cells is None:
+            return None
+        dims, _ = split_dims(self.attractors["attractor_id"])
+        return self.attractors.isel(dict(zip(dims, self.index, strict=True)))
+
+
+class Catalog:
+    """Attractors of a parameter point; several threads may ask at once.
+
+    Parameters
+    ----------
+    place
+        The point.
+    known
+        What the run's analysis says of it.
+    closure_tolerance
+        Of the run.
+    """
+
+    def __init__(self, place: Place, known: Known, closure_tolerance: float) -> None:
+        self.place, self.model = place, place.parameters.model
+        self._packed = place.parameters.pack()
+        self._geometry = Geometry.of(self.model)
+        here = known.here()
+        self.options = _options_of(here)
+        self.tolerance = _tolerance_of(here, closure_tolerance)
+        self._lock = threading.RLock()
+        self.entries: list[Entry] = []
+        self._orbits: list[Orbit] = []
+        self._orbit_entries: list[int] = []
+        self._sets: list[tuple[Entry, Sets]] = []
+        self.n_ids = 0 if known.attractors is None else known.attractors.sizes["attractor"]
+        if here is not None and known.cells is not None:
+            self._take(here, known.cells)
+
+    # ---- what the run knows ------------------------------------------------------------------
+
+    def _take(self, here: xr.Dataset, cells: xr.Dataset) -> None:
+        """Enter the attractors of the run."""
+        present = np.flatnonzero(here["kind"].values != ABSENT)
+        points = {int(i): _finite(here["attractor_points"].values[i]) for i in present}
+        periods = here["orbit_period"].values
+        closed = [i for i in points if here["kind"].values[i] == CLOSED_ORBIT and periods[i] > 0]
+        orbits = self._polished(
+            np.array([points[i][0] for i in closed]), np.array([periods[i] for i in closed], np.int64)
+        )
+        found = dict(zip(closed, orbits, strict=True))
+        for i, own in points.items():
+            kind = int(here["kind"].values[i])
+            side = int(here["side"].values[i]) if "side" in here else 0
+            seconds = float(here["period_s"].values[i])
+            entry = Entry(i, i, kind, int(periods[i]), side, 0, own, seconds)
+            self.entries.append(entry)
+            if i in found:
+                self._add_orbit(found[i] or raw_orbit(own, self._geometry), entry)
+            elif kind == BOUNDED_SET:
+                clouds = self._clouds_of(here, cells, i)
+                if clouds is not None:
+                    self._sets.append((entry, find_sets(clouds, self._geometry, self._rule)))
+
+    @property
+    def _rule(self) -> Rule:
+        return Rule.of(self.options)
+
+    def _clouds_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Clouds | None:
+        """Clouds of the cube's cells that are on a bounded set."""
+        block = self._point(cells).whole()
+        ids = here["attractor_id"].transpose(*split_dims(cells["status"])[1]).values.ravel()
+        own = np.flatnonzero((ids == number) & block.is_bounded)
+        if not len(own):
+            return None
+        clouds = Clouds.of(block.section[own], block.turns[own], self._geometry, self._rule)
+        return clouds.first(self._rule.n_anchors)
+
+    def _polished(self, points: np.ndarray, period: np.ndarray) -> list[Orbit | None]:
+        n = len(points)
+        return polish(
+            np.tile(self._packed, (n, 1)), np.full(n, self.place.frequency), points, period,
+            geometry=self._geometry, system=self.model.system, tolerance=self.options.residual,
+        )  # fmt: skip
+
+    def _add_orbit(self, orbit: Orbit, entry: Entry) -> None:
+        self._orbits.append(orbit)
+        self._orbit_entries.append(entry.number)
+
+    # ---- where trajectories are ----------------------------------------------------------------
+
+    def on_orbits(self, block: Block) -> np.ndarray:
+        """Entry of the orbit that each cell is on or certain to end on, -1 for none."""
+        with self._lock:
+            orbits, numbers = list(self._orbits), np.array([*self._orbit_entries, -1])
+        if not orbits:
+            return np.full(len(block.status), -1, np.int64)
+        label, _ = decide(block, orbits, self.tolerance, self._geometry)
+        return np.asarray(numbers[label])
+
+    def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
+        """Which undecided cells are worth running on: those that come back near, as the analysis does it."""
+        rows = np.flatnonzero(block.is_bounded & (numbers < 0))
+        near = np.zeros(len(numbers), bool)
+        longest = self.options.max_orbit_period
+        near[rows] = Recurrence.of(block.section[rows], longest, self._geometry).is_near
+        if self.tolerance > STRICT:
+            near |= block.is_closed & (numbers < 0)
+        return near
+
+    def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
+        """Entry of each cell; what closes elsewhere gets an entry of its own.
+
+        Parameters
+        ----------
+        block
+            Cells at their end.
+        final
+            Whether every cell is to get one; else -1 stays for what is neither on an orbit nor at rest.
+        strictly
+            Whether cells count as closed within a small distance, however loosely the run's own do.
+        """
+        numbers = np.full(len(block.status), -1, np.int64)
+        if self.model.autonomous:
+            block = self._rest(block, numbers)
+        numbers = np.where(numbers < 0, self.on_orbits(block), numbers)
+        if strictly or self.tolerance <= STRICT:
+            self._learn(block, numbers)
+        if final:
+            self._in_sets(block, numbers)
+            for row in np.flatnonzero(numbers < 0):
+                numbers[row] = self._class_of(block, int(row)).number
+        return numbers
+
+    def _rest(self, block: Block, numbers: np.ndarray) -> Block:
+        """Tell cells at equilibria and on limit cycles of a flow, in place; returns cells without them."""
+        point = self._point(_dataset_of(block, self.model))
+        tell_rest([point], self.tolerance, self._geometry)
+        for k, found in enumerate(point.equilibria):
+            here = self._entry_near(EQUILIBRIUM, found.state)
+            entry = here or self._new(EQUILIBRIUM, 0, found.state[None])
+            assert point.at_rest is not None
+            numbers[point.at_rest == k] = entry.number
+        if self.model.crossing is None:
+            options = self.options
+            tell_cycles([point], self.tolerance, options.max_orbit_period, options.residual, self._geometry)
+            for k, cycle in enumerate(point.cycles):
+                assert point.on_cycle is not None
+                own = point.on_cycle == k
+                last = block.section[own][0, -1:]
+                entry = self._entry_of_seconds(cycle.seconds) or self._new(
+                    CLOSED_ORBIT, 0, last, seconds=cycle.seconds
+                )
+                numbers[own] = entry.number
+        status = np.where(numbers >= 0, np.int8(Status.NO_RETURN), block.status)
+        return Block(block.cells, block.section, status, block.orbit_period, block.turns, block.rest)
+
+    def _learn(self, block: Block, numbers: np.ndarray) -> None:
+        """Polish what closes on no known orbit, and enter it, in place."""
+        for row in np.flatnonzero(block.is_closed & (numbers < 0)):
+            if numbers[row] >= 0 or self._n_new >= MOST_ENTRIES:
+                continue
+            own = block.section[row]
+            period = min(int(block.orbit_period[row]), len(own))
+            orbit = self._polished(own[-1:], np.array([period]))[0]
+            self._enter(orbit or raw_orbit(own[-period:], self._geometry))
+            again = self.on_orbits(block)
+            numbers[numbers < 0] = again[numbers < 0]
+
+    def _enter(self, orbit: Orbit) -> None:
+        with self._lock:
+            if number_of(orbit, self._orbits, self._geometry) == len(self._orbits):
+                motion = self._motion_of(orbit)
+                entry = self._new(CLOSED_ORBIT, orbit.period, orbit.points, motion, seconds=orbit.seconds)
+                self._add_orbit(orbit, entry)
+
+    def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
+        """Tell which of the run's bounded sets the other bounded cells are in, in place."""
+        rows = np.flatnonzero(block.is_bounded & (numbers < 0))
+        if not len(rows) or not self._sets:
+            return
+        clouds = Clouds.of(block.section[rows], block.turns[rows], self._geometry, self._rule)
+        inside = np.stack([assign(clouds, sets, self._rule) >= 0 for _, sets in self._sets], axis=1)
+        for row, own in zip(rows, inside, strict=True):
+            candidates = [self._sets[k][0] for k in np.flatnonzero(own)]
+            if len(candidates) > 1:
+                candidates.sort(key=lambda e: mean_distance(block.section[row], e.points, self._geometry))
+            if candidates:
+                numbers[row] = candidates[0].number
+
+    # ---- entries -------------------------------------------------------------------------------
+
+    @property
+    def _n_new(self) -> int:
+        return sum(entry.attractor is None and entry.kind != ABSENT for entry in self.entries)
+
+    def _new(
+        self, kind: int, period: int, points: np.ndarray, motion: int = 0, status: int = 0,
+        seconds: float = np.nan,
+    ) -> Entry:  # fmt: skip
+        with self._lock:
+            number = max([self.n_ids, *(e.number + 1 for e in self.entries)])
+            entry = Entry(number, None, kind, period, motion, status, points, seconds)
+            self.entries.append(entry)
+            return entry
+
+    def entry(self, number: int) -> Entry:
+        """Return the entry of a number."""
+        return next(entry for entry in self.entries if entry.number == number)
+
+    def _entry_near(self, kind: int, state: np.ndarray) -> Entry | None:
+        for entry in self.entries:
+            if entry.kind == kind and self._geometry.distance(entry.points[0], state) <= SAME_REST:
+                return entry
+        return None
+
+    def _entry_of_seconds(self, seconds: float) -> Entry | None:
+        for entry in self.entries:
+            same = abs(entry.seconds - seconds) <= SAME_SECONDS * seconds
+            if entry.kind == CLOSED_ORBIT and not entry.period and same:
+                return entry
+        return None
+
+    def _class_of(self, block: Block, row: int) -> Entry:
+        """Entry of a cell that is on nothing known: one for each status, period and motion."""
+        status = int(block.status[row])
+        alive = bool(block.is_bounded[row] or block.is_closed[row])
+        period = int(block.orbit_period[row]) if alive else 0
+        motion = int(self.motions(block)[row]) if alive else 0
+        key = (period, motion, 0 if alive else status)
+        with self._lock:
+            for entry in self.entries:
+                if entry.kind == ABSENT and (entry.period, entry.motion, entry.status) == key:
+                    return entry
+            return self._new(ABSENT, period, block.section[row][:0], motion, key[2])
+
+    # ---- motions -------------------------------------------------------------------------------
+
+    def motions(self, block: Block) -> np.ndarray:
+        """Codes of the model's classifier for each cell."""
+        return features.sides_of(block.section, block.turns, self.place.frequency, self.place.parameters)
+
+    def _motion_of(self, orbit: Orbit) -> int:
+        """Code of an orbit's motion, its turns counted over its period."""
+        if self.model.classifier is None:
+            return 0
+        is_flow = self.model.crossing is not None
+        known = np.isfinite(orbit.seconds)
+        seconds = orbit.seconds if known else orbit.period / self.place.frequency
+        clock = orbit.period / seconds if is_flow and known else self.place.frequency
+        states = orbit_series(self.place.parameters, clock, orbit.points[0], orbit.period, seconds)["states"]
+        angles = np.flatnonzero(self._geometry.is_angle)
+        turns = np.round((states[-1] - states[0])[angles] / (2.0 * np.pi)).astype(np.int64)
+        place = self.place
+        return int(features.sides_of(orbit.points[None], turns[None], place.frequency, place.parameters)[0])
+
+    def _point(self, cells: xr.Dataset) -> _WholePoint:
+        return _WholePoint(
+            cells, split_dims(cells["status"])[1], self.place.frequency, self._packed, self.place.parameters,
+            sum(self._geometry.is_angle), cells["status"].size, self.model.system,
+        )  # fmt: skip
+
+
+class _WholePoint(Point):
+    """A point all of whose cells are one block."""
+
+    def whole(self) -> Block:
+        """All cells."""
+        return next(self.blocks())
+
+
+def _finite(points: np.ndarray) -> np.ndarray:
+    return np.asarray(points[np.isfinite(points).all(axis=-1)])
+
+
+def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
+    """Options with which the run's attractors were found; else those by default."""
+    attrs: Mapping[Any, Any] = {} if here is None else here.attrs
+    given = {}
+    for name, field in IdentifyOptions.model_fields.items():
+        value = attrs.get(f"identify_{name}")
+        if value is not None:
+            given[name] = type(field.default)(value)
+    return IdentifyOptions(**given)
+
+
+def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
+    """Within which a closed cell belongs to an orbit: as `identify` takes it."""
+    found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
+    return found or max(1e-4, 10.0 * closure_tolerance)
+
+
+def _dataset_of(block: Block, model: Model) -> xr.Dataset:
+    """Cells as a dataset of one parameter point."""
+    dims = "initial_condition"
+    variables: dict[str, Any] = {
+        "section": ((dims, "period_index", "state"), block.section),
+        "status": ((dims,), block.status),
+        "orbit_period": ((dims,), block.orbit_period),
+        "turns": ((dims, model.angle_dim), block.turns),
+    }
+    if block.rest is not None:
+        variables["rest_state"] = ((dims, "state"), block.rest)
+    return xr.Dataset(variables)

@@ -1,0 +1,350 @@
+"""What is computed while one watches: starts, slices, orbits that follow a parameter, runs of a region.
+
+`LiveRun` is what all who watch a run share: compiled code, the attractors of parameter points, threads for
+the kernel. `LiveSession` is one of those who watch: it takes messages (see `messages`) and gives answers to
+a callback, dictionaries for JSON and bytes of `arrays.pack_arrays`. There is one job of a kind at a time; a
+newer one takes the place of the one before. Neither knows how messages travel.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.parameters import ParameterError
+from magpend_core.orbits import section_map
+from pipeline.explorer.catalog import Catalog, Known
+from pipeline.explorer.jobs import Answer, Desk, Job
+from pipeline.explorer.legend import Legend
+from pipeline.explorer.messages import CancelRequest, Request, RequestError, read_request
+from pipeline.explorer.series import orbit_series
+from pipeline.explorer.settling import Flight, Place
+from pipeline.layout.cells import CellMap, parameter_axes
+from pipeline.layout.domains import check_states
+from pipeline.layout.vocabulary import axis_name
+from pipeline.runs.derive import stored
+from pipeline.spec.tables import FREQUENCY
+from pipeline.store.run import Run
+
+LOG = logging.getLogger(__name__)
+
+MOST_CATALOGS = 64
+"""Parameter points of which the attractors are remembered."""
+
+FAR = 10.0
+"""How many times higher or lower than the run's own a drive frequency may be."""
+
+SAME_VALUE = 1e-12
+"""Relative difference at which a value is that of the cube."""
+
+MOST_THREADS = 8
+
+
+def live_problem(run: Run) -> str | None:
+    """Say in one sentence why nothing can be computed live for a run; None if it can."""
+    if run.spec.recorded is not None:
+        return (
+            f"the drive of {run.name} is the recording {run.spec.recorded.file}, and a live trajectory would "
+            "go on where it ends; make a run at its mean frequency."
+        )
+    try:
+        run.model.flow.system  # noqa: B018
+    except (ParameterError, ImportError) as error:
+        return str(error)
+    return None
+
+
+class LiveRun:
+    """A run as those who watch it share it.
+
+    Parameters
+    ----------
+    run
+        An opened run for which `live_problem` has nothing to say.
+    """
+
+    def __init__(self, run: Run) -> None:
+        problem = live_problem(run)
+        if problem is not None:
+            raise RequestError(problem)
+        self.run, self.model, self.spec = run, run.model, run.spec
+        self.integration = run.spec.integration
+        self.threads = max(1, min(os.cpu_count() or 1, MOST_THREADS))
+        self.pool = ThreadPoolExecutor(self.threads, "magpend-live")
+        self.region_lock = threading.Lock()
+        self._lock = threading.Lock()
+        self._catalogs: OrderedDict[tuple[float, ...], Catalog] = OrderedDict()
+        self._attractors: xr.Dataset | None = None
+        self._cube: xr.Dataset | None = None
+        self._warming = Warming(self)
+
+    def close(self) -> None:
+        """Give up the threads; jobs are cancelled by their sessions."""
+        self.pool.shutdown(wait=False, cancel_futures=True)
+
+    def warm(self, tell: Callable[[int, int], None] | None = None) -> None:
+        """Compile and read in the background what jobs need; `tell` hears how much of it is done."""
+        self._warming.begin(tell)
+
+    # ---- parameter points --------------------------------------------------------------------
+
+    def place(self, values: Mapping[str, float], frequency: float | None) -> Place:
+        """Return a parameter point; what is not given is the run's own.
+
+        Raises
+        ------
+        RequestError, ParameterError
+            If a name is unknown, or a value out of bounds.
+        """
+        parameters = self.spec.values.replace(**values)
+        hertz = self._frequency(frequency)
+        index = self._index(parameters, hertz)
+        if index is not None:  # the cube's own bits, whatever became of the last digit on the way
+            for axis, i in zip(parameter_axes(self.spec), index, strict=True):
+                if axis.parameter == FREQUENCY:
+                    hertz = float(axis.values[i])
+                else:
+                    parameters = parameters.replace(**{axis.parameter: float(axis.values[i])})
+        return Place(parameters, hertz, index)
+
+    def _frequency(self, given: float | None) -> float:
+        crossing = self.model.crossing
+        if crossing is not None:
+            return crossing.frequency_hz
+        axis = self.spec.axes.get(FREQUENCY)
+        own = self.spec.frequency_hz
+        if given is None:
+            if own is None:
+                raise RequestError(
+                    f"frequency: the run sweeps it; give one of {self.model.name}'s drive [Hz]."
+                )
+            return own
+        values = np.array([own]) if axis is None else axis.array()
+        low, high = float(values.min()) / FAR, float(values.max()) * FAR
+        if not low <= given <= high:
+            raise RequestError(f"frequency = {given:g} Hz: must be from {low:g} to {high:g} Hz here.")
+        return given
+
+    def _index(self, parameters: Mapping[str, float], frequency: float) -> tuple[int, ...] | None:
+        axes = parameter_axes(self.spec)
+        swept = {axis.parameter for axis in axes}
+        own = self.spec.values
+        if any(not _same(parameters[n], own[n]) for n in own if n not in swept):
+            return None
+        fixed = self.spec.frequency_hz
+        if FREQUENCY not in swept and fixed is not None and not _same(frequency, fixed):
+            return None
+        found = []
+        for axis in axes:
+            value = frequency if axis.parameter == FREQUENCY else parameters[axis.parameter]
+            i = int(np.abs(axis.values - value).argmin())
+            if not _same(value, float(axis.values[i])):
+                return None
+            found.append(i)
+        return tuple(found)
+
+    def state(self, values: Mapping[str, float], place: Place) -> np.ndarray:
+        """Return an initial state by name, 0 where nothing is given.
+
+        Raises
+        ------
+        RequestError
+            If the model has no such state.
+        """
+        names = self.model.state_names
+        unknown = [name for name in values if name not in names]
+        if unknown:
+            known = ", ".join(names)
+            raise RequestError(f"{unknown[0]!r} is no state of {self.model.name}; it has {known}.")
+        state = np.array([float(values.get(name, 0.0)) for name in names])
+        self.check_states(state[None], place)
+        return state
+
+    def check_states(self, states: np.ndarray, place: Place) -> None:
+        """Refuse states at which the equations of a model as text have no value; raises `SpecError`."""
+        point = {**place.parameters, FREQUENCY: place.frequency}
+        check_states(self.model.flow, states, [point])
+
+    # ---- attractors --------------------------------------------------------------------------
+
+    @property
+    def attractors(self) -> xr.Dataset | None:
+        """The run's attractors, if they are kept in ``derived/``; nothing is computed."""
+        with self._lock:
+            if self._attractors is None:
+                self._attractors = stored(self.run, "attractors")
+            return self._attractors
+
+    def catalog(self, place: Place) -> Catalog:
+        """Attractors of a parameter point as far as known; the same object for the same point."""
+        known = self._known(place)
+        key = (float(known.attractors is not None), *place.key)
+        with self._lock:
+            found = self._catalogs.get(key)
+        if found is None:
+            found = Catalog(place, known, self.integration.closure_tolerance)
+        with self._lock:
+            found = self._catalogs.setdefault(key, found)
+            self._catalogs.move_to_end(key)
+            while len(self._catalogs) > MOST_CATALOGS:
+                self._catalogs.popitem(last=False)
+        return found
+
+    def _known(self, place: Place) -> Known:
+        attractors = self.attractors
+        if attractors is None or place.index is None:
+            return Known(attractors)
+        dims = [axis_name(name) for name in self.spec.axes]
+        cells = self.cube.isel(dict(zip(dims, place.index, strict=True)))
+        return Known(attractors, cells, place.index)
+
+    @property
+    def cube(self) -> xr.Dataset:
+        """The run's cube, opened once."""
+        with self._lock:
+            if self._cube is None:
+                self._cube = self.run.cube()
+            return self._cube
+
+    def legend(self, catalog: Catalog) -> Legend:
+        """Names and colours of what trajectories of a point end on."""
+        return Legend(catalog, self.attractors)
+
+    def first_start(self) -> tuple[Place, np.ndarray]:
+        """A parameter point of the run, and a start there."""
+        cells = CellMap(self.spec)
+        block = tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
+        inputs = cells.inputs(block)
+        values = dict(zip(self.spec.values.names, map(float, inputs.parameters[0, 0]), strict=True))
+        frequency = None if self.model.crossing is not None else float(inputs.frequency_hz[0, 0])
+        return self.place(values, frequency), inputs.initial_states[0]
+
+
+def _same(a: float, b: float) -> bool:
+    return abs(a - b) <= SAME_VALUE * max(abs(a), abs(b))
+
+
+class Warming:
+    """Compiles what jobs need, once, in a thread of its own."""
+
+    def __init__(self, live: LiveRun) -> None:
+        self._live, self._lock = live, threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._done, self._listeners = 0, list[Callable[[int, int], None]]()
+        self._steps = (self._sections, self._series, self._maps, self._attractors)
+
+    def begin(self, tell: Callable[[int, int], None] | None) -> None:
+        """Begin unless that was done; `tell` hears of every step from now on."""
+        with self._lock:
+            if tell is not None and self._done < len(self._steps):
+                self._listeners.append(tell)
+            done, begun = self._done, self._thread is not None
+            if not begun:
+                self._thread = threading.Thread(target=self._run, name="magpend-warm", daemon=True)
+                self._thread.start()
+        if tell is not None:
+            tell(done, len(self._steps))
+
+    def _run(self) -> None:
+        for step in self._steps:
+            try:
+                step()
+            except Exception as error:  # a job that needs it will say what is wrong
+                LOG.info("warming: %s", error)
+            with self._lock:
+                self._done += 1
+                listeners = list(self._listeners)
+            for tell in listeners:
+                tell(self._done, len(self._steps))
+        with self._lock:
+            self._listeners.clear()
+
+    def _sections(self) -> None:
+        live = self._live
+        place, start = live.first_start()
+        flight = Flight(place, live.integration, start[None], lambda: None)
+        section, _ = flight.advance(np.array([0]), 1)
+        flight.closed(section, live.integration)
+
+    def _series(self) -> None:
+        live = self._live
+        place, start = live.first_start()
+        rtol, atol = live.integration.rtol, live.integration.atol
+        orbit_series(
+            place.parameters, place.frequency, start, 1, 0.01 / place.frequency, rtol=rtol, atol=atol
+        )
+
+    def _maps(self) -> None:
+        place, start = self._live.first_start()
+        packed, frequency = place.parameters.pack()[None], np.array([place.frequency])
+        section_map(packed, frequency, start[None], 1, system=self._live.model.system)
+
+    def _attractors(self) -> None:
+        place, _ = self._live.first_start()
+        self._live.catalog(place)
+
+
+class LiveSession:
+    """One who watches a run.
+
+    Parameters
+    ----------
+    live
+        What is shared with others.
+    emit
+        Takes an answer; called from threads of jobs, one call at a time for a kind of job.
+    """
+
+    def __init__(self, live: LiveRun, emit: Callable[[Answer], None]) -> None:
+        from pipeline.explorer import doing
+
+        self.live = live
+        self._emit, self._closed = emit, threading.Event()
+        self._desks = {kind: Desk(self._emit_open, work) for kind, work in doing.works(live).items()}
+        live.warm(self._tell_warming)
+
+    def _tell_warming(self, done: int, total: int) -> None:
+        self._emit_open({"id": None, "kind": "progress", "what": "warming", "done": done, "total": total})
+
+    def _emit_open(self, answer: Answer) -> None:
+        if not self._closed.is_set():
+            self._emit(answer)
+
+    def receive(self, text: str | bytes) -> None:
+        """Take a message; whatever is wrong with it is answered, and nothing is raised."""
+        try:
+            request: Request = read_request(text)
+        except RequestError as error:
+            self._emit_open({"id": error.job, "kind": "error", "error": str(error)})
+            return
+        except Exception as error:  # a message never ends the server
+            LOG.warning("message refused: %s", error)
+            self._emit_open({"id": None, "kind": "error", "error": "the message cannot be read."})
+            return
+        if isinstance(request, CancelRequest):
+            for desk in self._desks.values():
+                desk.cancel(request.job)
+            self._emit_open({"id": request.id, "kind": "done"})
+            return
+        self._desks[request.do].put(Job(request))
+
+    def close(self) -> None:
+        """Cancel all jobs; nothing is emitted from now on."""
+        self._closed.set()
+        for desk in self._desks.values():
+            desk.close()
+
+    def join(self, timeout: float = 30.0) -> None:
+        """Wait until no job is at work."""
+        for desk in self._desks.values():
+            desk.join(timeout)
+
+
+__all__ = ["LiveRun", "LiveSession", "live_problem"]

@@ -1,0 +1,168 @@
+"""What a page asks for over the live connection: read, bounded and refused in one sentence.
+
+A message is a JSON object with an ``id`` of the page's choice and ``do``, the name of a job; see the classes
+here. Nothing of it names a file.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+MOST_BYTES = 65_536
+"""Longest message [bytes]."""
+
+MOST_RESOLUTION, LEAST_RESOLUTION = 512, 16
+"""Finest and coarsest slice [cells along a side]."""
+
+MOST_PERIODS = 20_000
+"""Longest start [drive periods or returns]."""
+
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Values = Annotated[dict[Name, float], Field(max_length=200)]
+Pair = tuple[float, float]
+
+
+class RequestError(ValueError):
+    """A message cannot be taken.
+
+    Attributes
+    ----------
+    job : int or None
+        Its ``id``, if that could be read.
+    """
+
+    def __init__(self, sentence: str, job: int | None = None) -> None:
+        super().__init__(sentence)
+        self.job = job
+
+
+class Message(BaseModel):
+    """What all messages have: strict types, no unknown keys, no NaN and no infinity."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class Job(Message):
+    """A job of the page's number `id`."""
+
+    id: int = Field(ge=0, le=2**53)
+
+
+class StartRequest(Job):
+    """Integrate a start and say where it ends."""
+
+    do: Literal["start"]
+    parameters: Values = {}
+    frequency: float | None = Field(None, gt=0)
+    state: Values = {}
+    periods: int | None = Field(None, ge=1, le=MOST_PERIODS)
+
+
+class SliceRequest(Job):
+    """Say where the starts of a plane end."""
+
+    do: Literal["slice"]
+    parameters: Values = {}
+    frequency: float | None = Field(None, gt=0)
+    plane: tuple[Name, Name]
+    ranges: tuple[Pair, Pair]
+    fixed: Values = {}
+    resolution: int = Field(64, ge=LEAST_RESOLUTION, le=MOST_RESOLUTION)
+
+
+class CellPoint(Message):
+    """A kept section of a cell of the cube."""
+
+    cell: int = Field(ge=0, le=2**53)
+    point: int = Field(0, ge=0, le=2**53)
+
+
+class KeptOrbit(Message):
+    """An orbit that an earlier answer has named."""
+
+    orbit: int = Field(ge=0, le=2**53)
+
+
+class FollowRequest(Job):
+    """Follow a periodic orbit to another value of a parameter."""
+
+    do: Literal["follow"]
+    origin: CellPoint | KeptOrbit = Field(alias="from")
+    parameter: Name
+    value: float
+
+
+class Region(Message):
+    """A part of what a run has computed.
+
+    Attributes
+    ----------
+    x, y
+        Intervals in the units of the cube.
+    axes
+        Names of what `x` and `y` are intervals of: axes of the cube, or states of the starts; by default
+        `x` is of the axis that is walked, or of the first. What is neither, such as a diagram's vertical
+        axis, is left as it was.
+    at
+        Index on each other axis that the new run is to have one value of.
+    """
+
+    x: Pair
+    y: Pair | None = None
+    axes: tuple[Name, Name | None] | None = None
+    at: Annotated[dict[Name, int], Field(max_length=200)] = {}
+
+
+class RunRequest(Job, Region):
+    """Run the specification of a region."""
+
+    do: Literal["run"]
+
+
+class CancelRequest(Job):
+    """Cancel a job."""
+
+    do: Literal["cancel"]
+    job: int = Field(ge=0, le=2**53)
+
+
+Request = StartRequest | SliceRequest | FollowRequest | RunRequest | CancelRequest
+
+_READER: TypeAdapter[Request] = TypeAdapter(Annotated[Request, Field(discriminator="do")])
+
+
+def read_request(text: str | bytes) -> Request:
+    """Read a message.
+
+    Raises
+    ------
+    RequestError
+        With one sentence that says what is wrong with it.
+    """
+    if len(text) > MOST_BYTES:
+        raise RequestError(f"the message has {len(text)} bytes; {MOST_BYTES} are the most.")
+    try:
+        return _READER.validate_json(text)
+    except ValidationError as error:
+        raise RequestError(sentence_of(error), _number_in(text)) from None
+
+
+def sentence_of(error: ValidationError) -> str:
+    """One sentence for the first thing that is wrong."""
+    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    jobs = {"start", "slice", "follow", "run", "cancel"}
+    place = ".".join(str(part) for part in first["loc"] if str(part) not in jobs)[:200]
+    reason = str(first["msg"])[:300].rstrip(".")
+    return f"{place}: {reason}." if place else f"the message cannot be read: {reason}."
+
+
+def _number_in(text: str | bytes) -> int | None:
+    """The ``id`` of a message that is wrong in something else."""
+    try:
+        number = json.loads(text)["id"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return number if type(number) is int and 0 <= number <= 2**53 else None

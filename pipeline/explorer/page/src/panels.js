@@ -1,0 +1,160 @@
+// The panels beside the diagram: the orbit behind a point, moving; where starts lead; an orbit that is dragged.
+
+import { card, el, show } from "./dom.js";
+import { Clock } from "./clock.js";
+import { Follow } from "./follow.js";
+import { Machine } from "./machine.js";
+import { Multipliers } from "./multipliers.js";
+import { NO_LIVE, Plane } from "./plane.js";
+import { Orbit } from "./orbit.js";
+import { Portraits } from "./portrait.js";
+import { saveMenu } from "./save.js";
+import { Series } from "./series.js";
+import { showFacts } from "./facts.js";
+import { themeChanged } from "./theme.js";
+
+class Panels {
+  constructor(state, source, element, view) {
+    Object.assign(this, { state, source, element, view, live: source.live ?? null, orbit: null, own: null });
+    this.clock = new Clock();
+    this.asked = 0;
+    this.hint = el("p", { class: "hint", role: "status" });
+    this.grid = el("div", { class: "panels" });
+    element.replaceChildren(this.hint, this.grid);
+    this.build();
+    this.forget = [state.on(["selected"], () => this.select()), state.on(["dark"], themeChanged)];
+    this.select();
+  }
+
+  build() {
+    const { view, clock } = this;
+    const cards = {
+      facts: card("Orbit", "facts"), machine: card(view.model.drawing ? "Motion" : "Time", "machine"),
+      portraits: card("Phase portraits", "portraits"), series: card("Over time", "series"),
+      multipliers: card("Multipliers", "multipliers"), plane: card("Initial states", "plane"), follow: card("Drag a parameter", "follow"),
+    };
+    const stack = (...names) => el("div", { class: "stack" }, ...names.map((name) => cards[name].element));
+    this.grid.append(stack("facts", "machine", "follow"), stack("portraits", "multipliers"), stack("series", "plane"));
+    this.cards = cards;
+    this.machine = new Machine(cards.machine.body, view, clock);
+    this.portraits = new Portraits(cards.portraits.body, view, clock);
+    this.series = new Series(cards.series.body, view, clock);
+    this.multipliers = new Multipliers(cards.multipliers.body);
+    const starter = this.live && { start: (request, onPiece) => this.start(request, onPiece) };
+    this.plane = new Plane(cards.plane.body, view, this.state, this.source, starter);
+    if (this.live) this.follow = new Follow(cards.follow.body, view, this.live, { show: (orbit) => this.showFollowed(orbit), back: () => this.back() });
+    else cards.follow.body.append(el("p", { class: "note", text: NO_LIVE }));
+    this.addMenus();
+    this.reveal(false);
+  }
+
+  addMenus() {
+    const data = { kind: "orbit", query: () => this.state.get().selected }, { source } = this;
+    const name = (what) => () => `${this.view.name}-${what}${this.orbit?.attrs.cell ?? ""}`;
+    const menus = {
+      machine: this.view.model.drawing && { frames: () => [this.machine.frame] },
+      portraits: { frames: () => this.portraits.frames, data }, series: { frames: () => this.series.frames, data },
+      multipliers: { frames: () => [this.multipliers.frame] },
+      plane: { frames: () => [this.plane.frame], data: { kind: "plane", query: () => ({ at: this.plane.indices }) } },
+    };
+    for (const [key, menu] of Object.entries(menus)) {
+      const { element, heading } = this.cards[key];
+      if (menu) element.append(saveMenu({ title: heading.textContent, name: name(key), source, ...menu }));
+    }
+  }
+
+  reveal(isShown) {
+    show(this.grid, isShown);
+    if (isShown) this.say("");
+    else this.say("Click a point of the diagram, or choose one with the keyboard: its orbit is shown here.");
+  }
+
+  async select() {
+    const { selected } = this.state.get();
+    const asked = ++this.asked;
+    if (!selected) {
+      this.clock.pause();
+      this.reveal(false);
+      return;
+    }
+    this.grid.setAttribute("aria-busy", "true");
+    if (this.grid.hidden) this.say("Integrating the orbit …");
+    let packed;
+    try {
+      packed = await this.source.orbit(selected);
+    } catch (error) {
+      if (asked === this.asked) this.say(error.message);
+      return;
+    } finally {
+      if (asked === this.asked) this.grid.removeAttribute("aria-busy");
+    }
+    if (asked === this.asked) this.showOwn(new Orbit(packed, this.view.model), selected);
+  }
+
+  say(text) {
+    this.hint.textContent = text;
+    show(this.hint, Boolean(text));
+  }
+
+  /** Show an orbit of the run. */
+  showOwn(orbit, selected) {
+    [this.own, this.selected] = [orbit, selected];
+    this.reveal(true);
+    this.display(orbit, false);
+    this.plane.show(orbit);
+    this.follow?.show(orbit, selected);
+  }
+
+  /** Show an orbit that has been followed to another value. */
+  showFollowed(orbit) {
+    this.display(orbit, true);
+    this.plane.show(orbit, true);
+  }
+
+  back() {
+    if (this.own) this.showOwn(this.own, this.selected);
+  }
+
+  display(orbit, keepsTime) {
+    this.orbit = orbit;
+    showFacts(this.cards.facts.body, orbit, this.view);
+    this.portraits.show(orbit);
+    this.series.show(orbit);
+    this.multipliers.show(orbit);
+    this.machine.show(orbit, keepsTime);
+  }
+
+  /** Integrate a start; its pieces are shown in the portraits, and `onPiece` takes them as well. */
+  async start(request, onPiece) {
+    this.startJob?.cancel();
+    this.portraits.beginLive();
+    const job = this.live.job("start", request, (kind, packed) => {
+      if (job !== this.startJob || (kind !== "path" && kind !== "sections")) return;
+      const piece = new Orbit(packed, this.view.model);
+      this.portraits.addLive(kind, piece);
+      onPiece(kind, piece);
+    });
+    this.startJob = job;
+    return job.done;
+  }
+
+  destroy() {
+    this.asked = -1;
+    this.startJob?.cancel();
+    this.clock.pause();
+    for (const end of this.forget) end?.();
+    for (const part of [this.machine, this.portraits, this.series, this.multipliers, this.plane, this.follow]) part?.destroy();
+    this.element.replaceChildren();
+  }
+}
+
+/**
+ * Put the panels into an element; they follow `state.selected`.
+ * @param {Object} state of `createState`
+ * @param {Object} source
+ * @param {Element} element
+ * @returns {Promise<Panels>} `destroy()` takes them away
+ */
+export async function mountPanels(state, source, element) {
+  return new Panels(state, source, element, await source.view());
+}

@@ -1,0 +1,442 @@
+// The plane of initial states at a parameter value: where its starts lead, as far as that is computed. A slice
+// is computed while one watches; a click integrates that start.
+
+import { el, freshId, labelledSelect, show } from "./dom.js";
+import { extent, Frame } from "./frame.js";
+import { number } from "./facts.js";
+import { axisOf, indicesOf } from "./orbit.js";
+import { brokenLines } from "./wrapping.js";
+
+const RESOLUTIONS = [64, 128, 256, 512], COARSEST = 16;
+const TURN = 2 * Math.PI;
+export const NO_LIVE = "Live integration is off in this copy: open the run with magpend explore to integrate starts, compute slices and drag parameters.";
+
+export class Plane {
+  /**
+   * @param {Element} body
+   * @param {Object} view
+   * @param {Object} state of `createState`
+   * @param {Object} source
+   * @param {{start: function(Object, function): Promise<Object>}|null} starter integrates a start; null without a server
+   */
+  constructor(body, view, state, source, starter) {
+    Object.assign(this, { view, state, source, starter, live: source.live, orbit: null, map: null, job: null });
+    this.asked = 0;
+    this.paths = [];
+    this.dots = [];
+    this.cross = null;
+    this.pairs = view.planes?.length ? view.planes : [view.model.states.slice(0, 2).map((entry) => entry.name)];
+    this.pair = this.chosenPair();
+    this.build(body);
+    this.forget = [state.on(["plane"], () => this.choose(this.chosenPair()))];
+  }
+
+  destroy() {
+    this.job?.cancel();
+    for (const end of this.forget) end();
+    this.frame.destroy();
+  }
+
+  chosenPair() {
+    const wanted = this.state.get().plane?.states;
+    return this.pairs.find((pair) => wanted && pair[0] === wanted[0] && pair[1] === wanted[1]) ?? this.pairs[0];
+  }
+
+  // ---- what stands on the page -------------------------------------------------------------
+
+  build(body) {
+    this.body = body;
+    this.readout = el("output", { class: "readout" });
+    this.legend = el("ul", { class: "legend" });
+    this.told = el("p", { class: "note", role: "status" });
+    const options = this.pairs.map((pair, k) => [String(k), `${this.named(pair[1])} against ${this.named(pair[0])}`]);
+    this.chooser = labelledSelect("Plane", options, String(this.pairs.indexOf(this.pair)), (k) => this.state.set({ plane: { states: this.pairs[k] } }));
+    body.append(el("div", { class: "controls top" }, this.chooser.element));
+    show(this.chooser.element, this.pairs.length > 1);
+    this.frame = new Frame(body, { label: "", ratio: 0.8 });
+    this.frame.paintBack = (ctx, frame, colours) => this.paint(ctx, frame, colours);
+    this.frame.paintFront = (ctx, frame, colours) => this.paintCross(ctx, frame, colours);
+    body.append(this.readout, this.legend, this.told);
+    this.listen();
+    if (this.live) this.buildLive(body);
+    else body.append(el("p", { class: "note", text: NO_LIVE }));
+    this.dress();
+  }
+
+  buildLive(body) {
+    this.resolution = labelledSelect("Cells", RESOLUTIONS.map((n) => [String(n), `${n} × ${n}`]), "128", () => {});
+    this.compute = el("button", { type: "button", text: "Compute this slice", on: { click: () => this.slice() } });
+    this.stop = el("button", { type: "button", text: "Cancel", hidden: true, on: { click: () => this.job?.cancel() } });
+    this.progress = el("progress", { max: 1, value: 0, hidden: true, "aria-label": "Slice" });
+    this.bounds = el("div", { class: "bounds" });
+    const more = el("details", {}, el("summary", { text: "Bounds, and the other states" }), this.bounds);
+    body.append(el("div", { class: "controls" }, this.compute, this.resolution.element, this.stop), this.progress, more);
+  }
+
+  named(name) {
+    const found = this.view.model.states.find((entry) => entry.name === name);
+    return found?.label || name;
+  }
+
+  dress() {
+    this.frame.xAxis = axisOf(this.view.model, this.pair[0]);
+    this.frame.yAxis = axisOf(this.view.model, this.pair[1]);
+    const what = `Plane of initial states: ${this.named(this.pair[1])} against ${this.named(this.pair[0])}`;
+    this.frame.setLabel(this.live ? `${what}. Arrow keys move a cross, Enter integrates the start there.` : what);
+  }
+
+  // ---- which plane -------------------------------------------------------------------------
+
+  choose(pair) {
+    this.pair = pair;
+    this.chooser.select.value = String(this.pairs.indexOf(pair));
+    this.dress();
+    if (this.orbit) this.show(this.orbit, this.isFollowed);
+  }
+
+  /** Show the plane at the parameter values of an orbit; one that is followed has none in the run. */
+  async show(orbit, isFollowed = false) {
+    const asked = ++this.asked;
+    [this.orbit, this.isFollowed] = [orbit, isFollowed];
+    const place = JSON.stringify([orbit.attrs.parameters, orbit.attrs.frequency, this.pair]);
+    if (place === this.place) return;
+    this.place = place;
+    this.job?.cancel();
+    this.forgetStart();
+    this.take(null);
+    if (isFollowed) return;
+    let map = null, problem = "";
+    try {
+      map = mapOf(await this.source.plane({ at: indicesOf(orbit, this.view) }));
+    } catch (error) {
+      problem = error.message;
+    }
+    if (asked !== this.asked) return;
+    const fits = map && map.states.join() === this.pair.join();
+    this.take(fits ? map : null, problem);
+  }
+
+  take(map, problem = "") {
+    [this.map, this.below] = [map, null];
+    this.limits = map?.box ?? this.usualLimits();
+    this.frame.fit(...this.limits, 0);
+    this.fixed = this.usualFixed();
+    if (this.live) this.fillBounds();
+    this.image = map?.label ? imageOf(map) : null;
+    this.showLegend();
+    const missing = `Where starts of this plane lead is not computed here${this.live ? "" : "."}${this.live ? ": compute the slice, or click a start." : ""}`;
+    this.told.textContent = problem || (map ? sourceSentence(map) : missing);
+    this.frame.repaint();
+  }
+
+  usualLimits() {
+    return this.pair.flatMap((name) => {
+      const state = this.view.model.states.find((entry) => entry.name === name);
+      if (state?.angle) return [-Math.PI, Math.PI];
+      const values = this.orbit ? [...this.orbit.column(name), ...this.orbit.section(name)] : [0];
+      const low = Math.min(...values), high = Math.max(...values), middle = (low + high) / 2;
+      const half = Math.max(high - low, 0.5 * (state?.scale ?? 1)) * 0.9;
+      return [middle - half, middle + half];
+    });
+  }
+
+  usualFixed() {
+    const fixed = {};
+    for (const { name } of this.view.model.states) {
+      if (this.pair.includes(name)) continue;
+      const section = this.orbit?.section(name);
+      fixed[name] = this.map?.fixed?.[name] ?? (this.view.model.forced ? 0 : section?.[0] ?? 0);
+    }
+    return fixed;
+  }
+
+  fillBounds() {
+    const field = (text, value, change) => {
+      const id = freshId("number");
+      const input = el("input", { id, type: "number", step: "any", value: Number(value.toPrecision(6)), on: {
+        change: () => Number.isFinite(input.valueAsNumber) && change(input.valueAsNumber),
+      } });
+      return el("span", { class: "field" }, el("label", { for: id, text }), input);
+    };
+    const bound = (k) => (value) => {
+      const limits = [...this.limits];
+      limits[k] = value;
+      if (limits[0] < limits[1] && limits[2] < limits[3]) this.frame.fit(...(this.limits = limits), 0);
+    };
+    const words = ["from", "to"];
+    const fields = this.limits.map((value, k) => field(`${this.named(this.pair[k >> 1])} ${words[k % 2]}`, value, bound(k)));
+    for (const [name, value] of Object.entries(this.fixed)) fields.push(field(this.named(name), value, (given) => (this.fixed[name] = given)));
+    this.bounds.replaceChildren(...fields);
+  }
+
+  // ---- painting ----------------------------------------------------------------------------
+
+  paint(ctx, frame, colours) {
+    if (this.image) {
+      const [x0, x1, y0, y1] = this.map.box;
+      ctx.imageSmoothingEnabled = false;
+      ctx.drawImage(this.image, frame.x(x0), frame.y(y1), frame.x(x1) - frame.x(x0), frame.y(y0) - frame.y(y1));
+    } else if (this.map?.dots) this.paintStarts(ctx, frame, colours);
+    for (const [x, y] of this.dots) {
+      ctx.beginPath();
+      ctx.arc(frame.x(x), frame.y(y), 3, 0, TURN);
+      ctx.fillStyle = colours.warn;
+      ctx.fill();
+    }
+    for (const [width, colour] of [[4, colours.card], [1.8, colours.ink]]) {
+      ctx.lineWidth = width;
+      ctx.strokeStyle = colour;
+      frame.trace(ctx, this.paths);
+      ctx.stroke();
+    }
+  }
+
+  paintStarts(ctx, frame, colours) {
+    const { u, v, dots } = this.map;
+    dots.forEach((id, i) => {
+      ctx.beginPath();
+      ctx.arc(frame.x(u[i]), frame.y(v[i]), 5, 0, TURN);
+      ctx.fillStyle = this.colourOf(id) ?? colours.card;
+      ctx.strokeStyle = colours.ink;
+      ctx.lineWidth = 1;
+      ctx.fill();
+      ctx.stroke();
+    });
+  }
+
+  colourOf(id) {
+    return this.map.labels.find((entry) => entry.id === id)?.colour ?? null;
+  }
+
+  paintCross(ctx, frame, colours) {
+    if (!this.cross) return;
+    const [px, py] = [frame.x(this.cross[0]), frame.y(this.cross[1])];
+    for (const [width, colour] of [[4, colours.card], [2, colours.ink]]) {
+      ctx.lineWidth = width;
+      ctx.strokeStyle = colour;
+      ctx.beginPath();
+      for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
+        ctx.moveTo(px + 3 * dx, py + 3 * dy);
+        ctx.lineTo(px + 11 * dx, py + 11 * dy);
+      }
+      ctx.stroke();
+    }
+  }
+
+  showLegend() {
+    if (!this.map) return this.legend.replaceChildren();
+    const counts = new Map();
+    for (const id of this.map.label ?? this.map.dots) if (id >= 0) counts.set(id, (counts.get(id) ?? 0) + 1);
+    const total = [...counts.values()].reduce((a, b) => a + b, 0);
+    const items = this.map.labels.filter((entry) => counts.has(entry.id)).map((entry) => {
+      const swatch = el("span", { class: "swatch", "aria-hidden": "true" });
+      swatch.style.background = entry.colour;
+      return el("li", {}, swatch, `${entry.label} (${((100 * counts.get(entry.id)) / total).toFixed(1)} %)`);
+    });
+    return this.legend.replaceChildren(...items);
+  }
+
+  // ---- pointing ----------------------------------------------------------------------------
+
+  listen() {
+    const { front } = this.frame;
+    this.frame.element.classList.add("takes-pointer");
+    front.addEventListener("pointermove", (event) => this.read(this.frame.at(event)));
+    if (!this.live) return;
+    front.tabIndex = 0;
+    front.setAttribute("role", "application");
+    front.addEventListener("click", (event) => {
+      const place = this.frame.at(event);
+      if (place) this.begin(place);
+    });
+    front.addEventListener("keydown", (event) => this.key(event));
+    front.addEventListener("focus", () => this.moveCross(0, 0));
+  }
+
+  key(event) {
+    const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+    if (event.key in steps) {
+      const [dx, dy] = steps[event.key].map((step) => step * (event.shiftKey ? 10 : 1));
+      this.moveCross(dx, dy);
+    } else if (event.key === "Enter" || event.key === " ") this.begin(this.cross);
+    else return;
+    event.preventDefault();
+  }
+
+  moveCross(dx, dy) {
+    if (!this.frame.limits) return;
+    const [x0, x1, y0, y1] = this.limits;
+    const [x, y] = this.cross ?? [(x0 + x1) / 2, (y0 + y1) / 2];
+    const held = (value, low, high) => Math.min(high, Math.max(low, value));
+    this.cross = [held(x + (dx * (x1 - x0)) / 100, x0, x1), held(y + (dy * (y1 - y0)) / 100, y0, y1)];
+    this.read(this.cross);
+    this.frame.refresh();
+  }
+
+  read(place) {
+    if (!place) return;
+    const [x, y] = place.map((value) => number(value));
+    const label = this.labelAt(place);
+    this.readout.textContent = `${this.named(this.pair[0])} = ${x}, ${this.named(this.pair[1])} = ${y}${label ? `: ${label}` : ""}`;
+  }
+
+  labelAt([x, y]) {
+    if (!this.map?.label) return "";
+    const id = idAt(this.map, x, y) ?? -1;
+    return this.map.labels.find((entry) => entry.id === (id < 0 && this.below ? idAt(this.below, x, y) : id))?.label ?? "";
+  }
+
+  // ---- computing ---------------------------------------------------------------------------
+
+  /** Indices of the axes at the orbit's parameter values, for what is kept of this plane. */
+  get indices() {
+    return this.orbit ? indicesOf(this.orbit, this.view) : {};
+  }
+
+  get point() {
+    return { parameters: this.orbit.attrs.parameters ?? {}, frequency: this.orbit.attrs.frequency ?? null };
+  }
+
+  /** Integrate the start at a place of the plane. */
+  async begin(place) {
+    if (!place || !this.orbit) return;
+    this.cross = place;
+    this.forgetStart();
+    const start = { ...this.fixed, [this.pair[0]]: place[0], [this.pair[1]]: place[1] };
+    this.told.textContent = "Integrating this start ...";
+    const begun = (this.begun = {});
+    try {
+      const end = await this.starter.start({ ...this.point, state: start }, (kind, piece) => begun === this.begun && this.add(kind, piece));
+      if (begun === this.begun && !end.cancelled) this.told.textContent = endSentence(end);
+    } catch (error) {
+      if (begun === this.begun) this.told.textContent = error.message;
+    }
+  }
+
+  forgetStart() {
+    this.begun = null;
+    [this.paths, this.dots] = [[], []];
+    this.frame.repaint();
+  }
+
+  /** Show a piece of a start that is being integrated. */
+  add(kind, piece) {
+    const [x, y] = this.pair.map((name, k) => this.around(kind === "path" ? piece.column(name) : piece.section(name), k));
+    if (kind === "path") {
+      const lines = brokenLines(x.values, y.values, x.wrapping, y.wrapping);
+      this.paths.push(...lines.map((line) => line.map((value, i) => value + (i % 2 ? y.middle : x.middle))));
+    } else {
+      const back = (value, { wrapping, middle }) => (wrapping.cut ? value - TURN * Math.floor((value + Math.PI) / TURN) : value) + middle;
+      for (let i = 0; i < x.values.length; i++) this.dots.push([back(x.values[i], x), back(y.values[i], y)]);
+      this.dots = this.dots.slice(-300);
+    }
+    this.frame.repaint();
+  }
+
+  /** Values of a plane's state from the middle of what is shown of it; of an angle, within half a turn. */
+  around(values, side) {
+    const { angle } = side ? this.frame.yAxis : this.frame.xAxis;
+    const middle = angle ? (this.limits[2 * side] + this.limits[2 * side + 1]) / 2 : 0;
+    return { values: values.map((value) => value - middle), wrapping: { shift: 0, cut: angle }, middle };
+  }
+
+  /** Compute the slice, low resolution first. */
+  async slice() {
+    if (!this.orbit) return;
+    const limits = this.limits, [x0, x1, y0, y1] = limits, resolution = Number(this.resolution.select.value);
+    const request = { ...this.point, plane: this.pair, ranges: [[x0, x1], [y0, y1]], fixed: this.fixed, resolution };
+    this.job?.cancel();
+    this.forgetStart();
+    this.working(true);
+    this.told.textContent = "Computing ...";
+    this.below = null;
+    const job = (this.job = this.live.job("slice", request, (kind, piece) => job === this.job && this.refine(kind, piece, resolution)));
+    try {
+      const end = await job.done;
+      if (job === this.job) this.told.textContent = end.cancelled ? "Cancelled; what was computed stays." : `Computed: ${resolution} × ${resolution} starts.`;
+    } catch (error) {
+      if (job === this.job) this.told.textContent = error.message;
+    }
+    if (job === this.job) this.working(false);
+  }
+
+  working(isWorking) {
+    if (!isWorking) this.job = null;
+    show(this.stop, isWorking);
+    show(this.progress, isWorking);
+    this.compute.disabled = isWorking;
+    if (isWorking) this.progress.removeAttribute("value");
+  }
+
+  refine(kind, piece, wanted) {
+    if (kind !== "slice") return;
+    const { resolution, share_done: share } = piece.attrs, before = resolution > COARSEST ? (resolution / 2) ** 2 : 0;
+    this.progress.value = (before + share * (resolution ** 2 - before)) / wanted ** 2;
+    this.map = mapOf({ ...piece, attrs: { ...piece.attrs, states: this.pair, fixed: this.fixed, source: "slice" } }, this.limits);
+    this.image = imageOf(this.map, this.below?.image);
+    if (share >= 1) this.below = { ...this.map, image: this.image };
+    this.showLegend();
+    if (resolution < wanted) this.told.textContent = `${resolution} × ${resolution} of ${wanted} × ${wanted} starts`;
+    this.frame.repaint();
+  }
+}
+
+/** What a plane holds: a grid of labels or single starts, and the box that they fill. */
+function mapOf({ attrs, arrays }, box = null) {
+  const { u, v, label, starts, start_label: ids } = arrays;
+  const common = { states: attrs.states, fixed: attrs.fixed ?? {}, labels: attrs.labels ?? [], source: attrs.source };
+  if (attrs.source && label?.length) return { ...common, u, v, label, box: box ?? [...edges(u), ...edges(v)] };
+  if (!ids?.length) return null;
+  const [su, sv] = [0, 1].map((k) => Array.from(ids, (_, i) => starts[2 * i + k]));
+  return { ...common, u: su, v: sv, dots: Array.from(ids), box: [...widened(su), ...widened(sv)] };
+}
+
+/** Id at a place of a grid of labels; null beyond it. */
+function idAt({ u, v, label, box: [x0, x1, y0, y1] }, x, y) {
+  const i = Math.floor(((x - x0) / (x1 - x0)) * u.length), j = Math.floor(((y - y0) / (y1 - y0)) * v.length);
+  return i < 0 || j < 0 || i >= u.length || j >= v.length ? null : label[j * u.length + i];
+}
+
+function widened(values) {
+  const [low, high] = extent(values), room = 0.08 * (high - low) || 0.5;
+  return [low - room, high + room];
+}
+
+/** Outer bounds of cells whose centres these are. */
+function edges(values) {
+  const n = values.length, first = values[0], last = values[n - 1];
+  const half = n > 1 ? (last - first) / (n - 1) / 2 : 0.5;
+  return [first - half, last + half];
+}
+
+/** Labels as colours, one pixel each; where there is none yet, what is `below` shines through. */
+function imageOf({ u, v, label, labels }, below = null) {
+  const [nu, nv] = [u.length, v.length];
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [nu, nv];
+  const ctx = canvas.getContext("2d");
+  ctx.imageSmoothingEnabled = false;
+  if (below) ctx.drawImage(below, 0, 0, nu, nv);
+  const image = ctx.getImageData(0, 0, nu, nv);
+  const colours = new Map(labels.map((entry) => [entry.id, [1, 3, 5].map((k) => parseInt(entry.colour.slice(k, k + 2), 16))]));
+  for (let j = 0; j < nv; j++) {
+    for (let i = 0; i < nu; i++) {
+      const colour = colours.get(label[j * nu + i]);
+      if (colour) image.data.set([...colour, 255], 4 * ((nv - 1 - j) * nu + i));
+    }
+  }
+  ctx.putImageData(image, 0, 0);
+  return canvas;
+}
+
+function sourceSentence({ source, fixed, u, v, dots }) {
+  const held = Object.entries(fixed).map(([name, value]) => `${name} = ${number(value)}`).join(", ");
+  const known = { basins: "Basins of attraction", starts: `The run's ${u.length} × ${v.length} starts` };
+  const what = dots ? `The run's ${dots.length} starts` : known[source] ?? source;
+  return held ? `${what}, at ${held}.` : `${what}.`;
+}
+
+function endSentence({ label, motion, status, periods, period }) {
+  const what = label ?? [period ? `period ${period}` : status, motion].filter(Boolean).join(", ");
+  return `This start ends on ${what}${periods ? `, after ${periods} periods` : ""}.`;
+}

@@ -1,0 +1,60 @@
+"""Symbols of models as plain text: what a page shows where nothing sets LaTeX."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+_GREEK = frozenset((
+    "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu",
+    "nu", "xi", "omicron", "pi", "rho", "sigma", "tau", "upsilon", "phi", "chi", "psi", "omega",
+))  # fmt: skip
+
+_SUBSCRIPTS = str.maketrans("0123456789+-aehijklmnoprstuvx", "₀₁₂₃₄₅₆₇₈₉₊₋ₐₑₕᵢⱼₖₗₘₙₒₚᵣₛₜᵤᵥₓ")
+
+_ACCENTS = {"dot": "\u0307", "ddot": "\u0308", "hat": "\u0302", "bar": "\u0304", "tilde": "\u0303"}
+
+_ACCENT = re.compile(r"\\(dot|ddot|hat|bar|tilde)\s*(?:\{([^{}]*)\}|(\\[A-Za-z]+|.))")
+_FONT = re.compile(r"\\(?:mathrm|mathit|mathbf|text|operatorname)\s*\{([^{}]*)\}")
+_SUBSCRIPT = re.compile(r"_(?:\{([^{}]*)\}|(.))")
+
+
+def _letter(name: str) -> str:
+    known = name.lower().removeprefix("var")
+    if known not in _GREEK:
+        return name
+    case = "SMALL" if name[0].islower() else "CAPITAL"
+    # Unicode spells lambda differently
+    found = unicodedata.lookup(f"GREEK {case} LETTER {'LAMDA' if known == 'lambda' else known.upper()}")
+    return found
+
+
+def plain(symbol: str, name: str) -> str:
+    r"""Write a symbol without LaTeX: Greek letters, accents and subscripts of Unicode.
+
+    Parameters
+    ----------
+    symbol
+        LaTeX without dollar signs; may be empty.
+    name
+        What stands there without a symbol.
+
+    Examples
+    --------
+    >>> plain(r"\dot{\theta}_1", "rate")
+    'θ̇₁'
+    """
+    if not symbol:
+        return name.replace("_", " ")
+    text = _FONT.sub(lambda found: found[1], symbol)
+    text = _ACCENT.sub(lambda found: f"{found[2] or found[3]}{{{_ACCENTS[found[1]]}}}", text)
+    text = re.sub(r"\\([A-Za-z]+)", lambda found: _letter(found[1]), text)
+    text = re.sub(r"\{([\u0300-\u036f])\}", r"\1", text)
+    return _SUBSCRIPT.sub(_lowered, text).replace("{", "").replace("}", "").strip()
+
+
+def _lowered(found: re.Match[str]) -> str:
+    """A subscript in small letters, if there are such for all of it."""
+    text = (found[1] if found[1] is not None else found[2]).replace(" ", "")
+    small = text.translate(_SUBSCRIPTS)
+    return small if all(a != b for a, b in zip(text, small, strict=True)) else f"_{text}"

@@ -1,0 +1,353 @@
+"""The explorer's server: answers one page on loopback from one run, which it only reads.
+
+Reading goes on in a few threads, so that the page stays at hand; what waits is bounded. `security` says who
+is answered.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import json
+import socket
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from tornado import httpserver, web
+
+from pipeline.explorer import page_html
+from pipeline.explorer.answers import ANSWERS, Answer, Query, first_answers
+from pipeline.explorer.explored import ExploredRun, ExplorerError
+from pipeline.explorer.live import LiveRun, live_problem
+from pipeline.explorer.security import Guard, Rate, headers_of, new_token
+from pipeline.explorer.socket import socket_routes
+from pipeline.spec.problems import SpecError
+from pipeline.store.errors import StoreError
+from pipeline.store.run import Run
+
+HOST = "127.0.0.1"
+
+MOST_BODY, MOST_HEADERS = 64 * 1024, 16 * 1024
+"""Bytes of a request."""
+
+MOST_ADDRESS = 4096
+"""Characters of an address: more is none that the page makes."""
+
+THREADS, MOST_WAITING = 3, 12
+"""Requests that are worked on at once, and those that may wait besides."""
+
+PER_SECOND, BURST = 40.0, 120
+"""Requests that are answered."""
+
+STATIC = {
+    "explorer.js": "text/javascript; charset=utf-8",
+    "explorer.css": "text/css; charset=utf-8",
+    "LICENSES.txt": "text/plain; charset=utf-8",
+}
+"""Files of the page, by name: no other is served, and none is looked up by what a request says."""
+
+
+def static_files() -> dict[str, tuple[bytes, str]]:
+    """Content and type of the page's files, read once."""
+    folder = resources.files("pipeline.explorer") / "static"
+    return {
+        name: ((folder / name).read_bytes(), kind)
+        for name, kind in STATIC.items()
+        if (folder / name).is_file()
+    }
+
+
+class Service:
+    """What the handlers share.
+
+    Parameters
+    ----------
+    run
+        What is looked at.
+    guard
+        Who is answered.
+    """
+
+    def __init__(self, run: Run, guard: Guard) -> None:
+        self.run = ExploredRun.of(run)
+        self.guard, self.rate = guard, Rate(PER_SECOND, BURST)
+        self.static = static_files()
+        self.live_problem = live_problem(self.run)
+        self.live = None if self.live_problem else LiveRun(self.run)
+        self.pool = ThreadPoolExecutor(THREADS, "explorer")
+        self.waiting = 0
+
+    def refresh(self) -> None:
+        """Look again at what stands in the directory: cells and analyses may have been added."""
+        self.run = self.run.refreshed()
+
+    def warm(self) -> None:
+        """Begin with what the page asks for first, while the browser starts."""
+        self.pool.submit(first_answers, self.run, self.live is not None)
+
+    async def work(self, function: Callable[[], Any]) -> Any:
+        """Call a function in a thread; raises `ExplorerError` if too many wait."""
+        if self.waiting >= THREADS + MOST_WAITING:
+            raise TooManyError("the server has more to do than it may; try again in a moment")
+        self.waiting += 1
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self.pool, function)
+        finally:
+            self.waiting -= 1
+
+    def close(self) -> None:
+        """Give up what is waiting."""
+        self.pool.shutdown(wait=False, cancel_futures=True)
+        if self.live is not None:
+            self.live.close()
+
+
+class TooManyError(ExplorerError):
+    """More is asked for than the server does at once."""
+
+
+class Handler(web.RequestHandler):
+    """What all handlers have in common."""
+
+    needs_token = True
+    service: Service
+
+    def initialize(self, service: Service) -> None:
+        """Take what the handlers share."""
+        self.service = service
+
+    def set_default_headers(self) -> None:
+        """Headers of every answer, errors too."""
+        service: Service | None = getattr(self, "service", None) or self.application.settings.get("service")
+        if service is not None:
+            for name, value in headers_of(service.guard.port).items():
+                self.set_header(name, value)
+
+    def prepare(self) -> None:
+        """Refuse before anything is done."""
+        guard, headers = self.service.guard, self.request.headers
+        if reason := guard.foreign(headers):
+            self.refuse(403, reason)
+        elif not self.service.rate.allows():
+            self.refuse(429, "too many requests; wait a moment")
+        elif len(self.request.uri or "") > MOST_ADDRESS:
+            self.refuse(414, "the address is too long")
+        elif self.needs_token and not guard.authorised(headers, self.get_query_argument("token", "")):
+            self.refuse(403, "the token is missing or wrong; use the address that magpend explore printed")
+
+    def refuse(self, status: int, sentence: str) -> None:
+        """Answer with one sentence, and end."""
+        self.set_status(status)
+        self.set_header("Content-Type", "application/json; charset=utf-8")
+        self.finish(json.dumps({"error": sentence}))
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        """Say what went wrong, without anything of the inside."""
+        self.refuse(status_code, self._reason)
+
+
+class PageHandler(Handler):
+    """The page itself."""
+
+    def refuse(self, status: int, sentence: str) -> None:
+        """Answer with a page that has one sentence: a person is reading."""
+        self.set_status(status)
+        self.set_header("Content-Type", "text/html; charset=utf-8")
+        self.finish(page_html.note(sentence))
+
+    async def get(self) -> None:
+        """The page of the run."""
+        if "explorer.js" not in self.service.static:
+            self.refuse(500, "the page's script is not installed: install magpend again")
+            return
+        self.set_header("Content-Type", "text/html; charset=utf-8")
+        self.finish(page_html.page(self.service.run.info.title, self.service.guard.token))
+
+
+class StaticHandler(Handler):
+    """The page's script and style, which are no secret."""
+
+    needs_token = False
+
+    async def get(self, name: str) -> None:
+        """One of `STATIC`."""
+        if name not in self.service.static:
+            self.refuse(404, "there is no such file")
+            return
+        content, kind = self.service.static[name]
+        self.set_header("Content-Type", kind)
+        self.finish(content)
+
+
+class ApiHandler(Handler):
+    """One kind of answer."""
+
+    answer: Answer
+
+    def initialize(self, service: Service, answer: Answer) -> None:  # type: ignore[override]
+        """Take what the handlers share, and what is answered."""
+        self.service, self.answer = service, answer
+
+    async def get(self) -> None:
+        """Answer from what the address says."""
+        if self.answer.method != "GET":
+            self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
+            return
+        await self._reply(b"")
+
+    async def post(self) -> None:
+        """Answer from what the body says."""
+        if self.answer.method != "POST":
+            self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
+            return
+        await self._reply(self.request.body)
+
+    async def _reply(self, body: bytes) -> None:
+        query = Query(
+            {k: v[-1].decode("utf-8", "replace") for k, v in self.request.query_arguments.items()}, body
+        )
+        service, answer = self.service, self.answer
+
+        def work() -> Any:
+            if answer.fresh:
+                service.refresh()
+            return answer.give(service.run, query, service.live is not None)
+
+        try:
+            reply = await service.work(work)
+        except TooManyError as error:
+            self.refuse(429, str(error))
+        except (StoreError, OSError) as error:
+            self.refuse(500, str(error))
+        except SpecError as error:
+            self.refuse(400, " ".join(error.problems))
+        except (ValueError, ArithmeticError) as error:
+            self.refuse(400, str(error))
+        else:
+            self.set_header("Content-Type", reply.kind)
+            if reply.filename:
+                self.set_header("Content-Disposition", f'attachment; filename="{reply.filename}"')
+            with contextlib.suppress(Exception):  # whoever asked has gone
+                await self.finish(reply.content)
+
+
+class NothingHandler(Handler):
+    """Everything else."""
+
+    def prepare(self) -> None:
+        """Refuse, and say no more than that there is nothing."""
+        super().prepare()
+        if not self._finished:
+            self.refuse(404, "there is no such page")
+
+
+def application(service: Service) -> web.Application:
+    """Return what answers requests for a run."""
+    shared = {"service": service}
+    routes: list[Any] = [
+        (r"/", PageHandler, shared),
+        (r"/static/([A-Za-z.]+)", StaticHandler, shared),
+        *((rf"/api/{name}", ApiHandler, {**shared, "answer": a}) for name, a in ANSWERS.items()),
+        *_live_routes(service),
+    ]
+    return web.Application(
+        routes, default_handler_class=NothingHandler, default_handler_args=shared, service=service,
+        compress_response=False, log_function=lambda handler: None,
+    )  # fmt: skip
+
+
+def _live_routes(service: Service) -> list[Any]:
+    """The websocket of live computing, where the run allows any."""
+    if service.live is None:
+        return []
+
+    def authorised(handler: web.RequestHandler) -> bool:
+        headers, guard = handler.request.headers, service.guard
+        token = handler.get_query_argument("token", "")
+        return guard.foreign(headers) is None and guard.authorised(headers, token)
+
+    return socket_routes(service.live, authorised)
+
+
+def listening(port: int) -> socket.socket:
+    """Return a socket on loopback.
+
+    Raises
+    ------
+    SpecError
+        If the port is taken or not ours to take.
+    """
+    if not 0 <= port <= 65535:
+        raise SpecError([f"--port {port}: must be 0 to 65535; 0 takes a free one."])
+    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        found.bind((HOST, port))
+        found.listen(64)
+        found.setblocking(False)
+    except OSError as error:
+        found.close()
+        reason = "is taken" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
+        raise SpecError([f"--port {port}: {reason}; give another one, or none for a free one."]) from None
+    return found
+
+
+def serve(
+    source: str | Path | Run,
+    port: int = 0,
+    *,
+    echo: Callable[[str], None],
+    opened: Callable[[str], None] | None = None,
+) -> None:
+    """Serve the page of a run until the process is stopped.
+
+    Parameters
+    ----------
+    source
+        Run directory, ``s3://BUCKET/PREFIX``, or an opened run.
+    port
+        On loopback; 0 takes a free one.
+    echo
+        Prints a line.
+    opened
+        Called with the address once the server answers, such as to open a browser.
+
+    Raises
+    ------
+    SpecError
+        If the port cannot be had.
+    RefusedError, DamagedError, UnreadableError
+        As `Run.open`.
+    """
+    run = Run.open(source)
+    taken = listening(port)
+    guard = Guard(new_token(), taken.getsockname()[1])
+    service = Service(run, guard)
+    try:
+        asyncio.run(_answer(service, taken, echo, opened))
+    finally:
+        service.close()
+        taken.close()
+
+
+async def _answer(
+    service: Service,
+    taken: socket.socket,
+    echo: Callable[[str], None],
+    opened: Callable[[str], None] | None,
+) -> None:
+    server = httpserver.HTTPServer(
+        application(service), max_body_size=MOST_BODY, max_header_size=MOST_HEADERS,
+        max_buffer_size=MOST_BODY + MOST_HEADERS, idle_connection_timeout=300.0, body_timeout=20.0,
+    )  # fmt: skip
+    server.add_socket(taken)
+    service.warm()
+    address = f"http://{HOST}:{service.guard.port}/?token={service.guard.token}"
+    echo(address)
+    if opened is not None:
+        opened(address)
+    await asyncio.Event().wait()
