@@ -133,6 +133,9 @@ class _Uncollected(event.Listener):
 
 event.register("numba:compiler_lock", _Uncollected())
 
+_PROCESS = os.urandom(6).hex()
+"""Is part of the name of every part that this process compiles."""
+
 _PARTS: dict[Any, tuple[Any, Any]] = {}
 """Parts by what they are made of, each with what must live as long: identities are in its key."""
 
@@ -159,7 +162,9 @@ def bound_part(
     values = tuple((name, _identity(value, names)) for name, value in used.items())
     key = template.__code__, id(template.__globals__), dissolves, short, values
     if key not in _PARTS:
-        function = specialise(template, "part", **used)
+        # numba tells functions of one name apart by a count that begins anew in every process: engines that
+        # several processes left in the cache would take each other's parts for their own
+        function = specialise(template, f"part_{os.getpid():x}_{_PROCESS}", **used)
         _PARTS[key] = part(function, dissolves, short), (template, used)
     return _PARTS[key][0]
 

@@ -3,6 +3,8 @@
 import dataclasses
 import gc
 import re
+import subprocess
+import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -168,3 +170,21 @@ def test_compilation__leaves_garbage_alone_and_the_collector_as_it_was():
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_bound_part__has_another_name_in_another_process():
+    """Machine code of two processes meets in the cache, and its functions are found by name.
+
+    An engine of one process took another's parts for its own, and wrote beside its arrays.
+    """
+    code = (
+        "from magpend_core.engine import jit, observers\n"
+        "print(jit.bound_part(observers.HELPERS and getattr(observers, observers.HELPERS[0]), {}, True)"
+        ".py_func.__qualname__)"
+    )
+    names = {
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    }
+    assert len(names) == 2
+    assert all(name.strip() for name in names)
