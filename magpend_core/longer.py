@@ -115,5 +115,5 @@ def _judge_of(system: System) -> Callable[..., None]:
         "SCALES": system.scales,
     }
     for key in observers.HELPERS:
-        bindings[key] = bound_part(getattr(observers, key), bindings, True, True)
+        bindings[key] = bound_part(getattr(observers, key), system.label, bindings, True, True)
     return kernel(specialise(judge, system.label, **bindings))

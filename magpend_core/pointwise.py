@@ -98,8 +98,8 @@ def _evaluator(system: System, kind: str) -> Any:
         "quantities": system.quantities,
     }
     label = f"{system.label}_{kind}"
-    bindings["_set_modes"] = bound_part(_set_modes, bindings, True)
-    bindings["quantity"] = bound_part(_KINDS[kind], bindings, True)
+    bindings["_set_modes"] = bound_part(_set_modes, label, bindings, True)
+    bindings["quantity"] = bound_part(_KINDS[kind], label, bindings, True)
     return kernel(specialise(_evaluate, label, **bindings), keeping(*system.functions))
 
 

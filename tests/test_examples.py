@@ -39,6 +39,7 @@ BOUNDED = {
     "driven-pendulum": {"num = 201": "num = 51"},
     "belt": {"step = 0.05": "step = 0.15", "num = 21": "num = 15"},
     "rossler": {"stop = 6.0, num = 281": "stop = 4.5, num = 81"},
+    "impact": {"num = 251": "num = 63"},
 }
 """What is changed in a workflow so that its run takes a second or two; the others run as they ship."""
 

@@ -133,16 +133,14 @@ class _Uncollected(event.Listener):
 
 event.register("numba:compiler_lock", _Uncollected())
 
-_PROCESS = os.urandom(6).hex()
-"""Is part of the name of every part that this process compiles."""
-
 _PARTS: dict[Any, tuple[Any, Any]] = {}
 """Parts by what they are made of, each with what must live as long: identities are in its key."""
 
 
 def bound_part(
-    template: Callable[..., Any], bindings: Mapping[str, Any], dissolves: bool, short: bool = False
-) -> Any:
+    template: Callable[..., Any], name: str, bindings: Mapping[str, Any], dissolves: bool,
+    short: bool = False,
+) -> Any:  # fmt: skip
     """Bind a template and compile it as a part; a part of the same template and values is the same one.
 
     Half of what an engine is made of knows no equations: where two engines agree in what a part uses, it is
@@ -152,6 +150,9 @@ def bound_part(
     ----------
     template
         A plain function; its free names in `bindings` are bound, the others are its module's.
+    name
+        Of the engine: one name, one content, also of what other processes have kept. Their machine code and
+        that of this process are linked by names, so that two parts of one name would be taken for each other.
     bindings
         More than it uses may be in there.
     dissolves, short
@@ -162,9 +163,7 @@ def bound_part(
     values = tuple((name, _identity(value, names)) for name, value in used.items())
     key = template.__code__, id(template.__globals__), dissolves, short, values
     if key not in _PARTS:
-        # numba tells functions of one name apart by a count that begins anew in every process: engines that
-        # several processes left in the cache would take each other's parts for their own
-        function = specialise(template, f"part_{os.getpid():x}_{_PROCESS}", **used)
+        function = specialise(template, name, **used)
         _PARTS[key] = part(function, dissolves, short), (template, used)
     return _PARTS[key][0]
 

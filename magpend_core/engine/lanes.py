@@ -760,6 +760,7 @@ def _layers_at(system: System) -> Callable[..., Any]:
 
 def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> dict[str, Any]:
     """Names that the templates of this module use, bound to a system and an observer."""
+    name = _name(system, observer, watched)
     bindings: dict[str, Any] = {
         "ROWS": rows_of(system, len(watched)),
         "WATCHES": len(watched) > 0,
@@ -800,9 +801,9 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
     }
     short = code_length(system.rhs) + code_length(system.forcing) <= UNROLLED_LENGTH
     for key in observers.HELPERS:
-        bindings[key] = bound_part(getattr(observers, key), bindings, True, short)
-    bindings["observe"] = bound_part(observer.observe, bindings, True, short)
-    bindings["renew"] = bound_part(observer.renew, bindings, True, short)
+        bindings[key] = bound_part(getattr(observers, key), name, bindings, True, short)
+    bindings["observe"] = bound_part(observer.observe, name, bindings, True, short)
+    bindings["renew"] = bound_part(observer.renew, name, bindings, True, short)
     templates: dict[str, Any] = {}
     for module in (event_templates, mode_templates):
         templates |= {key: getattr(module, key) for key in (*module.INLINE, *module.CALLED)}
@@ -813,7 +814,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         templates["squared_error"] = squared_error_of_two
     dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *_INLINE}
     for key, template in templates.items():
-        bindings[key] = bound_part(template, bindings, key in dissolving, short)
+        bindings[key] = bound_part(template, name, bindings, key in dissolving, short)
     return bindings
 
 

@@ -282,5 +282,5 @@ def sampler_of(system: System) -> Callable[..., None]:
     """Compile `follow_all` for a system."""
     bindings = engine_bindings(replace(system, method="dopri5"), RECORD)
     for key in (*_INLINE, *_CALLED):
-        bindings[key] = bound_part(globals()[key], bindings, key in _INLINE)
+        bindings[key] = bound_part(globals()[key], system.label, bindings, key in _INLINE)
     return kernel(specialise(follow_all, system.label, **bindings), keeping(*system.functions))

@@ -19,6 +19,7 @@ from pipeline.cli.common import EXIT_HELP, CommandError
 from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
 from pipeline.cli.explore import explore
+from pipeline.cli.export import export
 from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup
 from pipeline.cli.identify import identify_app
@@ -29,6 +30,8 @@ from pipeline.cli.models import models, presets
 from pipeline.cli.options import speaking
 from pipeline.cli.plot import plot_app
 from pipeline.cli.recordings import recordings_app
+from pipeline.cli.report import report
+from pipeline.cli.reproduce import reproduce
 from pipeline.cli.running import run, status, verify
 from pipeline.cli.simulate import EXTRA, simulate
 from pipeline.cli.submit import submit
@@ -65,8 +68,8 @@ def _main(
 
 for _command, _settings in (
     (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
-    (animate, EXTRA), (explore, {}), (models, {}),
-    (presets, {}), (fit_magnet, {}),
+    (explore, {}), (export, {}), (animate, EXTRA), (report, {}), (reproduce, {}),
+    (models, {}), (presets, {}), (fit_magnet, {}),
 ):  # fmt: skip
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
 app.add_typer(analyse_app, name="analyse")

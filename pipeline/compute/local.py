@@ -57,6 +57,11 @@ NO_PAGES: dict[str, Any] = {"distributed.scheduler.http.routes": []}
 _scratch_folders: set[Path] = set()
 
 
+def memory_per_worker(n_workers: int) -> float:
+    """Share of the machine's memory at which a worker is ended, before the system ends anything."""
+    return 1.0 / n_workers
+
+
 @contextlib.contextmanager
 def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
     """Yield a cluster of single-threaded processes, reachable with its own keys alone.
@@ -85,7 +90,7 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
             cluster = LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=0,
                 threads_per_worker=1,
-                memory_limit=1.0 / n_workers,
+                memory_limit=memory_per_worker(n_workers),
                 processes=True,
                 host="127.0.0.1",
                 protocol="tls",

@@ -1,11 +1,11 @@
 """What attracts at a parameter point, as far as it is known, and which of it a live trajectory has reached.
 
 Where the run's attractors are kept in ``derived/``, those of the point are taken from there with their ids,
-and a trajectory is matched as `pipeline.analysis.attractors` matches the cube's cells: closed or on its way to
-a polished orbit (`deciding.decide`), at an equilibrium, on a limit cycle, or one of a bounded set by the boxes
-that its sections occupy. What closes elsewhere is polished and becomes an entry of its own, without an id: so
-live trajectories are told apart by the same rules where no analysis was made. There is no search for bounded
-sets then; bounded cells have one entry for each motion that the model's classifier tells.
+and a trajectory is matched as `pipeline.analysis.attractors` matches the cube's cells: closed or on its way
+to a polished orbit (`deciding.decide`), at an equilibrium, on a limit cycle, or one of a bounded set by the
+boxes that its sections occupy. What closes elsewhere is polished and becomes an entry of its own, without
+an id: so live trajectories are told apart by the same rules where no analysis was made. There is no search
+for bounded sets then; bounded cells have one entry for each motion that the model's classifier tells.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from pipeline.layout.vocabulary import ABSENT, BOUNDED_SET, CLOSED_ORBIT, EQUILI
 from pipeline.products.attractors import IdentifyOptions
 
 MOST_ENTRIES = 64
-"""Attractors that are told apart besides those of the run; what closes elsewhere is told by its period alone."""
+"""Attractors told apart besides those of the run; what closes elsewhere is told by its period alone."""
 
 SAME_REST = 1e-5
 """Largest scaled distance between an equilibrium of the run and the same one found again."""
@@ -230,7 +230,7 @@ class Catalog:
         return numbers
 
     def _rest(self, block: Block, numbers: np.ndarray) -> Block:
-        """Tell cells at equilibria and on limit cycles of a flow, in place; returns the cells without them."""
+        """Tell cells at equilibria and on limit cycles of a flow, in place; returns cells without them."""
         point = self._point(_dataset_of(block, self.model))
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):
@@ -349,9 +349,7 @@ class Catalog:
         angles = np.flatnonzero(self._geometry.is_angle)
         turns = np.round((states[-1] - states[0])[angles] / (2.0 * np.pi)).astype(np.int64)
         place = self.place
-        return int(
-            features.sides_of(orbit.points[None], turns[None], place.frequency, place.parameters)[0]
-        )
+        return int(features.sides_of(orbit.points[None], turns[None], place.frequency, place.parameters)[0])
 
     def _point(self, cells: xr.Dataset) -> _WholePoint:
         return _WholePoint(
@@ -369,7 +367,7 @@ class _WholePoint(Point):
 
 
 def _finite(points: np.ndarray) -> np.ndarray:
-    return points[np.isfinite(points).all(axis=-1)]
+    return np.asarray(points[np.isfinite(points).all(axis=-1)])
 
 
 def _options_of(here: xr.Dataset | None) -> IdentifyOptions:

@@ -42,7 +42,8 @@ class Legend:
 
     def lines(self) -> list[dict[str, Any]]:
         """All entries: number, name, colour and the run's id, by number."""
-        new, found = 0, []
+        new = 0
+        found: list[dict[str, Any]] = []
         for entry in sorted(list(self._catalog.entries), key=lambda e: e.number):
             colour = self._colour(entry, new)
             new += entry.attractor is None and entry.kind != ABSENT
@@ -92,7 +93,9 @@ class Legend:
             return self._free[new % len(self._free)]
         motion = self.motion(entry.motion)
         # paler than any attractor's: a class of cells is none
-        return _pale(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)]) if motion else _grey("undecided")
+        return (
+            _pale(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)]) if motion else _grey("undecided")
+        )
 
 
 def _status_word(status: int) -> str:

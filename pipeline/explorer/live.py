@@ -1,9 +1,9 @@
 """What is computed while one watches: starts, slices, orbits that follow a parameter, runs of a region.
 
-`LiveRun` is what all who watch a run share: compiled code, the attractors of parameter points, threads for the
-kernel. `LiveSession` is one of those who watch: it takes messages (see `messages`) and gives answers to a
-callback, dictionaries for JSON and bytes of `arrays.pack_arrays`. There is one job of a kind at a time; a newer
-one takes the place of the one before. Neither knows how messages travel.
+`LiveRun` is what all who watch a run share: compiled code, the attractors of parameter points, threads for
+the kernel. `LiveSession` is one of those who watch: it takes messages (see `messages`) and gives answers to
+a callback, dictionaries for JSON and bytes of `arrays.pack_arrays`. There is one job of a kind at a time; a
+newer one takes the place of the one before. Neither knows how messages travel.
 """
 
 from __future__ import annotations
@@ -14,20 +14,18 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from magpend_core.models.parameters import ParameterError
 from magpend_core.orbits import section_map
-from pipeline.explorer.arrays import pack_arrays
 from pipeline.explorer.catalog import Catalog, Known
-from pipeline.explorer.jobs import Answer, Desk, Job, sentence_of_error
+from pipeline.explorer.jobs import Answer, Desk, Job
 from pipeline.explorer.legend import Legend
 from pipeline.explorer.messages import CancelRequest, Request, RequestError, read_request
 from pipeline.explorer.series import orbit_series
-from pipeline.explorer.settling import Flight, Place, system_at
+from pipeline.explorer.settling import Flight, Place
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.domains import check_states
 from pipeline.layout.vocabulary import axis_name
@@ -80,6 +78,7 @@ class LiveRun:
         self.integration = run.spec.integration
         self.threads = max(1, min(os.cpu_count() or 1, MOST_THREADS))
         self.pool = ThreadPoolExecutor(self.threads, "magpend-live")
+        self.region_lock = threading.Lock()
         self._lock = threading.Lock()
         self._catalogs: OrderedDict[tuple[float, ...], Catalog] = OrderedDict()
         self._attractors: xr.Dataset | None = None
@@ -123,7 +122,9 @@ class LiveRun:
         own = self.spec.frequency_hz
         if given is None:
             if own is None:
-                raise RequestError(f"frequency: the run sweeps it; give one of {self.model.name}'s drive [Hz].")
+                raise RequestError(
+                    f"frequency: the run sweeps it; give one of {self.model.name}'s drive [Hz]."
+                )
             return own
         values = np.array([own]) if axis is None else axis.array()
         low, high = float(values.min()) / FAR, float(values.max()) * FAR
@@ -276,7 +277,9 @@ class Warming:
         live = self._live
         place, start = live.first_start()
         rtol, atol = live.integration.rtol, live.integration.atol
-        orbit_series(place.parameters, place.frequency, start, 1, 0.01 / place.frequency, rtol=rtol, atol=atol)
+        orbit_series(
+            place.parameters, place.frequency, start, 1, 0.01 / place.frequency, rtol=rtol, atol=atol
+        )
 
     def _maps(self) -> None:
         place, start = self._live.first_start()
@@ -344,4 +347,4 @@ class LiveSession:
             desk.join(timeout)
 
 
-__all__ = ["LiveRun", "LiveSession", "live_problem", "pack_arrays", "sentence_of_error", "system_at"]
+__all__ = ["LiveRun", "LiveSession", "live_problem"]

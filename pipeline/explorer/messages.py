@@ -103,9 +103,9 @@ class Region(Message):
     x, y
         Intervals in the units of the cube.
     axes
-        Names of what `x` and `y` are intervals of: axes of the cube, or states of the starts; by default `x` is
-        of the axis that is walked, or of the first. What is neither, such as a diagram's vertical axis, is left
-        as it was.
+        Names of what `x` and `y` are intervals of: axes of the cube, or states of the starts; by default
+        `x` is of the axis that is walked, or of the first. What is neither, such as a diagram's vertical
+        axis, is left as it was.
     at
         Index on each other axis that the new run is to have one value of.
     """

@@ -20,7 +20,7 @@ from typing import Any
 from tornado import httpserver, web
 
 from pipeline.explorer import page_html
-from pipeline.explorer.answers import ANSWERS, Answer, Query
+from pipeline.explorer.answers import ANSWERS, Answer, Query, first_answers
 from pipeline.explorer.explored import ExploredRun, ExplorerError
 from pipeline.explorer.live import LiveRun, live_problem
 from pipeline.explorer.security import Guard, Rate, headers_of, new_token
@@ -73,7 +73,6 @@ class Service:
     """
 
     def __init__(self, run: Run, guard: Guard) -> None:
-        self._source: Any = run.info.files
         self.run = ExploredRun.of(run)
         self.guard, self.rate = guard, Rate(PER_SECOND, BURST)
         self.static = static_files()
@@ -84,7 +83,11 @@ class Service:
 
     def refresh(self) -> None:
         """Look again at what stands in the directory: cells and analyses may have been added."""
-        self.run = ExploredRun.of(Run.open(self._source))
+        self.run = self.run.refreshed()
+
+    def warm(self) -> None:
+        """Begin with what the page asks for first, while the browser starts."""
+        self.pool.submit(first_answers, self.run, self.live is not None)
 
     async def work(self, function: Callable[[], Any]) -> Any:
         """Call a function in a thread; raises `ExplorerError` if too many wait."""
@@ -342,6 +345,7 @@ async def _answer(
         max_buffer_size=MOST_BODY + MOST_HEADERS, idle_connection_timeout=300.0, body_timeout=20.0,
     )  # fmt: skip
     server.add_socket(taken)
+    service.warm()
     address = f"http://{HOST}:{service.guard.port}/?token={service.guard.token}"
     echo(address)
     if opened is not None:

@@ -151,9 +151,7 @@ class Flight:
             max_orbit_period=integration.max_orbit_period, system=self._system,
         )  # fmt: skip
 
-    def block(
-        self, rows: np.ndarray, section: np.ndarray, turns: np.ndarray, period: np.ndarray
-    ) -> Block:
+    def block(self, rows: np.ndarray, section: np.ndarray, turns: np.ndarray, period: np.ndarray) -> Block:
         """Cells as the analyses take them; what ended is what it is in the cube."""
         status = self.status[rows].copy()
         kept = status == Status.BOUNDED
@@ -168,9 +166,7 @@ Tell = Callable[[np.ndarray, int], None]
 """Is given new sections (k, n_states), and the number of periods done."""
 
 
-def run_start(
-    flight: Flight, integration: Integration, tell: Tell, periods: int | None = None
-) -> Block:
+def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int | None = None) -> Block:
     """Integrate one start as the run integrates its own cells; its sections are told as they come.
 
     Parameters
@@ -188,7 +184,8 @@ def run_start(
     n_transient = integration.n_transient if periods is None else periods - n_keep
     if n_keep > MOST_KEPT:
         raise RequestError(
-            f"the run keeps {n_keep} sections of each cell, and a live start at most {MOST_KEPT}; give periods."
+            f"the run keeps {n_keep} sections of each cell, and a live start at most {MOST_KEPT}; give "
+            "periods."
         )
     only, early = np.array([0]), integration.stop_when_closed
     window = window_of(integration.max_orbit_period)
@@ -290,8 +287,8 @@ def settle_cells(
 ) -> np.ndarray:
     """Entry on which each start ends.
 
-    A cell is given up as soon as it is on an orbit that is known, or certain to end there; the others go on for
-    as long as the run's own cells, and then on as the analysis of attractors runs them on.
+    A cell is given up as soon as it is on an orbit that is known, or certain to end there; the others go on
+    for as long as the run's own cells, and then on as the analysis of attractors runs them on.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """A plane of initial states while one watches: where its starts end, coarse first, then finer.
 
-The cells of the finest grid are squares of the plane, and the starts their centres. A coarser grid takes every
-second, fourth, ... of these starts, so that a finer one computes only what lies between. What a start ends on is
-told by `catalog`: by the run's attractors where they are known, else by the closed orbits that are met, and for
-what does not close by its motion.
+The cells of the finest grid are squares of the plane, and the starts their centres. A coarser grid takes
+every second, fourth, ... of these starts, so that a finer one computes only what lies between. What a start
+ends on is told by `catalog`: by the run's attractors where they are known, else by the closed orbits that
+are met, and for what does not close by its motion.
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ class _Grid:
         What each ends on, rows by the second state; `NOT_YET` before.
     """
 
-    def __init__(self, columns: tuple[int, int], base: np.ndarray, axes: tuple[np.ndarray, np.ndarray]) -> None:
+    def __init__(
+        self, columns: tuple[int, int], base: np.ndarray, axes: tuple[np.ndarray, np.ndarray]
+    ) -> None:
         self._columns, self._base, self.axes = columns, base, axes
         self.n = len(axes[0])
         self.labels = np.full((self.n, self.n), NOT_YET, np.int32)
@@ -83,7 +85,9 @@ class _Grid:
         axes = []
         for name, (low, high) in zip(request.plane, request.ranges, strict=True):
             if not low < high:
-                raise RequestError(f"ranges: that of {name} is {low:g} to {high:g}; the second must be greater.")
+                raise RequestError(
+                    f"ranges: that of {name} is {low:g} to {high:g}; the second must be greater."
+                )
             axes.append(low + (high - low) * ((np.arange(n) + 0.5) / n))
         base = live.state({k: v for k, v in request.fixed.items() if k not in request.plane}, place)
         grid = cls((names.index(request.plane[0]), names.index(request.plane[1])), base, (axes[0], axes[1]))
@@ -133,7 +137,9 @@ class _Slice:
         total, done, shown = len(rows), 0, time.perf_counter()
         parts = [slice(i, i + BATCH) for i in range(0, total, BATCH)]
         if n == LEAST_RESOLUTION and parts:  # alone, so that the others find the attractors that it meets
-            self._take(parts[0], rows, columns, self._settle(self._grid.starts(rows[parts[0]], columns[parts[0]])))
+            self._take(
+                parts[0], rows, columns, self._settle(self._grid.starts(rows[parts[0]], columns[parts[0]]))
+            )
             done = len(rows[parts[0]])
             parts = parts[1:]
         at_work: dict[Future[np.ndarray], slice] = {}

@@ -122,7 +122,7 @@ def _chosen(ds: xr.Dataset, max_period: int | None) -> list[int]:
 def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
     """Draw branches and mark their bifurcations; return the names of these."""
     for i in chosen:
-        for x, y, stable in _pieces(ds, i, measure):
+        for x, y, stable in pieces(ds, i, measure):
             ax.plot(x, y, scalex=scale, scaley=scale, **(_STABLE if stable else _UNSTABLE))
     return _mark(ax, ds, chosen, measure, scale)
 
@@ -135,7 +135,7 @@ def _stored(ds: xr.Dataset) -> xr.Dataset:
     )
 
 
-def _pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
+def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
     """Polylines of one stability of a branch, one for each point of the orbit, cut where an angle wraps."""
     n = int(ds["n_points"][branch])
     period = int(ds["orbit_period"][branch])

@@ -150,32 +150,35 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
     Returns
     -------
     Dataset or None
-        In memory: the result for the default options if that is kept, else any other that is sound and of
-        these cells and this version of the code; None if there is none.
+        In memory: of the sound results of these cells and this version of the code that with the fewest
+        options other than by default, the first by its name among equals; None if there is none.
     """
     run = Run.open(source)
     folder = run.info.files.below(DERIVED)
-    current = {"cube_digest": run.digest, "analysis_version": code_version(name), "derived_product": name}
-    found: xr.Dataset | None = None
-    for place in sorted(products_in(folder), key=lambda place: place.name):
-        try:
-            attrs = read_product_attrs(place)
-            if any(attrs.get(key) != value for key, value in current.items()):
-                continue
-            if found is None or attrs.get("derived_key") == _default_key(run, name):
-                found = _placed(open_product(place), place)
-        except (DamagedError, FileNotFoundError):
-            continue
-    return found
-
-
-def _default_key(run: Run, name: str) -> str | None:
-    """Name of the result for the default options; None if the run has not what it takes."""
-    try:
-        options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {}))
-    except SpecError:
+    places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
+    if not places:  # then the version, which takes a moment, does not matter
         return None
-    return _key(run, ANALYSES[name], options)["derived_key"]
+    current = {"cube_digest": run.digest, "analysis_version": code_version(name), "derived_product": name}
+    found = []
+    for place in places:
+        with contextlib.suppress(DamagedError, FileNotFoundError):
+            attrs = read_product_attrs(place)
+            if all(attrs.get(key) == value for key, value in current.items()):
+                found.append((_changed_options(run, name, attrs), place.name, place))
+    for _, _, place in sorted(found, key=lambda entry: entry[:2]):
+        with contextlib.suppress(DamagedError, FileNotFoundError):
+            return _placed(open_product(place), place)
+    return None
+
+
+def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
+    """Number of options of a result that are other than by default."""
+    try:
+        options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {})).plain()
+    except SpecError:  # the run has not what they take
+        options = {}
+    given = json.loads(str(attrs.get("derived_options", "{}")))
+    return sum(options.get(key) != value for key, value in given.items())
 
 
 def _refuse_recorded(run: Run, name: str) -> None:

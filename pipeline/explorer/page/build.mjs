@@ -10,7 +10,7 @@ const here = dirname(fileURLToPath(import.meta.url));
 const STATIC = join(here, "..", "static");
 
 /** What each script of the page begins with. */
-const ENTRIES = { explorer: "src/main.js" };
+const ENTRIES = { explorer: "src/main.js", "explorer-folder": "src/main-folder.js" };
 
 /** Style sheets in the order in which they apply. */
 const STYLES = ["explorer.css", "panels.css"];
@@ -21,6 +21,8 @@ const VENDORED = ["zarrita", "@zarrita/storage", "numcodecs", "reference-spec-re
 const OPTIONS = {
   bundle: true, format: "iife", minify: true, target: ["es2022"], charset: "utf8", legalComments: "none",
   write: false, absWorkingDir: here, logLevel: "warning", metafile: true,
+  // WebAssembly of codecs that exported cubes do not use
+  alias: Object.fromEntries(["blosc", "lz4", "zstd"].map((codec) => [`numcodecs/${codec}`, "./src/other-codecs.js"])),
 };
 
 /** `import text from "worker:./x.js"` gives the bundled source of a worker: a page may make one only of a blob. */

@@ -3,8 +3,6 @@
 import dataclasses
 import gc
 import re
-import subprocess
-import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +11,11 @@ from numba.core.compiler_lock import global_compiler_lock
 
 import magpend_core
 from magpend_core import accelerations, sections
+from magpend_core.engine import jit
 from magpend_core.engine.jit import bound_part, is_covered, source_digest, specialise
+from magpend_core.engine.lanes import engine_bindings
+from magpend_core.engine.observers import RECORD
+from magpend_core.engine.variational import with_tangents
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 
 SCRIPT = """
@@ -147,16 +149,27 @@ def _shifted(w):
 
 
 def test_bound_part__is_shared_where_all_that_it_uses_agrees():
-    first = bound_part(_shifted, {"OFFSET": 7, "ROWS": _Rows(1, 2), "other": 1}, True)
-    assert bound_part(_shifted, {"OFFSET": 7, "ROWS": _Rows(1, 3), "other": 2}, True) is first
+    first = bound_part(_shifted, "first", {"OFFSET": 7, "ROWS": _Rows(1, 2), "other": 1}, True)
+    assert bound_part(_shifted, "first", {"OFFSET": 7, "ROWS": _Rows(1, 3), "other": 2}, True) is first
     for differs in (
         {"OFFSET": 7.0, "ROWS": _Rows(1, 2)}, {"OFFSET": True, "ROWS": _Rows(1, 2)},
         {"OFFSET": 7, "ROWS": _Rows(0, 2)}, {"OFFSET": np.array([7]), "ROWS": _Rows(1, 2)},
     ):  # fmt: skip
-        assert bound_part(_shifted, differs, True) is not first
-    assert bound_part(_shifted, {"OFFSET": 7, "ROWS": _Rows(1, 2)}, False) is not first
+        assert bound_part(_shifted, "first", differs, True) is not first
+    assert bound_part(_shifted, "first", {"OFFSET": 7, "ROWS": _Rows(1, 2)}, False) is not first
     zero, minus = ({"OFFSET": x, "ROWS": _Rows(1, 2)} for x in (0.0, -0.0))
-    assert bound_part(_shifted, zero, True) is not bound_part(_shifted, minus, True)
+    assert bound_part(_shifted, "first", zero, True) is not bound_part(_shifted, "first", minus, True)
+
+
+def test_bound_part__no_two_have_one_name(monkeypatch):
+    """Kept machine code and that of this process are linked by names: one name must be one content."""
+    monkeypatch.setattr(jit, "_PARTS", {})
+    for system in (PENDULUM_FITTED, with_tangents(PENDULUM_FITTED, 4)):
+        engine_bindings(system, RECORD)
+    parts = [part.py_func for part, _ in jit._PARTS.values()]
+    names = [f"{f.__module__}.{f.__qualname__}" for f in parts]
+    assert len(names) > 40
+    assert len(set(names)) == len(names)
 
 
 def test_compilation__leaves_garbage_alone_and_the_collector_as_it_was():
@@ -170,21 +183,3 @@ def test_compilation__leaves_garbage_alone_and_the_collector_as_it_was():
         assert not gc.isenabled()
     finally:
         gc.enable()
-
-
-def test_bound_part__has_another_name_in_another_process():
-    """Machine code of two processes meets in the cache, and its functions are found by name.
-
-    An engine of one process took another's parts for its own, and wrote beside its arrays.
-    """
-    code = (
-        "from magpend_core.engine import jit, observers\n"
-        "print(jit.bound_part(observers.HELPERS and getattr(observers, observers.HELPERS[0]), {}, True)"
-        ".py_func.__qualname__)"
-    )
-    names = {
-        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-        for _ in range(2)
-    }
-    assert len(names) == 2
-    assert all(name.strip() for name in names)

@@ -49,6 +49,16 @@ def hanging(folder: str, index: int, number: int = 0, unlucky: tuple = (), poiso
     return {"task": index}
 
 
+def greedy(folder: str, index: int, poison: tuple = ()) -> dict:
+    """Some tasks take all memory that there is."""
+    log(folder, index)
+    held = []
+    while index in poison and len(held) < 60:
+        held.append(b"x" * 50_000_000)
+        time.sleep(0.02)
+    return {"task": index}
+
+
 def slow(folder: str, index: int, seconds: float = 0.2) -> dict:
     log(folder, index)
     time.sleep(seconds)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.compute import clients, limits, window
+from pipeline.compute import clients, limits, local, window
 from pipeline.compute.addresses import SchedulerError
 from pipeline.compute.execute import run_tasks
 from pipeline.compute.limits import Limits
@@ -66,6 +66,19 @@ def test_workers__poison_kills_them_and_the_others_finish(faulty, tmp_path, monk
     assert sorted(found) == [0, 1, 2, 4, 5, 6, 7]
     assert list(failed.value.failed) == [3]
     assert 2 <= tries(tmp_path)[3] <= 4
+
+
+def test_workers__one_that_takes_all_memory_is_ended_before_the_machine_suffers(
+    faulty, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(clients, "ALLOWED_FAILURES", 1)
+    monkeypatch.setattr(local, "memory_per_worker", lambda n_workers: 900_000_000)
+    task = partial(faulty.greedy, str(tmp_path), poison=(1,))
+    found = []
+    results = run_tasks(task, range(4), seconds=one_second, workers=1)
+    with pytest.raises(TaskFailedError, match=r"^task 1: its worker died 2 times \(out of memory"):
+        found.extend(result["task"] for result in results)
+    assert sorted(found) == [0, 2, 3]
 
 
 def test_workers__one_that_is_stopped(faulty, tmp_path, monkeypatch):

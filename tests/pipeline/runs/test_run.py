@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
 import tomllib
 
 import numpy as np
+import psutil
 import pytest
 
 from magpend_core import load_preset, run_branches
@@ -226,6 +228,34 @@ def test_kill__resumed_run_has_the_same_bytes(uninterrupted, start, tmp_path, by
     assert not state(directory).complete
     assert run(spec, directory, workers=0, echo=silent).complete
     assert bytes_of(directory) == bytes_of(uninterrupted / kind)
+
+
+def workers_of(process):
+    """Processes that compute for a run: not the one that keeps track of shared resources."""
+    with contextlib.suppress(psutil.Error):
+        children = psutil.Process(process.pid).children(recursive=True)
+        return [child for child in children if any("spawn_main" in word for word in child.cmdline())]
+    return []
+
+
+def test_kill__of_workers_over_and_over_loses_nothing(uninterrupted, start, tmp_path, bytes_of):
+    """A worker dies with every second task that is committed; those that live and new ones do the rest."""
+    rng = np.random.default_rng(4)
+    spec, directory = uninterrupted / "sweep.toml", tmp_path / "run"
+    process = start("run", spec, "--out", directory, "--workers", 2)
+    killed = 0
+    for count in range(2, 20, 2):
+        wait_for_commits(process, directory, count)
+        if found := workers_of(process):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                found[rng.integers(len(found))].kill()
+                killed += 1
+    out, err = process.communicate(timeout=240)
+    assert killed >= 4
+    assert process.returncode == 0, (out, err)
+    assert "Traceback" not in err
+    assert state(directory).complete
+    assert bytes_of(directory) == bytes_of(uninterrupted / "sweep")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

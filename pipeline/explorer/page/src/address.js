@@ -5,11 +5,20 @@ export const KEPT = ["x", "y", "at", "colour", "window", "selected", "plane", "p
 
 const OVERLAYS = ["branches", "exponents", "fractions"];
 
+/** Name of the colouring in which all points are alike. */
+export const ONE = "one";
+
+// many starts in as many colours are a speckle: they begin in one
+function firstColour(view) {
+  const [first] = view.colours;
+  return first && !(first.name === "seed" && first.categories.length > 6) ? first.name : ONE;
+}
+
 /** What a view begins with. */
 export function defaults(view) {
   const path = view.axes.find((axis) => axis.path) ?? view.axes[0];
   return {
-    x: path?.name ?? null, y: view.verticals[0].name, at: atFor(view, path?.name, {}), colour: view.colours[0]?.name ?? null,
+    x: path?.name ?? null, y: view.verticals[0].name, at: atFor(view, path?.name, {}), colour: firstColour(view),
     window: null, selected: null, plane: null, panel: null, hidden: {},
     overlays: { branches: view.has.branches, exponents: view.has.lyapunov, fractions: view.has.attractors }, dark: null,
   };
@@ -58,7 +67,7 @@ export function fromAddress(text, view) {
   const among = (key, names) => (names.includes(query.get(key)) ? query.get(key) : state[key]);
   state.x = among("x", view.axes.map((axis) => axis.name));
   state.y = among("y", view.verticals.map((vertical) => vertical.name));
-  state.colour = among("colour", view.colours.map((colour) => colour.name));
+  state.colour = among("colour", [...view.colours.map((colour) => colour.name), ONE]);
   state.panel = query.get("panel") ?? state.panel;
   const given = {};
   for (const axis of view.axes) if (query.has(`at.${axis.name}`)) given[axis.name] = Number(query.get(`at.${axis.name}`));

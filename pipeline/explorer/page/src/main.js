@@ -2,6 +2,7 @@
 
 import { start } from "./app.js";
 import { LiveClient, liveAddress } from "./live.js";
+import { InlineSource } from "./source-inline.js";
 import { ServerSource } from "./source.js";
 
 const root = document.getElementById("app");
@@ -15,6 +16,7 @@ const SOURCES = {
     if (view?.live) source.live = new LiveClient(liveAddress(token));
     return source;
   },
+  inline: async () => new InlineSource(document),
 };
 
 SOURCES[mode]().then((source) => start(source, root));

@@ -12,7 +12,8 @@ export class Orbit {
     this.time = packed.arrays.time ?? new Float64Array(0);
     this.columns = new Map();
     split(packed, "states", model.states, this.columns);
-    split(packed, "quantities", model.quantities ?? [], this.columns);
+    const kept = packed.attrs.quantities?.map((name) => ({ name })) ?? model.quantities ?? [];
+    split(packed, "quantities", kept, this.columns);
     this.sections = new Map();
     split(packed, "section", model.states, this.sections);
     this.n = this.time.length;

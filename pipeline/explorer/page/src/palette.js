@@ -45,8 +45,8 @@ export function visible(hex, paper) {
   return hexOf(rgb);
 }
 
-/** Grey of points of no category. */
-const NONE = "#7f7f7f";
+/** Grey of points of no category, and the colour of all where they are not told apart. */
+const NONE = "#7f7f7f", ALL = "#0072b2";
 
 /**
  * Bytes red, green, blue, 255 of each cell; all 0 for one that is switched off.
@@ -63,7 +63,7 @@ export function bytesOf(codes, count, colouring, hidden, paper) {
     return (r | (g << 8) | (b << 16) | (255 << 24)) >>> 0;
   };
   const table = new Map((colouring?.categories ?? []).map(({ id, colour }) => [id, hidden.includes(id) ? 0 : word(colour)]));
-  const other = hidden.includes(-1) ? 0 : word(NONE);
+  const other = hidden.includes(-1) ? 0 : word(colouring ? NONE : ALL);
   for (let i = 0; i < count; i++) words[i] = codes ? (table.get(codes[i]) ?? other) : other;
   return bytes;
 }

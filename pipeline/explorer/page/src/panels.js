@@ -78,6 +78,7 @@ class Panels {
       return;
     }
     this.grid.setAttribute("aria-busy", "true");
+    if (this.grid.hidden) this.say("Integrating the orbit …");
     let packed;
     try {
       packed = await this.source.orbit(selected);

@@ -382,13 +382,13 @@ export class Plane {
 }
 
 /** What a plane holds: a grid of labels or single starts, and the box that they fill. */
-function mapOf({ attrs, arrays, shapes }, box = null) {
-  const { u, v, label } = arrays;
-  if (!attrs.source || !label?.length) return null;
-  const isGrid = shapes.label.length === 2;
-  const common = { states: attrs.states, fixed: attrs.fixed ?? {}, labels: attrs.labels ?? [], source: attrs.source, u, v };
-  if (isGrid) return { ...common, label, box: box ?? [...edges(u), ...edges(v)] };
-  return { ...common, dots: Array.from(label), box: [...widened(u), ...widened(v)] };
+function mapOf({ attrs, arrays }, box = null) {
+  const { u, v, label, starts, start_label: ids } = arrays;
+  const common = { states: attrs.states, fixed: attrs.fixed ?? {}, labels: attrs.labels ?? [], source: attrs.source };
+  if (attrs.source && label?.length) return { ...common, u, v, label, box: box ?? [...edges(u), ...edges(v)] };
+  if (!ids?.length) return null;
+  const [su, sv] = [0, 1].map((k) => Array.from(ids, (_, i) => starts[2 * i + k]));
+  return { ...common, u: su, v: sv, dots: Array.from(ids), box: [...widened(su), ...widened(sv)] };
 }
 
 /** Id at a place of a grid of labels; null beyond it. */
@@ -431,7 +431,8 @@ function imageOf({ u, v, label, labels }, below = null) {
 
 function sourceSentence({ source, fixed, u, v, dots }) {
   const held = Object.entries(fixed).map(([name, value]) => `${name} = ${number(value)}`).join(", ");
-  const what = { basins: "Basins of attraction", starts: dots ? `The run's ${dots.length} starts` : `The run's ${u.length} × ${v.length} starts` }[source] ?? source;
+  const known = { basins: "Basins of attraction", starts: `The run's ${u.length} × ${v.length} starts` };
+  const what = dots ? `The run's ${dots.length} starts` : known[source] ?? source;
   return held ? `${what}, at ${held}.` : `${what}.`;
 }
 

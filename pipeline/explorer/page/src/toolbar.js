@@ -1,6 +1,6 @@
 // What one chooses above the diagram: axes, values of the other axes, colours, what is drawn over and under it.
 
-import { atFor } from "./address.js";
+import { ONE, atFor } from "./address.js";
 import { told } from "./axes.js";
 import { el, freshId } from "./dom.js";
 import { KEYS } from "./keyboard.js";
@@ -17,7 +17,7 @@ export class Toolbar {
     this.help = this.dialog();
     this.fields = el("div", { class: "fields" });
     this.toggles = el("div", { class: "toggles" });
-    this.element.append(this.fields, this.toggles, this.buttons(formats), this.help);
+    this.element.append(this.fields, this.toggles, this.buttons(formats));
     state.on(["x", "y", "at", "colour", "overlays"], () => this.show());
     this.show();
   }
@@ -35,7 +35,7 @@ export class Toolbar {
       select(`at.${axis.name}`, axis.label, options, String(at[axis.name] ?? 0), (index) =>
         state.set({ at: { ...state.get().at, [axis.name]: Number(index) } }));
     }
-    select("colour", "Colours", view.colours.map((c) => [c.name, c.title]), colour, (name) => state.set({ colour: name }));
+    select("colour", "Colours", [...view.colours.map((c) => [c.name, c.title]), [ONE, "one colour"]], colour, (name) => state.set({ colour: name }));
     const focused = this.fields.contains(document.activeElement) ? document.activeElement.name : null;
     this.fields.replaceChildren(...fields);
     if (focused) this.fields.querySelector(`select[name="${CSS.escape(focused)}"]`)?.focus();
@@ -75,7 +75,17 @@ export class Toolbar {
     return el("div", { class: "buttons" },
       button("+", "Zoom in", () => doing.zoom(0.6)), button("−", "Zoom out", () => doing.zoom(1 / 0.6)), button("All", "Show all", () => doing.reset()),
       this.menu("Save", pictures.concat(data)), this.menu("Zoom here", region, "A run of what the window shows, with more points"),
-      button("?", "Keys and gestures", () => this.showHelp()));
+      ...this.absent());
+  }
+
+  /** What is not computed yet, with the commands that do. */
+  absent() {
+    const commands = Object.values(this.view.commands ?? {});
+    if (!commands.length) return [];
+    const lines = commands.map((command) => el("li", {}, el("code", { text: command })));
+    const menu = this.menu("More", [], "Not computed yet; run these, then reload this page:");
+    menu.querySelector(".menu-list").append(el("ul", { class: "commands" }, ...lines));
+    return [menu];
   }
 
   offers(kind) {
@@ -98,6 +108,12 @@ export class Toolbar {
     const rows = KEYS.map(([key, text]) => el("div", {}, el("dt", {}, el("kbd", { text: key })), el("dd", { text })));
     const close = el("button", { type: "button", text: "Close", on: { click: () => this.help.close() } });
     return el("dialog", { class: "help", "aria-label": "Keys and gestures" }, el("h2", { text: "Keys and gestures" }), el("dl", {}, ...rows), close);
+  }
+
+  /** The button that shows the keys, and what it shows: they stand outside of the toolbar. */
+  get helpButton() {
+    const button = el("button", { type: "button", "aria-label": "Keys and gestures", title: "Keys and gestures", text: "?", on: { click: () => this.showHelp() } });
+    return el("span", {}, button, this.help);
   }
 
   showHelp() {

@@ -1,0 +1,63 @@
+"""``magpend export``: the explorer as files, without a server."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import Directory
+
+
+def export(
+    directory: Directory,
+    page: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="One file that opens by a double click. Default: NAME.html."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT",
+            help="Instead a folder for any static host: with all of the cube, read as one looks.",
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace the file, or a folder that export has made.")
+    ] = False,
+    orbits: Annotated[
+        int, typer.Option(min=0, help="Most orbits that are integrated to go along. Default: 2000.")
+    ] = 2000,
+    megabytes: Annotated[
+        float, typer.Option(min=1, max=100, help="Size of the one file at most [MB]. Default: 20.")
+    ] = 20.0,
+) -> None:
+    """Write the explorer of a run as files that need no server of magpend's: to send, to publish, to keep.
+
+    The diagram, its overlays and the orbits of attractors are in them; live integration is not. What does not
+    fit into one file is left out, and the page says what.
+    """
+    from pipeline.cli import console
+    from pipeline.explorer.export import export_page
+    from pipeline.explorer.folder import export_folder
+    from pipeline.spec.problems import SpecError
+    from pipeline.store.run import Run
+
+    if page is not None and folder is not None:
+        raise SpecError(["--page and --folder: give one of them."])
+    if page is not None and page.suffix.lower() not in (".html", ".htm"):
+        raise SpecError([f"--page {page}: the suffix must be .html."])
+    run = Run.open(directory)
+    with console.progress("exporting"):
+        if folder is not None:
+            written = export_folder(run, folder, force=force, most_orbits=orbits)
+        else:
+            target = page or Path(f"{Path(run.name).resolve().name}.html")
+            written = export_page(
+                run, target, force=force, most_orbits=orbits, most_bytes=round(megabytes * 1e6)
+            )
+    for sentence in written.sentences:
+        console.note(f"note: {sentence}")
+    where = written.path / "index.html" if folder is not None else written.path
+    console.result(f"page: {where} ({written.size / 1e6:.1f} MB, {written.orbits:,} orbits)")

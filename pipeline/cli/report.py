@@ -1,0 +1,53 @@
+"""``magpend report``: one page on runs of one's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def report(
+    directories: Annotated[
+        list[str], typer.Argument(metavar="DIR...", help="Run directories, or s3://BUCKET/PREFIX.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The page.")] = Path("report.html"),
+    title: Annotated[str, typer.Option(help="Its title; by default that of the run.")] = "",
+    also: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with", metavar="ANALYSIS", help="Compute this, too: branches, chaos, ...; may be repeated."
+        ),
+    ] = None,
+    only_stored: Annotated[
+        bool, typer.Option("--only-stored", help="Compute nothing; show what was found before.")
+    ] = False,
+) -> None:
+    """Write one HTML page on runs: parameters, diagram, attractors, bifurcations, exponents, provenance.
+
+    The page holds all that it shows, needs no script and no network, and prints. Attractors are found, and of
+    a continuation its hysteresis, if they were not; what else is missing is named with its command.
+    """
+    from pipeline.cli import console
+    from pipeline.report.page import write
+    from pipeline.report.report import report as make
+
+    check_page(out)
+    page = make(directories, title=title, also=also or [], only_stored=only_stored, echo=console.note)
+    write(page, out)
+    console.result(f"report: {out} ({out.stat().st_size / 1e6:.1f} MB)")
+
+
+def check_page(path: Path) -> None:
+    """Refuse a page that cannot be written, before anything is computed."""
+    from pipeline.spec.problems import SpecError
+    from pipeline.store.errors import RefusedError
+    from pipeline.store.local import unwritable
+
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise SpecError([f"--out {path}: the suffix must be .html."])
+    if path.is_dir() or not path.parent.is_dir():
+        raise SpecError([f"--out {path}: must be a file in a folder that exists."])
+    if problem := unwritable(path.parent):
+        raise RefusedError(f"{problem}; give another place for the page: --out FILE.")

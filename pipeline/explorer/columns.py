@@ -1,0 +1,135 @@
+"""The columns of a copy in one file: exact where they fit, else rounded, else fewer sections; and said so."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.explorer.gather import Column
+from pipeline.explorer.packing import packed
+
+
+@dataclass(frozen=True)
+class Level:
+    """How much of the columns is copied.
+
+    Attributes
+    ----------
+    dtype : str
+        Of the values.
+    each : int
+        Of cells on no closed orbit every so many sections; 0 keeps all sections of all cells, and any other
+        number one period of those on closed orbits.
+    """
+
+    dtype: str
+    each: int
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Columns that fit.
+
+    Attributes
+    ----------
+    objects : dict
+        Data by name of the vertical axis.
+    level : Level
+    kept, total : int
+        Points of the first vertical axis, here and in the run.
+    closed, others : int
+        Cells with points that are on closed orbits, and that are not.
+    """
+
+    objects: dict[str, bytes]
+    level: Level
+    kept: int
+    total: int
+    closed: int
+    others: int
+
+    def sentences(self) -> list[str]:
+        """What a reader must know of them."""
+        found = []
+        if self.level.dtype == "float32":
+            found.append("Numbers are rounded to 24 bits, so each is right to 6e-8 of its size.")
+        if self.kept < self.total:
+            each = self.level.each
+            rest = "all sections" if each == 1 else f"every {_ordinal(each)} section, the last one among them"
+            found.append(
+                f"Sections were left out: this copy has {self.kept:,} of {self.total:,} points. Of "
+                f"{self.closed:,} cells on closed orbits it has the last period; of {self.others:,} others "
+                f"{rest}. "
+                "magpend export --folder leaves nothing out."
+            )
+        return found
+
+
+def _ordinal(n: int) -> str:
+    return f"{n}{'th' if 10 < n % 100 < 14 else {1: 'st', 2: 'nd', 3: 'rd'}.get(n % 10, 'th')}"
+
+
+def levels(most: int) -> Iterator[Level]:
+    """From all there is to a section of each cell."""
+    yield Level("float64", 0)
+    yield Level("float32", 0)
+    for each in itertools.chain([1], *([2 * 2**k, 3 * 2**k] for k in range(most.bit_length()))):
+        yield Level("float32", each)
+
+
+def fit(columns: Mapping[str, Column], period: np.ndarray, most_bytes: float) -> Fitted | None:
+    """Return as much of the columns as takes at most so many bytes; None if nothing does.
+
+    Parameters
+    ----------
+    columns
+        By vertical axis, all over the same cells.
+    period
+        Of each cell's closed orbit; 0 where there is none.
+    most_bytes
+        For all of them.
+    """
+    longest = max((int(c.count.max(initial=0)) for c in columns.values()), default=0)
+    first = next(iter(columns.values()))
+    closed = int(((first.count > 0) & (period > 0)).sum())
+    others = int((first.count > 0).sum()) - closed
+    for level in levels(longest):
+        objects = _packed(columns, period, level, most_bytes)
+        if objects is not None:
+            kept = int(thinned(first, period, level.each).count.sum())
+            return Fitted(objects, level, kept, len(first.y), closed, others)
+    return None
+
+
+def _packed(
+    columns: Mapping[str, Column], period: np.ndarray, level: Level, most_bytes: float
+) -> dict[str, bytes] | None:
+    """All columns at a level; None as soon as they are too large."""
+    objects, size = {}, 0
+    for name, column in columns.items():
+        part = thinned(column, period, level.each)
+        objects[name] = packed({"count": part.count, "y": part.y.astype(level.dtype)})
+        size += len(objects[name])
+        if size > most_bytes:
+            return None
+    return objects
+
+
+def thinned(column: Column, period: np.ndarray, each: int) -> Column:
+    """Leave sections out: all but the last period of closed orbits, of other cells all but every `each`-th.
+
+    The last section of every cell stays. Nothing is left out if `each` is 0.
+    """
+    if each == 0:
+        return column
+    count = column.count.astype(np.int64)
+    first = np.cumsum(count) - count
+    # sections that come after each one, in its cell
+    after = np.repeat(count, count) - 1 - (np.arange(len(column.y)) - np.repeat(first, count))
+    orbit = np.repeat(period.astype(np.int64), count)
+    stays = np.where(orbit > 0, after < orbit, after % each == 0)
+    kept = np.add.reduceat(np.append(stays, False), first, dtype=np.int64) if len(first) else count
+    return Column(np.where(count > 0, kept, 0).astype(np.uint32), column.y[stays])

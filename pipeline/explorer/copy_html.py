@@ -1,0 +1,77 @@
+"""The HTML of copies: one file that needs nothing beside it but, in a folder, data."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Mapping
+from html import escape
+from importlib import resources
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="generator" content="{generator}">
+<title>{title}</title>
+<link rel="icon" href="data:,">
+<style>{style}</style>
+</head>
+<body>
+<div id="app" data-mode="{mode}"{objects}></div>
+<noscript>This page draws with a script of its own; nothing of it comes from elsewhere.</noscript>
+{data}<script>{script}</script>
+</body>
+</html>
+"""
+
+_DATA = '<script type="application/octet-stream;base64" id="data-{name}">{content}</script>\n'
+
+
+def static_text(name: str) -> str:
+    """A file of the built page."""
+    return resources.files("pipeline.explorer").joinpath("static", name).read_text("utf-8")
+
+
+def inline_html(title: str, generator: str, objects: Mapping[str, bytes]) -> str:
+    """The page with its data in itself; it asks for nothing."""
+    data = "".join(
+        _DATA.format(name=escape(name), content=base64.b64encode(content).decode())
+        for name, content in objects.items()
+    )
+    return _page("inline", title, generator, "explorer.js", "'none'", data=data)
+
+
+def folder_html(title: str, generator: str, list_sha256: str) -> str:
+    """The page of a folder; it holds the digest of the list of digests."""
+    return _page("folder", title, generator, "explorer-folder.js", "'self'", f' data-objects="{list_sha256}"')
+
+
+def inline_bytes(objects: Mapping[str, bytes]) -> int:
+    """Size of objects in a page [bytes]."""
+    frame = len(_DATA)
+    return sum(frame + len(name) + 4 * -(-len(content) // 3) for name, content in objects.items())
+
+
+def _page(
+    mode: str, title: str, generator: str, script_name: str, connect: str, objects: str = "", data: str = ""
+) -> str:
+    script, style = static_text(script_name), static_text("explorer.css")
+    for text, end in ((script, "</script"), (style, "</style")):
+        if end in text.lower():
+            raise ValueError(f"the built page holds {end}, which would end it: build it again")
+    policy = (
+        f"default-src 'none'; script-src {_digest(script)}; style-src {_digest(style)}; img-src data: blob:; "
+        f"connect-src {connect}; worker-src blob:; base-uri 'none'; form-action 'none'"
+    )
+    return _PAGE.format(
+        policy=escape(policy), generator=escape(generator), title=escape(f"{title} - magpend"), style=style,
+        mode=mode, objects=objects, data=data, script=script,
+    )  # fmt: skip
+
+
+def _digest(text: str) -> str:
+    """A text as a content policy names it."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

@@ -1,0 +1,135 @@
+"""A copy in a folder: for any static host or object store, read column by column as one looks."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.explorer.copied_orbits import Room
+from pipeline.explorer.copy_html import folder_html
+from pipeline.explorer.explored import ExploredRun
+from pipeline.explorer.export import Exported, add_all_orbits, finished, read_columns
+from pipeline.explorer.gather import Copied, add_planes, gather, place_of
+from pipeline.explorer.verticals import verticals
+from pipeline.store.consolidate import write_cube
+from pipeline.store.errors import RefusedError
+from pipeline.store.files import entry_of
+from pipeline.store.local import remove_tree, sync_folder, temporary_beside, unwritable
+from pipeline.store.run import Run
+
+INDEX, LIST, DATA = "index.html", "objects.json", "data"
+
+MOST_BYTES = 500_000_000
+"""What orbits, and planes, may take of a folder each."""
+
+
+def export_folder(source: Run, out: Path, *, force: bool = False, most_orbits: int = 2000) -> Exported:
+    """Write a run as a folder that any static host can serve.
+
+    In it are the page, the cube with its metadata in one file and its chunks cut by columns, and
+    ``objects.json`` with the sha256 of every object, whose own sha256 stands in the page.
+
+    Parameters
+    ----------
+    source
+        An opened run. What is not committed reads as pending in the new cube, too.
+    out
+        Folder to make.
+    force
+        Whether a folder that an export has made there makes way; nothing else does.
+    most_orbits
+        Orbits that are integrated for it, one for each attractor at each parameter point.
+
+    Raises
+    ------
+    RefusedError
+        If something is at its place, or nothing can be written there.
+    DamagedError
+        If what is read of the run is not what was written.
+    """
+    check_folder(out, force)
+    temporary = temporary_beside(out)
+    try:
+        temporary.mkdir()
+        exported = _write(ExploredRun.of(source), temporary, most_orbits)
+        if out.exists():
+            before = temporary_beside(out)
+            out.rename(before)
+            temporary.rename(out)
+            remove_tree(before)
+        else:
+            temporary.rename(out)
+        sync_folder(out.parent)
+    except BaseException:
+        remove_tree(temporary)
+        raise
+    return Exported(out, exported.size, exported.orbits, exported.sentences)
+
+
+def check_folder(out: Path, force: bool) -> None:
+    """Refuse a place that is taken or cannot be written to, before anything is computed.
+
+    Raises
+    ------
+    RefusedError
+        Saying why.
+    """
+    if not out.parent.is_dir():
+        raise RefusedError(f"{out.parent}: no such folder; make it first.")
+    if problem := unwritable(out.parent):
+        raise RefusedError(f"{problem}; give another place.")
+    if not (out.exists() or out.is_symlink()):
+        return
+    if not force:
+        raise RefusedError(f"{out}: exists already and is not overwritten; give another name, or --force.")
+    own = {INDEX, LIST, DATA, "cube.zarr"}
+    if out.is_symlink() or not out.is_dir() or {p.name for p in out.iterdir()} - own:
+        raise RefusedError(
+            f"{out}: is not a folder that magpend export has made, so --force leaves it; remove it."
+        )
+
+
+def _write(run: ExploredRun, folder: Path, most_orbits: int) -> Exported:
+    copied = gather(run)
+    columns, layers = read_columns(copied)
+    add_planes(copied, MOST_BYTES)
+    orbits = add_all_orbits(copied, columns, layers, Room(most_orbits, MOST_BYTES, brief=False))
+    for vertical in verticals(run):
+        variable, own = place_of(run, vertical)
+        copied.about["columns"][vertical.name] = {"variable": variable, "own": own}
+    along = next((a.name for a in run.axes if a.swept), None)
+    entries = write_cube(run, folder, along, _layers_of(copied, layers))
+    (folder / DATA).mkdir()
+    for name, content in finished(copied).items():
+        key = f"{DATA}/{name}.bin"
+        (folder / key).write_bytes(content)
+        entries[key] = entry_of(content)
+    listed = json.dumps(entries, sort_keys=True, separators=(",", ":")).encode()
+    (folder / LIST).write_bytes(listed)
+    digest = hashlib.sha256(listed).hexdigest()
+    html = folder_html(run.info.title, f"magpend {copied.view['version']}", digest).encode()
+    (folder / INDEX).write_bytes(html)
+    size = sum(entry["size"] for entry in entries.values()) + len(listed) + len(html)
+    return Exported(folder, size, orbits, copied.sentences)
+
+
+def _layers_of(copied: Copied, layers: dict[str, np.ndarray]) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
+    """Codes of colours in the shape of the cube, each with what its codes mean."""
+    shape = copied.run.plan.shape
+    titles = {f"colour_{c['name']}": c for c in copied.view["colours"]}
+    return {
+        name: (
+            values.reshape(shape),
+            {
+                "long_name": titles[name]["title"],
+                "flag_values": [c["id"] for c in titles[name]["categories"]],
+                "comment": "; ".join(f"{c['id']} {c['label']}" for c in titles[name]["categories"]),
+            },
+        )
+        for name, values in layers.items()
+        if name != "status"
+    }

@@ -1,0 +1,8 @@
+// Where the page of an exported folder begins: it alone has zarrita in it.
+
+import { start } from "./app.js";
+import { FolderSource } from "./source-folder.js";
+
+const root = document.getElementById("app");
+
+start(new FolderSource(root.dataset.objects), root);

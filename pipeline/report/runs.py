@@ -1,0 +1,384 @@
+"""Sections of a report on one run: diagram, attractors, bifurcations, exponents, parameters, provenance.
+
+What stands in the cube and in ``derived/`` is shown. The attractors, and of a continuation its hysteresis,
+are found first if they were not, as ``magpend analyse`` does; whatever else is missing is named, with its
+command.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.analysis.tabular import axis_ranges, distinct, number
+from pipeline.layout.letters import letter
+from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
+from pipeline.products.product import function_of
+from pipeline.products.registry import ANALYSES, FIGURES
+from pipeline.report.page import Block, Facts, Grid, Note, Part, Source, grid_of, picture_of
+from pipeline.report.stored import stored_options
+from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.drawing import figure
+from pipeline.runs.status import state
+from pipeline.spec.problems import SpecError
+from pipeline.spec.tables import FREQUENCY
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+CHEAP = ("attractors", "hysteresis", "basins")
+"""Analyses that a report computes unless it is told not to."""
+
+SHOWN = ("attractors", "hysteresis", "basins", "branches", "curves", "chaos", "dimension", "settling")
+"""Analyses in the order in which a report has them."""
+
+_HEADINGS = {
+    "hysteresis": "Hysteresis",
+    "basins": "Basins",
+    "branches": "Bifurcations",
+    "curves": "Curves of bifurcations",
+    "chaos": "Regular and chaotic",
+    "dimension": "Dimensions",
+    "settling": "Transient or attractor",
+}
+
+_CAPTIONS = {
+    "hysteresis": "Jumps of the walks: from where to where, from which attractor to which",
+    "basins": "What the initial states of the grid end on",
+    "branches": "Located bifurcations",
+    "curves": "Curves of bifurcations",
+    "chaos": "What kind of motion each attractor is",
+    "dimension": "Correlation dimensions of the bounded sets that stay",
+    "settling": "Bounded sets that were run on",
+}
+
+
+class Shown:
+    """A run that is reported on.
+
+    Parameters
+    ----------
+    run
+        It.
+    computed
+        Analyses that may be computed; others are shown if they are stored.
+    """
+
+    def __init__(self, run: AnalysedRun, computed: tuple[str, ...]) -> None:
+        self.run, self.computed = run, computed
+        self.cube = run.cube()
+        self.axes, self.starts = split_dims(self.cube["status"])
+
+    @property
+    def directory(self) -> str:
+        """The run directory as a command takes it."""
+        return shlex.quote(self.run.name)
+
+    def options_of(self, name: str) -> list[dict[str, Any]]:
+        """Return the options with which an analysis can be shown: stored ones, or those by default."""
+        known = stored_options(self.run, name)
+        return known or ([{}] if name in self.computed else [])
+
+
+def part_of(
+    source: str | AnalysedRun, echo: Callable[[str], None], computed: tuple[str, ...] = CHEAP
+) -> Part:
+    """Return the section of a run.
+
+    Parameters
+    ----------
+    source
+        Run directory, or an opened run.
+    echo
+        Prints a line; says what is computed.
+    computed
+        Analyses that are computed where they are not stored.
+
+    Raises
+    ------
+    RefusedError, DamagedError, UnreadableError
+        As `pipeline.store.run.Run.open`.
+    """
+    shown = Shown(AnalysedRun.of(source, echo), computed)
+    title = shown.run.info.title or shown.run.name.rpartition("/")[2]
+    parts = [
+        Part("Diagram", list(_diagram(shown))),
+        Part("Attractors", list(_attractors(shown))),
+        *_analyses(shown),
+        Part("Exponents", list(_exponents(shown))),
+        Part("Parameters", list(_parameters(shown))),
+        Part("Where this comes from", list(provenance_of(shown.run))),
+    ]
+    return Part(title, list(_state(shown)), [part for part in parts if part.blocks])
+
+
+def _state(shown: Shown) -> Iterator[Block]:
+    """What the run is, and how far."""
+    run, found = shown.run, state(shown.run)
+    swept = ", ".join(f"{name} {_span(shown.cube, name)}" for name in shown.axes) or "nothing"
+    model = run.model
+    yield Facts({
+        "model": f"{model.name}: {model.title}",
+        "kind": f"{run.spec.kind}; swept: {swept}",
+        "cells": f"{found.n_committed} of {found.plan.n_cells} computed"
+        + "".join(f", {n} {name.replace('_', ' ')}" for name, n in found.cells.items() if n),
+        "sections": f"{run.spec.integration.n_keep} kept after {run.spec.integration.n_transient}, "
+        f"at {model.section}",
+    })  # fmt: skip
+    if not run.complete:
+        yield Note(
+            "This run is not complete: what is not computed is left out everywhere below.",
+            f"magpend run SPEC --out {shown.directory}",
+        )
+
+
+def _span(cube: xr.Dataset, name: str) -> str:
+    """Range of an axis, its unit and how many values it has."""
+    values, unit = cube[name].values, str(cube[name].attrs.get("units", "1"))
+    if values.size == 1:
+        return f"{values[0]:g}{'' if unit == '1' else ' ' + unit}"
+    return f"{values[0]:g} to {values[-1]:g}{'' if unit == '1' else ' ' + unit} ({values.size} values)"
+
+
+def _parameters(shown: Shown) -> Iterator[Block]:
+    """Parameters with their values, units and sources."""
+    run = shown.run
+    chosen = run.model.preset(run.spec.parameters.chosen)
+    over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
+    rows = []
+    if run.spec.frequency_hz and parameter_name(FREQUENCY) not in swept and run.spec.section is None:
+        rows.append(
+            ("drive's frequency", f"{run.spec.frequency_hz:g}", "Hz", "of the forcing", "the specification")
+        )
+    for p in run.model.parameters:
+        source = chosen.provenance.get(p.name, f"preset {chosen.name}")
+        value = f"{run.parameters[p.name]:g}"
+        if p.name in swept:
+            value, source = _span(shown.cube, swept[p.name]), "swept"
+        elif p.name in over:
+            source = "the specification"
+        rows.append((p.name, value, "" if p.unit == "1" else p.unit, p.meaning, source))
+    yield Grid(
+        ("parameter", "value", "unit", "meaning", "from"),
+        rows,
+        f"Preset {chosen.name}: {chosen.title}".rstrip(": "),
+    )
+
+
+def _diagram(shown: Shown) -> Iterator[Block]:
+    """Draw what the cube shows over its axes, or its section if nothing is swept."""
+    if len(shown.axes) > 1:
+        at = _first_of_others(shown)
+        yield from _drawn(
+            shown, "bifurcation", "Bifurcation diagram at the first values of the other axes", at=at
+        )
+    elif shown.axes and shown.cube.sizes[shown.axes[0]] > 1:
+        yield from _drawn(shown, "bifurcation", "Bifurcation diagram")
+    else:
+        yield from _drawn(shown, "section", "Section points")
+
+
+def _first_of_others(shown: Shown) -> dict[str, float]:
+    """Values of the axes that a diagram over one of them has no room for."""
+    continuation = shown.run.spec.continuation
+    path = next(
+        (d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0]
+    )
+    return {d: float(shown.cube[d].values[0]) for d in shown.axes if d != path}
+
+
+def _attractors(shown: Shown) -> Iterator[Block]:
+    """Attractors with periods, motions, ranges and shares; pictures of them."""
+    known = shown.options_of("attractors")
+    if not known:
+        yield _missing(shown, "attractors")
+        return
+    options = known[0]
+    try:
+        found = shown.run.derive("attractors", **options)
+    except SpecError as error:
+        yield Note(str(error))
+        return
+    command = command_of("analyse attractors", options, shown.directory)
+    rows = list(function_of(ANALYSES["attractors"].table)(found).rows)
+    yield Grid(
+        *_attractor_grid(found, rows, shown.axes),
+        f"{len({r['attractor_id'] for r in rows})} attractors",
+        command,
+    )
+    if len(shown.axes) == 1 and shown.cube.sizes[shown.axes[0]] > 1:
+        yield from _drawn(shown, "attractors", "All coexisting attractors", **options)
+        if "fraction" in (rows or [{}])[0]:
+            yield from _drawn(
+                shown, "fractions", "Shares of the initial states that end on each attractor", **options
+            )
+    elif len(shown.axes) == 2:
+        yield from _drawn(shown, "regimes", "Which periods coexist", **options)
+        yield from _drawn(shown, "regimes", "How many attractors coexist", **options, show="number")
+    if rows:
+        where = _richest(rows, shown.axes)
+        told = ", ".join(f"{name} = {value:g}" for name, value in where.items())
+        words = f"Attractors at {told}, where most coexist" if told else "Attractors"
+        yield from _drawn(shown, "gallery", words, **options, at=where)
+
+
+def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, float]:
+    """Values of the axes at which most attractors coexist, the first of equals."""
+    counts: dict[tuple[float, ...], int] = {}
+    for row in rows:
+        place: tuple[float, ...] = tuple(row[name] for name in axes)
+        counts[place] = counts.get(place, 0) + 1
+    best = max(counts, key=counts.__getitem__)
+    return dict(zip(axes, best, strict=True))
+
+
+def _attractor_grid(
+    ds: xr.Dataset, rows: list[dict[str, Any]], axes: tuple[str, ...]
+) -> tuple[list[str], list[list[str]]]:
+    """Return a line per attractor: kind, period, motion, where it exists, largest share with its interval."""
+    motion, sampled = any("side" in r for r in rows), any("fraction" in r for r in rows)
+    names = ["", "kind", "period", *(["motion"] if motion else []), *axes, "cells"]
+    names += ["share (95 % interval)"] if sampled else []
+    lines = []
+    for i in sorted({row["attractor_id"] for row in rows}):
+        own = [row for row in rows if row["attractor_id"] == i]
+        line = [letter(i), distinct(r["kind"].replace("_", " ") for r in own)]
+        line.append(distinct(r["orbit_period"] for r in own if r["orbit_period"]) or "-")
+        line += [distinct(r["side"] for r in own)] if motion else []
+        line += [axis_ranges(ds, d, own, alone=len(axes) == 1) for d in axes]
+        line.append(str(sum(r["n_cells"] for r in own)))
+        line += [_share(own, axes)] if sampled else []
+        lines.append(line)
+    return names, lines
+
+
+def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
+    """Return the largest share of an attractor, with its interval and where that is."""
+    best = max(rows, key=lambda row: float(np.nan_to_num(row["fraction"], nan=-1.0)))
+    where = ", ".join(f"{name} {best[name]:g}" for name in axes)
+    share = (
+        f"{number(best['fraction'], '.3f')} ({number(best['low'], '.3f')} to {number(best['high'], '.3f')})"
+    )
+    return f"{share} at {where}" if where and len(rows) > 1 else share
+
+
+def _analyses(shown: Shown) -> Iterator[Part]:
+    """Return a section for every other analysis: its table and its figure, or how to get it."""
+    for name in SHOWN[1:]:
+        if not _suits(shown, name):
+            continue
+        known = shown.options_of(name)
+        blocks: list[Block] = [] if known else [_missing(shown, name)]
+        for options in known:
+            blocks += _analysis(shown, name, options)
+        yield Part(_HEADINGS[name], blocks)
+
+
+def _suits(shown: Shown, name: str) -> bool:
+    """Whether an analysis can say something of a run of this kind."""
+    if name == "hysteresis":
+        return shown.run.spec.continuation is not None and shown.run.spec.continuation.direction == "both"
+    if name == "basins":
+        return sum(map(is_grid_dim, shown.starts)) >= 2
+    return name in ("branches", "chaos") or bool(stored_options(shown.run, name))
+
+
+def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[Block]:
+    try:
+        found = shown.run.derive(name, **options)
+    except SpecError as error:
+        yield Note(str(error))
+        return
+    rows = [_with_letters(row) for row in function_of(ANALYSES[name].table)(found).rows]
+    command = command_of(f"analyse {name}", options, shown.directory)
+    if rows:
+        yield grid_of(rows, _CAPTIONS[name], command)
+    else:
+        yield Note("Nothing of this kind was found.", command)
+    drawn = ANALYSES[name].figure
+    if drawn and drawn not in ("attractors", "lyapunov"):
+        at = {d: float(shown.cube[d].values[0]) for d in shown.axes} if drawn == "basins" else {}
+        where = " at the first values of the axes" if any(shown.cube.sizes[d] > 1 for d in at) else ""
+        yield from _drawn(shown, drawn, f"{_CAPTIONS[name]}{where}", **options, **({"at": at} if at else {}))
+
+
+def _with_letters(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row in which attractors have the letters of the figures."""
+    found = {}
+    for name, value in row.items():
+        is_id = name in ("attractor_id", "from_id", "to_id", "mirror_partner")
+        found[name.removesuffix("_id")] = ("-" if value < 0 else letter(int(value))) if is_id else value
+    return found
+
+
+def _exponents(shown: Shown) -> Iterator[Block]:
+    """Lyapunov exponents of the cube, if it has them."""
+    if "lyapunov" not in shown.run.spec.products:
+        yield Note(
+            "Lyapunov exponents were not computed in this run: add the table to the specification and run it "
+            "into another directory.", "[products]\nlyapunov = {}",
+        )  # fmt: skip
+    elif len(shown.axes) == 2:
+        yield from _drawn(shown, "lyapunov", "Largest Lyapunov exponent", as_map=True)
+    elif shown.axes and shown.cube.sizes[shown.axes[0]] > 1:
+        yield from _drawn(shown, "lyapunov", "Lyapunov exponents", spectrum=True)
+    else:
+        yield from _drawn(shown, "convergence", "Convergence of the largest Lyapunov exponent")
+
+
+def provenance_of(run: AnalysedRun) -> Iterator[Block]:
+    """Command, digests and versions of a run, and its specification; no host and no path of a home."""
+    info = run.info
+    made = dict(info.versions)
+    facts = {
+        "command": f"magpend run SPEC --out {shlex.quote(run.name)}",
+        "digest of the specification": info.digest,
+        "digest of the cube": run.digest,
+        "made": info.provenance.get("created", ""),
+        "commit": info.provenance.get("git_commit", ""),
+        "versions": ", ".join(f"{name} {version}" for name, version in made.items()),
+    }
+    yield Facts({name: value for name, value in facts.items() if value})
+    yield Source("Specification", info.spec_text)
+
+
+def _drawn(shown: Shown, name: str, caption: str, **options: Any) -> Iterator[Block]:
+    """Return a figure, or the sentence that says why there is none."""
+    try:
+        drawn = figure(shown.run, name, options)
+    except SpecError as error:
+        yield Note(f"{caption}: not drawn. {error}")
+        return
+    notes = "".join(f" {note}." for note in drawn.notes)
+    words = f"{caption} of {shown.run.info.title or shown.run.name}"
+    yield picture_of(drawn, words, f"{caption}.{notes}", command_of(f"plot {name}", options, shown.directory))
+
+
+def _missing(shown: Shown, name: str) -> Note:
+    does = ANALYSES[name].help.partition("\n")[0]
+    return Note(f"Not computed. To {does[0].lower()}{does[1:]}", f"magpend analyse {name} {shown.directory}")
+
+
+def command_of(words: str, options: Mapping[str, Any], place: str) -> str:
+    """Return the command that gives one thing alone."""
+    verb, _, name = words.partition(" ")
+    model = (ANALYSES if verb == "analyse" else FIGURES)[name].options
+    parts = []
+    for key, value in options.items():
+        extra: Any = model.model_fields[key].json_schema_extra
+        flag = (extra or {}).get("flag") or f"--{key.replace('_', '-')}"
+        if isinstance(value, bool):
+            parts.append(flag if value else flag.replace("--", "--no-", 1))
+        elif isinstance(value, Mapping):
+            parts += [f"{flag} {k}={v:.10g}" for k, v in value.items()]
+        else:
+            parts.append(f"{flag} {shlex.quote(text_of_option(value))}")
+    return " ".join(["magpend", words, place, *parts])
+
+
+def text_of_option(value: Any) -> str:
+    """Spell the value of an option for the command line."""
+    return " ".join(f"{part:.15g}" for part in value) if isinstance(value, list | tuple) else str(value)

@@ -1,0 +1,52 @@
+"""What was found in a run already: results in its ``derived/`` that belong to the cells as they are."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from pipeline.products.registry import ANALYSES
+from pipeline.runs.versions import code_version
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import DERIVED
+from pipeline.store.products import products_in, read_product_attrs
+from pipeline.store.run import Run
+
+
+def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
+    """Return the options of every stored result of an analysis that `pipeline.runs.derive.derive` would take.
+
+    Parameters
+    ----------
+    run
+        An opened run.
+    name
+        Of the analysis.
+
+    Returns
+    -------
+    list of dict
+        Options that differ from their defaults, those with the fewest first.
+    """
+    analysis = ANALYSES[name]
+    found = []
+    for place in products_in(run.info.files.below(DERIVED)):
+        try:
+            attrs = read_product_attrs(place)
+        except (DamagedError, FileNotFoundError):
+            continue
+        if (
+            attrs.get("derived_product") == name
+            and attrs.get("cube_digest") == run.digest
+            and attrs.get("analysis_version") == code_version(name)
+        ):
+            given = json.loads(str(attrs["derived_options"]))
+            found.append(analysis.options.model_validate(_tuples(given)).changed())
+    return sorted(found, key=lambda options: (len(options), json.dumps(options, sort_keys=True)))
+
+
+def _tuples(value: Any) -> Any:
+    """Lists of JSON as the tuples that options hold."""
+    if isinstance(value, dict):
+        return {name: _tuples(part) for name, part in value.items()}
+    return tuple(_tuples(part) for part in value) if isinstance(value, list) else value

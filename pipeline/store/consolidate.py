@@ -1,0 +1,183 @@
+"""The cube rewritten for readers over plain HTTP: columns in small objects, one file that lists them all.
+
+A browser has gzip and no blosc, cannot list a folder, and asks for one state at a few values of the
+horizontal axis. So a chunk here is one state of all cells at some values of that axis, compressed by gzip,
+and the group's metadata describe every array. The numbers are those of the cube, bit for bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.codecs import BytesCodec, Crc32cCodec, GzipCodec
+from zarr.codecs.numcodecs import Shuffle
+from zarr.storage import LocalStore
+
+from pipeline.layout.cells import parameter_axes
+from pipeline.products.reporting import report
+from pipeline.store.files import CUBE, entry_of
+from pipeline.store.run import Run
+
+CHUNK_BYTES = 500_000
+"""What a chunk holds before compression: a request's delay is then small beside its transfer."""
+
+SLAB_BYTES = 200_000_000
+"""What is held in memory at a time."""
+
+LEVEL = 6
+"""Of gzip."""
+
+PRIVATE = ("host",)
+"""Attributes of an opened cube that do not go to strangers."""
+
+Layers = Mapping[str, tuple[np.ndarray, Mapping[str, Any]]]
+"""Arrays over the cells, by name, with their attributes."""
+
+
+def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dict[str, dict[str, Any]]:
+    """Write what is committed of a run as a cube that browsers read column by column.
+
+    Parameters
+    ----------
+    run
+        An opened run; what it has not committed reads as pending in the new cube, too.
+    folder
+        Of the new ``cube.zarr``, which must not be there.
+    along
+        The swept parameter on the horizontal axis, as a dim of the cube; None if nothing is swept.
+    layers
+        Further arrays over the cells.
+
+    Returns
+    -------
+    dict
+        Size and sha256 of every file, by its path below `folder`.
+
+    Raises
+    ------
+    DamagedError
+        If what is read of the run is not what was written.
+    """
+    place = folder / CUBE
+    place.mkdir(parents=True)
+    store = LocalStore(place)
+    with _unwarned():
+        _write_group(run, store, _Columns(run, along), layers)
+        zarr.consolidate_metadata(store)
+    files = sorted(path for path in place.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): entry_of(path.read_bytes()) for path in files}
+
+
+class _Columns:
+    """How the arrays of a run are cut: chunks of some values of one dim and all starts, of one state.
+
+    Parameters
+    ----------
+    run
+        The run.
+    along
+        The dim.
+    """
+
+    def __init__(self, run: Run, along: str | None) -> None:
+        self.dims, self.shape, self._sizes = run.plan.dims, run.plan.shape, run.plan.sizes
+        swept = [axis.dim for axis in parameter_axes(run.spec)]
+        starts = [dim for dim in reversed(self.dims) if dim not in swept]
+        others = [dim for dim in reversed(swept) if dim != along]
+        self._along = along
+        # what is read together first; other parameters only where there is room left
+        self._order = [*starts, *([] if along is None else [along]), *others]
+
+    def chunks(self, itemsize: int, own: tuple[str, ...] = ()) -> tuple[int, ...]:
+        """Chunk shape of an array over the cells, with dims of its own."""
+        apart = tuple(1 if dim == "state" else self._sizes[dim] for dim in own)
+        room = max(1, CHUNK_BYTES // (itemsize * math.prod(apart)))
+        found = {}
+        for dim in self._order:
+            found[dim] = min(self.shape[self.dims.index(dim)], room)
+            room = max(1, room // found[dim])
+        return (*(found[dim] for dim in self.dims), *apart)
+
+    def slabs(self, chunks: tuple[int, ...], bytes_per_cell: int) -> Iterator[tuple[slice, ...]]:
+        """Whole chunks along the dim, as many at a time as the memory should hold."""
+        if self._along is None:
+            yield (slice(None),) * len(self.dims)
+            return
+        i = self.dims.index(self._along)
+        per_value = math.prod(self.shape) // self.shape[i] * bytes_per_cell
+        step = max(1, SLAB_BYTES // (per_value * chunks[i])) * chunks[i]
+        for first in range(0, self.shape[i], step):
+            part = slice(first, min(first + step, self.shape[i]))
+            yield tuple(part if k == i else slice(None) for k in range(len(self.dims)))
+
+
+def _write_group(run: Run, store: LocalStore, columns: _Columns, layers: Layers) -> None:
+    ds = run.cube()
+    attrs = {str(k): v for k, v in ds.attrs.items() if k not in PRIVATE}
+    others = " ".join(sorted(str(name) for name in ds.coords if name not in ds.dims))
+    group = zarr.create_group(store, zarr_format=3, attributes=_plain({**attrs, "coordinates": others}))
+    for name, coordinate in ds.coords.items():
+        values = coordinate.values
+        array = _create(group, str(name), coordinate.dims, values, values.shape, None, coordinate.attrs)
+        array[...] = values.astype(object) if values.dtype.kind == "U" else values
+    for name, (values, attributes) in layers.items():
+        chunks = columns.chunks(values.dtype.itemsize)
+        _create(group, name, columns.dims, values, chunks, 0, attributes)[...] = values
+    total = float(sum(ds[v.name].nbytes for v in run.plan.variables))
+    done = 0.0
+    for variable in run.plan.variables:
+        source = ds[variable.name]
+        chunks = columns.chunks(source.dtype.itemsize, variable.own_dims)
+        array = _create(group, variable.name, source.dims, source, chunks, variable.fill, source.attrs)
+        for slab in columns.slabs(chunks, variable.itemsize(run.plan.sizes)):
+            values = source[slab].values
+            array[slab] = values
+            done += values.nbytes
+            report("rewriting the cube", done / 1e6, total / 1e6)
+
+
+def _create(
+    group: zarr.Group, name: str, dims: Iterable[Any], like: Any, chunks: tuple[int, ...], fill: Any,
+    attrs: Mapping[Any, Any],
+) -> Any:  # fmt: skip
+    """Create an array in codecs that browsers have of themselves; checksums stand at the ends of chunks."""
+    dtype: np.dtype[Any] = like.dtype
+    texts = dtype.kind == "U"
+    shuffled = [] if texts or dtype.itemsize == 1 else [Shuffle(elementsize=dtype.itemsize)]
+    serializer: Any = "auto" if texts else BytesCodec(endian="little" if dtype.itemsize > 1 else None)
+    if fill is None:
+        fill = "" if texts else (math.nan if dtype.kind == "f" else 0)
+    return group.create_array(
+        name,
+        shape=like.shape,
+        chunks=tuple(max(n, 1) for n in chunks),
+        dtype="string" if texts else dtype,
+        fill_value=fill,
+        serializer=serializer,
+        compressors=[*shuffled, GzipCodec(level=LEVEL), Crc32cCodec()],
+        chunk_key_encoding={"name": "default", "separator": "."},
+        dimension_names=tuple(map(str, dims)),
+        attributes=_plain(attrs),
+        config={"write_empty_chunks": True},
+    )
+
+
+def _plain(attrs: Mapping[Any, Any]) -> dict[str, Any]:
+    """Attributes as JSON has them."""
+    return {str(k): v.tolist() if isinstance(v, (np.ndarray, np.generic)) else v for k, v in attrs.items()}
+
+
+@contextlib.contextmanager
+def _unwarned() -> Iterator[None]:
+    """Without what zarr says of codecs and metadata that are no part of version 3 of its format."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Consolidated metadata")
+        warnings.filterwarnings("ignore", message="Numcodecs codecs are not")
+        yield

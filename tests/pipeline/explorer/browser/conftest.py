@@ -1,0 +1,159 @@
+"""A real browser before a real explorer: chromium by playwright, a small run, its page served on loopback.
+
+The run is computed once; `browser` starts chromium once for each file of tests (playwright's event loop counts as
+running in its thread while it is there, so that it must end before other tests begin). Where there is no chromium
+or no playwright the tests say so and are skipped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.runs.derive import derive
+from pipeline.runs.run import run
+
+ROOT = Path(__file__).parents[4]
+
+HOSTILE = "small <img src=x onerror=\"document.title='run by a title'\"> run"
+"""A title that would run what it says if it were ever taken for markup."""
+
+SMALL = f"""
+kind = "sweep"
+title = {json.dumps(HOSTILE)}
+[axes]
+frequency_hz = {{ start = 2.2, stop = 2.3, num = 5 }}
+[initial_conditions]
+kind = "grid"
+psi1_deg = {{ start = -20, stop = 20, num = 3 }}
+psi2_deg = {{ start = -20, stop = 20, num = 3 }}
+[integration]
+rtol = 1e-7
+atol = 1e-7
+n_transient = 300
+n_keep = 20
+"""
+
+CANDIDATES = ("/usr/bin/chromium", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+WAIT_MS = 60_000  # a machine that is busy with other tests
+
+
+def chromium() -> str | None:
+    """Path of a chromium, if there is one."""
+    return next((found for name in CANDIDATES if (found := shutil.which(name))), None)
+
+
+@dataclass
+class Opened:
+    """A page and what it complained of.
+
+    Attributes
+    ----------
+    page
+        Playwright's page.
+    complaints
+        Errors of the console, of scripts and of requests.
+    outside
+        Requests to other hosts.
+    """
+
+    page: Any
+    complaints: list[str] = field(default_factory=list)
+    outside: list[str] = field(default_factory=list)
+
+    def watch(self, host: str) -> None:
+        """Collect from now on."""
+
+        def console(message: Any) -> None:
+            if message.type in ("error", "warning"):
+                self.complaints.append(f"{message.type}: {message.text}")
+
+        def request(asked: Any) -> None:
+            if not asked.url.startswith((f"http://{host}", f"ws://{host}", "data:", "blob:", "file:")):
+                self.outside.append(asked.url)
+
+        self.page.on("console", console)
+        self.page.on("pageerror", lambda error: self.complaints.append(f"script: {error}"))
+        self.page.on("requestfailed", lambda asked: self.complaints.append(f"request: {asked.url} {asked.failure}"))
+        self.page.on("request", request)
+
+
+@pytest.fixture(scope="session")
+def looked_at(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Directory of a small run of the pendulum whose attractors have been analysed."""
+    folder = tmp_path_factory.mktemp("looked-at")
+    (folder / "small.toml").write_text(SMALL, "utf-8")
+    run(folder / "small.toml", folder / "small", workers=1, echo=_silent)
+    derive(folder / "small", "attractors", {})
+    return folder / "small"
+
+
+def _silent(text: str) -> None:
+    """Print nothing."""
+
+
+@contextmanager
+def served(directory: Path) -> Iterator[str]:
+    """Serve the page of a run in a process of its own; gives its address."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "pipeline.cli.main", "explore", str(directory), "--no-browser"]
+    with subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
+        assert process.stdout is not None
+        try:
+            address = next((line.strip() for line in process.stdout if line.startswith("http://")), None)
+            assert address is not None, f"magpend explore ended with {process.wait()}"
+            yield address
+        finally:
+            process.terminate()
+
+
+@pytest.fixture(scope="module")
+def explorer(looked_at: Path) -> Iterator[str]:
+    """Address of the explorer that shows `looked_at`."""
+    with served(looked_at) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium, once for each file of tests."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = chromium()
+    if path is None:
+        pytest.skip("there is no chromium on this machine")
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def visit(browser: Any) -> Iterator[Callable[..., Opened]]:
+    """Open an address in a window of its own: ``visit(address, width=1440, height=900, **context)``."""
+    contexts = []
+
+    def go(address: str, width: int = 1440, height: int = 900, **options: Any) -> Opened:
+        context = browser.new_context(viewport={"width": width, "height": height}, **options)
+        contexts.append(context)
+        context.set_default_timeout(WAIT_MS)
+        opened = Opened(context.new_page())
+        opened.watch(address.split("/")[2])
+        opened.page.goto(address)
+        return opened
+
+    yield go
+    for context in contexts:
+        context.close()

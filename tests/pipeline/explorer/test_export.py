@@ -1,0 +1,312 @@
+"""Copies of a run: what they hold is what the cube holds, what they leave out they say."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import html.parser
+import json
+import re
+
+import numpy as np
+import pytest
+from pipeline.explorer.explored import ExploredRun
+
+from pipeline.explorer import folder as folder_module
+from pipeline.explorer.arrays import unpack_arrays
+from pipeline.explorer.columns import fit, levels, thinned
+from pipeline.explorer.copied_orbits import ALIKE, NEAREST, NONE, SAME_ATTRACTOR, choose
+from pipeline.explorer.export import export_page
+from pipeline.explorer.folder import export_folder
+from pipeline.explorer.gather import Column
+from pipeline.explorer.packing import packed
+from pipeline.store.errors import DamagedError, RefusedError
+from pipeline.store.run import Run
+
+HOSTILE = '</script><script>alert(1)</script><!-- \\" onload=alert(1) &lt;b'
+
+
+def _data(content: bytes):
+    """What an object holds, as the page reads it."""
+    arrays, attrs = unpack_arrays(gzip.decompress(content))
+    for name, place in attrs.pop("apart").items():
+        planes = np.ascontiguousarray(arrays[name].T)
+        arrays[name] = planes.view(np.dtype(place["dtype"]).newbyteorder("<")).reshape(place["shape"])
+    return arrays, attrs
+
+
+def _objects(path):
+    """Objects of data by name in a page."""
+    found = re.findall(
+        r'<script type="application/octet-stream;base64" id="data-([^"]+)">([^<]*)</script>',
+        path.read_text("utf-8"),
+    )
+    return {name: base64.b64decode(content) for name, content in found}
+
+
+def _about(objects):
+    content = json.loads(gzip.decompress(objects["view"]))
+    return content["view"], content["about"]
+
+
+@pytest.fixture
+def run(made):
+    """All of the small sweep but its last task."""
+    for index in range(made.plan.n_tasks - 1):
+        made.commit(index)
+    return Run.open(made.info.directory)
+
+
+def test_packed__is_read_back(tmp_path):
+    arrays = {
+        "a": np.arange(6, dtype=np.float64).reshape(2, 3) / 7,
+        "b": np.arange(3, dtype=np.uint8),
+        "c": np.empty(0),
+    }
+    back, attrs = _data(packed(arrays, {"k": [1, None]}))
+    assert attrs == {"k": [1, None]}
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(back[name], values)
+        assert back[name].shape == values.shape
+
+
+def test_export_page__has_the_cubes_numbers(run, tmp_path):
+    written = export_page(run, tmp_path / "copy.html", most_orbits=0)
+    assert written.size == (tmp_path / "copy.html").stat().st_size
+    objects = _objects(tmp_path / "copy.html")
+    view, about = _about(objects)
+    cube = run.cube()
+    status = cube["status"].values.ravel()
+    assert [d["name"] for d in about["dims"]] == list(run.plan.dims)
+    for i, state in enumerate(run.model.state_names):
+        arrays, _ = _data(objects[about["columns"][state]])
+        section = cube["section"].values[..., i].reshape(run.plan.n_cells, -1)
+        np.testing.assert_array_equal(arrays["count"], np.where(status == 2, section.shape[1], 0))
+        np.testing.assert_array_equal(arrays["y"], section[status == 2].ravel())
+    cells, _ = _data(objects["cells"])
+    np.testing.assert_array_equal(cells["status"], status)
+    assert {f"colour_{c['name']}" for c in view["colours"]} == set(cells) - {"status"}
+
+
+def test_export_page__of_an_incomplete_run_says_so(run, tmp_path):
+    written = export_page(run, tmp_path / "copy.html", most_orbits=0)
+    _, about = _about(_objects(tmp_path / "copy.html"))
+    pending = run.plan.cells_in(run.plan.n_tasks - 1)
+    sentence = f"{pending} of {run.plan.n_cells} cells were not computed"
+    assert any(sentence in s for s in written.sentences)
+    assert sentence in about["notice"]
+    assert "Nothing is computed here" in about["notice"]
+
+
+def test_export_page__leaves_out_what_does_not_fit_and_says_what(run, tmp_path):
+    whole = export_page(run, tmp_path / "whole.html", most_orbits=0)
+    assert not any("left out" in s for s in whole.sentences)
+    for share in (0.999, 0.99):
+        # random numbers do not shrink: first they are rounded, then sections go
+        room = round(whole.size * share)
+        name = tmp_path / f"{share}.html"
+        columns = sum(len(v) for k, v in _objects(tmp_path / "whole.html").items() if k.startswith("column"))
+        most = whole.size - round(4 / 3 * columns * (0.2 if share == 0.999 else 0.7)) + 10_000
+        written = export_page(run, name, most_orbits=0, most_bytes=max(most, room - whole.size))
+        assert written.size <= most
+        objects = _objects(name)
+        _, about = _about(objects)
+        arrays, _ = _data(objects[about["columns"]["psi1"]])
+        assert arrays["y"].dtype == np.float32
+        assert any("right to 6e-8" in s for s in written.sentences)
+
+
+def test_export_page__refuses_what_does_not_fit_at_all(run, tmp_path):
+    with pytest.raises(RefusedError, match="--folder OUT"):
+        export_page(run, tmp_path / "copy.html", most_orbits=0, most_bytes=10_000)
+    assert list(tmp_path.glob("*.html")) == []
+
+
+def test_thinned__keeps_a_period_of_closed_orbits_and_the_last_section_of_all():
+    column = Column(np.array([6, 0, 5, 4], np.uint32), np.arange(15, dtype=float))
+    found = thinned(column, np.array([2, 0, 0, 8]), 3)
+    np.testing.assert_array_equal(found.count, [2, 0, 2, 4])
+    np.testing.assert_array_equal(found.y, [4, 5, 7, 10, 11, 12, 13, 14])
+    assert thinned(column, np.array([2, 0, 0, 8]), 0) is column
+    every = thinned(column, np.zeros(4, int), 100)
+    np.testing.assert_array_equal(every.count, [1, 0, 1, 1])
+    np.testing.assert_array_equal(every.y, [5, 10, 14])
+
+
+def test_fit__gives_numbers_that_are_those_of_what_it_keeps():
+    rng = np.random.default_rng(1)
+    count = rng.integers(0, 50, 400).astype(np.uint32)
+    period = rng.integers(0, 3, 400)
+    columns = {name: Column(count, rng.normal(size=int(count.sum()))) for name in "ab"}
+    whole = fit(columns, period, 1e9)
+    assert (whole.kept, whole.level.dtype, whole.sentences()) == (int(count.sum()), "float64", [])
+    for most in (60_000, 40_000, 20_000):
+        found = fit(columns, period, most)
+        assert sum(map(len, found.objects.values())) <= most
+        arrays, _ = _data(found.objects["a"])
+        assert found.kept == len(arrays["y"]) == int(arrays["count"].sum())
+        assert found.closed == int(((count > 0) & (period > 0)).sum())
+        assert (
+            found.kept == found.total or f"{found.kept:,} of {found.total:,} points" in found.sentences()[-1]
+        )
+        first, here = np.cumsum(count) - count, np.cumsum(arrays["count"]) - arrays["count"]
+        last = count > 0
+        np.testing.assert_array_equal(
+            arrays["y"][(here + arrays["count"] - 1)[last]],
+            columns["a"].y[(first + count - 1)[last]].astype(np.float32),
+        )
+    assert fit(columns, period, 100) is None
+    assert [level.each for level in levels(5)][:5] == [0, 0, 1, 2, 3]
+
+
+def test_choose__an_orbit_for_each_attractor_else_the_nearest(run):
+    explored = ExploredRun.of(run)
+    shape = run.plan.shape
+    frequency = np.indices(shape)[0].ravel()
+    count = np.full(run.plan.n_cells, 3)
+    count[0] = 0
+    attractor = (np.arange(run.plan.n_cells) % 2).astype(np.uint16)
+    layers = {
+        "status": np.full(count.shape, 2, np.int8),
+        "colour_attractor": attractor,
+        "orbit_period": np.zeros(count.shape, np.int16),
+    }
+    chosen = choose(explored, layers, count, 1000)
+    assert chosen.groups == len(chosen.cells) == 5 * 2 * 2
+    assert chosen.orbit[0] == NONE
+    assert set(chosen.how[1:]) == {SAME_ATTRACTOR}
+    np.testing.assert_array_equal(attractor[chosen.cells[chosen.orbit[1:]]], attractor[1:])
+    np.testing.assert_array_equal(frequency[chosen.cells[chosen.orbit[1:]]], frequency[1:])
+
+    fewer = choose(explored, layers, count, 6)
+    assert len(fewer.cells) <= 6
+    assert fewer.groups == 20
+    there = np.flatnonzero(fewer.how == SAME_ATTRACTOR)
+    np.testing.assert_array_equal(frequency[fewer.cells[fewer.orbit[there]]], frequency[there])
+    assert set(fewer.how[1:]) == {SAME_ATTRACTOR, NEAREST}
+    # the nearest is one of the same attractor
+    np.testing.assert_array_equal(attractor[fewer.cells[fewer.orbit[1:]]], attractor[1:])
+
+    del layers["colour_attractor"]
+    assert set(choose(explored, layers, count, 1000).how[1:]) == {ALIKE}
+    none = choose(explored, layers, count, 0)
+    assert (len(none.cells), set(none.orbit)) == (0, {NONE})
+
+
+def test_export_folder__lists_every_object_and_pins_the_list(run, tmp_path):
+    written = export_folder(run, tmp_path / "site", most_orbits=0)
+    site = tmp_path / "site"
+    files = {p.relative_to(site).as_posix(): p.read_bytes() for p in site.rglob("*") if p.is_file()}
+    page, listed = files.pop("index.html"), files.pop("objects.json")
+    assert written.size == sum(map(len, [*files.values(), page, listed]))
+    assert f'data-objects="{hashlib.sha256(listed).hexdigest()}"' in page.decode()
+    assert {k: (v["size"], v["sha256"]) for k, v in json.loads(listed).items()} == {
+        k: (len(content), hashlib.sha256(content).hexdigest()) for k, content in files.items()
+    }
+    _, about = _about({"view": files["data/view.bin"]})
+    assert about["columns"]["psi2_dot"] == {"variable": "section", "own": [None, 3]}
+    assert not any(p.name.startswith(".") for p in tmp_path.iterdir())
+
+
+class _Scripts(html.parser.HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.scripts, self.title, self.tags, self._in_title = [], "", [], False
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self._in_title = tag == "title"
+        if tag == "script":
+            self.scripts.append(dict(attrs))
+
+    def handle_data(self, data):
+        if self._in_title:
+            self.title += data
+
+    def handle_endtag(self, tag):
+        self._in_title = False
+
+
+@pytest.mark.parametrize("kind", ["page", "folder"])
+def test_export__a_hostile_title_stays_text(run, tmp_path, kind, monkeypatch):
+    plain = tmp_path / "plain.html"
+    export_page(run, plain, most_orbits=0)
+    monkeypatch.setitem(run.info.__dict__, "title", HOSTILE)
+    if kind == "page":
+        path = tmp_path / "copy.html"
+        export_page(run, path, most_orbits=0)
+    else:
+        path = export_folder(run, tmp_path / "site", most_orbits=0).path / "index.html"
+    text = path.read_text("utf-8")
+    assert "<script>alert" not in text
+    found, before = _Scripts(), _Scripts()
+    found.feed(text)
+    before.feed(plain.read_text("utf-8"))
+    assert found.title == f"{HOSTILE} - magpend"
+    if kind == "page":
+        assert [s.get("id") for s in found.scripts] == [s.get("id") for s in before.scripts]
+        assert found.tags == before.tags
+
+
+def test_export__what_is_there_is_not_overwritten(run, tmp_path):
+    page = tmp_path / "copy.html"
+    page.write_text("mine")
+    with pytest.raises(RefusedError, match="exists already"):
+        export_page(run, page, most_orbits=0)
+    assert page.read_text() == "mine"
+    export_page(run, page, most_orbits=0, force=True)
+    assert page.read_bytes().startswith(b"<!doctype html>")
+    with pytest.raises(RefusedError, match="no such folder"):
+        export_page(run, tmp_path / "absent" / "copy.html", most_orbits=0)
+    with pytest.raises(RefusedError, match="is a folder"):
+        export_page(run, tmp_path, most_orbits=0, force=True)
+
+    site = tmp_path / "site"
+    export_folder(run, site, most_orbits=0)
+    with pytest.raises(RefusedError, match="exists already"):
+        export_folder(run, site, most_orbits=0)
+    export_folder(run, site, most_orbits=0, force=True)
+    (site / "thesis.tex").write_text("mine")
+    with pytest.raises(RefusedError, match="not a folder that magpend export has made"):
+        export_folder(run, site, most_orbits=0, force=True)
+    assert (site / "thesis.tex").read_text() == "mine"
+
+
+def test_export_folder__that_fails_leaves_what_was_there(run, tmp_path, monkeypatch):
+    site = tmp_path / "site"
+    export_folder(run, site, most_orbits=0)
+    before = (site / "objects.json").read_bytes()
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(folder_module, "write_cube", fail)
+    with pytest.raises(OSError, match="No space"):
+        export_folder(run, site, most_orbits=0, force=True)
+    assert (site / "objects.json").read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+def test_export__of_a_damaged_run_is_refused(run, tmp_path):
+    chunk = next((run.directory / "cube.zarr" / "section").glob("c.*"))
+    chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0")
+    for write, name in ((export_page, "copy.html"), (export_folder, "site")):
+        with pytest.raises(DamagedError, match="section"):
+            write(run, tmp_path / name, most_orbits=0)
+        assert not (tmp_path / name).exists()
+
+
+def test_export__command(main, run, tmp_path):
+    code, out, err = main("export", run.directory, "--orbits", 0)
+    assert code == 0, err
+    assert "page: run.html" in out
+    assert "cells were not computed" in err
+    assert (tmp_path / "run.html").stat().st_size < 20e6
+    assert main("export", run.directory, "--orbits", 0)[0] == 2
+    assert main("export", run.directory, "--page", "a.html", "--folder", "b")[0] == 2
+    code, _, err = main("export", run.directory, "--page", "a.txt")
+    assert (code, "suffix" in err) == (2, True)
+    code, out, err = main("export", run.directory, "--folder", "site", "--orbits", 0)
+    assert code == 0, err
+    assert "site/index.html" in out

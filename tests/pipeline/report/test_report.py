@@ -1,0 +1,118 @@
+"""``magpend report``: what it says of a run is what the run says, and its commands give it."""
+
+from __future__ import annotations
+
+import html as markup
+import math
+import re
+import shlex
+
+import pytest
+
+from pipeline.report.report import report
+from pipeline.report.stored import stored_options
+from pipeline.runs.derive import derive
+from pipeline.spec.problems import SpecError
+from pipeline.store.run import Run
+
+HOSTILE = "<script>alert(1)</script> & friends"
+SWEEP = f"""
+kind = "sweep"
+title = "{HOSTILE}"
+[axes]
+frequency_hz = {{ values = [2.6, 2.8] }}
+[initial_conditions]
+kind = "grid"
+psi1_deg = {{ start = -10, stop = 10, num = 3 }}
+psi2_deg = {{ start = -10, stop = 10, num = 2 }}
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 200
+n_keep = 16
+stop_when_closed = true
+closure_tolerance = 1e-2
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    from pipeline.runs.run import run
+
+    folder = tmp_path_factory.mktemp("report")
+    (folder / "spec.toml").write_text(SWEEP)
+    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda _: None)
+    return folder
+
+
+def written(command, folder, *words):
+    command(folder, "report", *words)
+    return (folder / "report.html").read_text("utf-8")
+
+
+def wilson(count, n, z=1.959964):
+    """Share and score interval (Wilson, 1927), as the page spells them."""
+    share = count / n
+    middle = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    return f"{share:.3f} ({middle - half:.3f} to {middle + half:.3f})"
+
+
+def test_report__only_stored_computes_nothing(folder, command):
+    html = written(command, folder, "run", "--only-stored")
+    assert not (folder / "run" / "derived").exists()
+    assert "magpend analyse attractors run" in html
+    assert html.count("<img") == 1
+
+
+def test_report__of_a_sweep(folder, command):
+    html = written(command, folder, "run")
+    assert "<script" not in html
+    assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; friends" in html
+    run = Run.open(folder / "run")
+    assert run.digest in html
+    found = derive(run, "attractors")
+    rows = re.findall(r"<tr><td>([A-Z])</td>(.*?)</tr>", html)
+    assert [row[0] for row in rows] == [chr(65 + int(i)) for i in found["attractor"].values]
+    ids = found["attractor_id"].values.reshape(2, 6)
+    shares = [re.findall(r"<td>(.*?)</td>", row[1])[-1] for row in rows]
+    for i, share in zip(found["attractor"].values, shares, strict=True):
+        assert share.partition(" at")[0] == wilson(max((ids == i).sum(1)), 6)
+    assert html == written(command, folder, "run")
+
+
+def test_report__its_commands_work(folder, command):
+    html = written(command, folder, "run", "--with", "branches")
+    commands = [markup.unescape(c) for c in re.findall(r'<p class="command"><code>(.*?)</code>', html)]
+    mine = [c for c in commands if re.match(r"magpend (analyse|plot) ", c) and "chaos" not in c]
+    assert {"magpend plot basins", "magpend analyse branches", "magpend plot gallery"} <= {
+        " ".join(c.split()[:3]) for c in mine
+    }
+    for c in mine:
+        _, notes = command(folder, *shlex.split(c)[1:])
+        assert not re.search(r": computed", notes), c
+
+
+def test_report__several_runs(folder, command):
+    command(folder, "run", "spec.toml", "--out", "second", "--workers", "0")
+    page = report([str(folder / "run"), str(folder / "second")], only_stored=True, echo=lambda _: None)
+    assert page.title == "2 runs"
+    assert [part.title for part in page.parts] == [HOSTILE, HOSTILE]
+    assert len(page.summary[0].rows) == 2
+
+
+def test_report__what_is_refused(folder, command):
+    with pytest.raises(SpecError, match="unknown analysis 'branch'; did you mean branches"):
+        report([str(folder / "run")], also=["branch"], echo=lambda _: None)
+    with pytest.raises(AssertionError, match=r"suffix must be \.html"):
+        command(folder, "report", "run", "--out", "page.pdf")
+    with pytest.raises(AssertionError, match="no run directory"):
+        command(folder, "report", "nowhere")
+
+
+def test_stored_options__of_these_cells(folder):
+    run = Run.open(folder / "run")
+    derive(run, "attractors")
+    derive(run, "attractors", {"n_points": 8})
+    assert stored_options(run, "attractors") == [{}, {"n_points": 8}]
+    assert stored_options(run, "curves") == []
