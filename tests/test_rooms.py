@@ -33,6 +33,7 @@ PENDULUM = {
 KNOWS_A_PART = {
     "pipeline/rig/__init__.py": ("its magnets", "says that the measurement of their torque is here"),
     "pipeline/rig/magnet": ("its magnets", "the paper's measurement of their torque, named for it"),
+    "pipeline/report/torque_curves.py": ("its magnets", "reports on the fit of that measurement"),
     "pipeline/cli/main.py": ("its magnets", "lists the command of that measurement"),
     "pipeline/cli/magnet.py": ("its magnets", "is the command of that measurement"),
 }

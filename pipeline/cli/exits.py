@@ -14,6 +14,7 @@ class Exit(IntEnum):
     LOCKED = 3
     FAILED = 4
     DAMAGED = 5
+    CONTRADICTED = 6
     HUNG_UP = 129
     INTERRUPTED = 130
     TERMINATED = 143
@@ -31,6 +32,7 @@ _SENTENCES = {
     Exit.LOCKED: "another process is writing to the run directory",
     Exit.FAILED: "a computation failed; what is committed stays, the same command goes on",
     Exit.DAMAGED: "stored data are damaged",
+    Exit.CONTRADICTED: "a study's required claim is contradicted; its report says which",
     Exit.INTERRUPTED: "stopped by Ctrl-C; what is committed stays, the same command goes on",
     Exit.TERMINATED: "stopped by SIGTERM; likewise",
     Exit.HUNG_UP: "stopped because its terminal was closed; likewise",

@@ -202,6 +202,7 @@ def _orbit(
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The orbit from a cell's last section, in the digits and at the instants that there is room for."""
     arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
+    del arrays["section"]  # the columns have it, of every cell
     if room.brief:
         arrays = brief(arrays, closed=attrs["period"] is not None)
     return {

@@ -17,8 +17,9 @@ from magpend_core.status import Status
 from pipeline.explorer.arrays import unpack_arrays
 from pipeline.explorer.diagram import points
 from pipeline.explorer.explored import ExploredRun
-from pipeline.explorer.overlays import attractors, branches, curves, plane
+from pipeline.explorer.overlays import attractors, branches, curves
 from pipeline.explorer.packing import packed, packed_json
+from pipeline.explorer.planes import plane
 from pipeline.explorer.verticals import Vertical
 from pipeline.explorer.view import describe_view
 from pipeline.plots.points import DRAWN
@@ -92,21 +93,19 @@ def gather(run: ExploredRun) -> Copied:
             f"The run was not complete: {cells['pending']:,} of {cells['total']:,} cells were not computed."
         )
     lines = [(a.name, place) for a in run.axes for place in places(run, but=a.name)]
+    heights = [str(v["name"]) for v in view["verticals"]]
     _answers(copied, "curves", ((place_key(run, at, x), partial(curves, run, x, at)) for x, at in lines))
-    if view["has"]["branches"]:
-        heights = [str(v["name"]) for v in view["verticals"]]
-        asked = (
-            (f"y={y}&{place_key(run, at, x)}", partial(branches, run, x, y, at))
-            for y in heights
-            for x, at in lines
-        )
-        _answers(copied, "branches", asked)
-    if view["has"]["attractors"]:
-        _answers(
-            copied, "attractors", ((place_key(run, at), partial(attractors, run, at)) for at in places(run))
-        )
-    for kind in ("curves", "branches", "attractors"):
-        about["answers"].setdefault(kind, {"blocks": {}, "missing": ""})
+    known = view["has"]
+    # what is not computed has one answer everywhere: how to compute it
+    asked = ((y, x, at) for y in (heights if known["branches"] else heights[:1]) for x, at in lines)
+    _answers(
+        copied,
+        "branches",
+        ((f"y={y}&{place_key(run, at, x)}", partial(branches, run, x, y, at)) for y, x, at in asked),
+        alike=not known["branches"],
+    )
+    everywhere = ((place_key(run, at), partial(attractors, run, at)) for at in places(run))
+    _answers(copied, "attractors", everywhere, alike=not known["attractors"])
     return copied
 
 
@@ -123,12 +122,20 @@ def place_key(run: ExploredRun, at: Mapping[str, int], x: str = "") -> str:
     return "&".join([*([f"x={x}"] if x else []), *parts])
 
 
-def _answers(copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], Any]]]) -> None:
-    """Put the answers of a kind into objects of about equal size; of too many, none."""
-    asked = list(itertools.islice(asked, MOST_PLACES + 1))
+def _answers(
+    copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], Any]]], alike: bool = False
+) -> None:
+    """Put the answers of a kind into objects of about equal size; of too many, none.
+
+    If they are all alike, the first stands for all.
+    """
+    asked = list(itertools.islice(asked, 1 if alike else MOST_PLACES + 1))
+    if alike:
+        copied.about["answers"][kind] = {"blocks": {}, "missing": "", "alike": asked[0][1]()}
+        return
     if len(asked) > MOST_PLACES:
         text = f"The {kind} are not in this copy: there are more than {MOST_PLACES:,} places of the axes."
-        copied.about["answers"][kind] = {"blocks": {}, "missing": text}
+        copied.about["answers"][kind] = {"blocks": {}, "missing": text, "alike": None}
         copied.sentences.append(text)
         return
     blocks: dict[str, int] = {}
@@ -143,7 +150,7 @@ def _answers(copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], 
             held, number, size = {}, number + 1, 0
     if held:
         copied.objects[f"{kind}-{number}"] = packed_json(held)
-    copied.about["answers"][kind] = {"blocks": blocks, "missing": ""}
+    copied.about["answers"][kind] = {"blocks": blocks, "missing": "", "alike": None}
 
 
 def add_planes(copied: Copied, most_bytes: float) -> None:

@@ -16,6 +16,7 @@ from pipeline.analysis.selection import place, snap
 from pipeline.layout.vocabulary import told_by
 from pipeline.plots.files import with_provenance
 from pipeline.plots.style import DataFigure, Frame
+from pipeline.products.animation import AnimationOptions
 from pipeline.products.product import FigureOptions, Options, function_of
 from pipeline.products.registry import FIGURES
 
@@ -97,7 +98,7 @@ def frame_of(options: FigureOptions) -> Frame:
     return Frame(options.width, options.xlim, options.ylim)
 
 
-def values_of(run: Run, options: FigureOptions) -> tuple[dict[str, float], list[str]]:
+def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict[str, float], list[str]]:
     """Return the values of axes that are drawn, and what to say where they are not those asked for.
 
     Raises

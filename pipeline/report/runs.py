@@ -202,7 +202,7 @@ def _attractors(shown: Shown) -> Iterator[Block]:
     except SpecError as error:
         yield Note(str(error))
         return
-    command = _command("analyse attractors", options, shown)
+    command = command_of("analyse attractors", options, shown.directory)
     rows = list(function_of(ANALYSES["attractors"].table)(found).rows)
     yield Grid(
         *_attractor_grid(found, rows, shown.axes),
@@ -293,7 +293,7 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
         yield Note(str(error))
         return
     rows = [_with_letters(row) for row in function_of(ANALYSES[name].table)(found).rows]
-    command = _command(f"analyse {name}", options, shown)
+    command = command_of(f"analyse {name}", options, shown.directory)
     if rows:
         yield grid_of(rows, _CAPTIONS[name], command)
     else:
@@ -354,7 +354,7 @@ def _drawn(shown: Shown, name: str, caption: str, **options: Any) -> Iterator[Bl
         return
     notes = "".join(f" {note}." for note in drawn.notes)
     words = f"{caption} of {shown.run.info.title or shown.run.name}"
-    yield picture_of(drawn, words, f"{caption}.{notes}", _command(f"plot {name}", options, shown))
+    yield picture_of(drawn, words, f"{caption}.{notes}", command_of(f"plot {name}", options, shown.directory))
 
 
 def _missing(shown: Shown, name: str) -> Note:
@@ -362,7 +362,7 @@ def _missing(shown: Shown, name: str) -> Note:
     return Note(f"Not computed. To {does[0].lower()}{does[1:]}", f"magpend analyse {name} {shown.directory}")
 
 
-def _command(words: str, options: Mapping[str, Any], shown: Shown) -> str:
+def command_of(words: str, options: Mapping[str, Any], place: str) -> str:
     """Return the command that gives one thing alone."""
     verb, _, name = words.partition(" ")
     model = (ANALYSES if verb == "analyse" else FIGURES)[name].options
@@ -376,7 +376,7 @@ def _command(words: str, options: Mapping[str, Any], shown: Shown) -> str:
             parts += [f"{flag} {k}={v:.10g}" for k, v in value.items()]
         else:
             parts.append(f"{flag} {shlex.quote(text_of_option(value))}")
-    return " ".join(["magpend", words, shown.directory, *parts])
+    return " ".join(["magpend", words, place, *parts])
 
 
 def text_of_option(value: Any) -> str:

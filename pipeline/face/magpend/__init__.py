@@ -43,6 +43,8 @@ _HOMES = {
     "pipeline.runs.zoom": ("zoom",),
     "pipeline.runs.derive": ("derive", "prune"),
     "pipeline.runs.drawing": ("figure",),
+    "pipeline.runs.filming": ("animation",),
+    "pipeline.plots.films": ("save_animation",),
     "pipeline.rig.identify.identification": ("identify",),
     "pipeline.rig.recordings": (
         "findings_of", "load_mapping", "read_recording", "smooth", "window", "write_recording",

@@ -46,6 +46,7 @@ function build(source, root, view, messages) {
   const reader = {
     say: (text) => messages.say(text),
     problem: (error) => messages.problem(error, error ? () => diagram.load() : null),
+    help: () => toolbar.showHelp(),
     told: ({ count, data, attrs }) => {
       legend.setPresent(data);
       messages.facts.textContent = factsOf(view, count, data, attrs);
@@ -63,7 +64,7 @@ function build(source, root, view, messages) {
   const right = el("div", { class: "side-column" });
   const layout = el("div", { class: "layout" }, left, right);
   root.replaceChildren(
-    header(view, state), messages.banner, messages.notes, messages.progress, tabs(state, root, left, right), layout, messages.line,
+    header(view, state, toolbar.helpButton), messages.banner, messages.notes, messages.progress, tabs(state, root, left, right), layout, messages.line,
   );
   mountPanels(state, source, right).catch((error) => messages.problem(error));
   keepAddress(state, view);
@@ -71,11 +72,11 @@ function build(source, root, view, messages) {
   window.magpend = { state, source, diagram };
 }
 
-function header(view, state) {
+function header(view, state, help) {
   const name = view.title && view.title !== view.name ? el("span", { class: "run-name", text: view.name }) : null;
   return el("header", { class: "page-header" },
     el("div", { class: "titles" }, el("h1", { text: view.title || view.name }), name, el("span", { class: "run-name", text: view.model.title })),
-    themeSwitch(state));
+    el("div", { class: "page-buttons" }, help, themeSwitch(state)));
 }
 
 /** One line on what is shown. */
@@ -91,7 +92,7 @@ function factsOf(view, count, data, attrs) {
 function notesOf(source, view) {
   const notes = [], { total, pending } = view.cells;
   if (source.notice) notes.push(source.notice);
-  if (pending) {
+  if (pending && !source.notice) {
     const share = told((100 * (total - pending)) / total);
     notes.push(`This run is not complete: ${pending.toLocaleString("en")} of ${total.toLocaleString("en")} cells are pending (${share} % done). Go on with magpend run, then reload this page.`);
   }

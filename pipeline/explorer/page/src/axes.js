@@ -141,7 +141,7 @@ export function placeY(box, [, , y0, y1], y) {
 export function paintAxes(ctx, box, bounds, axes, colours) {
   const { left, top, width, height } = box;
   const xs = (axes.x.angle ? angleTicks : ticksOf)(bounds[0], bounds[1], Math.max(2, Math.floor(width / 80)));
-  const ys = (axes.y.angle ? angleTicks : ticksOf)(bounds[2], bounds[3], Math.max(2, Math.floor(height / (height < 150 ? 30 : 44))));
+  const ys = (axes.y.angle ? angleTicks : ticksOf)(bounds[2], bounds[3], Math.max(2, Math.floor(height / (height < 150 ? 22 : 44))));
   ctx.font = FONT;
   ctx.lineWidth = 1;
   ctx.strokeStyle = colours.grid;

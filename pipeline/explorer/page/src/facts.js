@@ -30,7 +30,10 @@ function rows(orbit, view) {
   if (attrs.attractor !== null && attrs.attractor !== undefined) found.push(["Attractor", attractorName(attrs.attractor, view)]);
   const told = share(attrs);
   if (told) found.push(["Share of the starts", told]);
-  if (attrs.exponents?.length) found.push(["Lyapunov exponents", attrs.exponents.map((value) => number(value, 3)).join(", ")]);
+  if (attrs.exponents?.length) {
+    const from = attrs.exponents_from ? ` (from the ${attrs.exponents_from})` : "";
+    found.push(["Lyapunov exponents [1/s]", attrs.exponents.map((value) => number(value, 3)).join(", ") + from]);
+  }
   return found;
 }
 

@@ -29,6 +29,7 @@ export function onKey(event, diagram) {
     diagram.moveTo([x0 + dx, x1 + dx, y0 + dy, y1 + dy]);
   } else if (event.key === "+" || event.key === "=") diagram.moveTo(scaled(diagram.window, ...middle, 0.8, 0.8));
   else if (event.key === "-" || event.key === "_") diagram.moveTo(scaled(diagram.window, ...middle, 1.25, 1.25));
+  else if (event.key === "?") diagram.reader.help();
   else if (event.key === "0" || event.key === "Home") diagram.reset();
   else if (event.key === "Enter" || event.key === " ") diagram.walk("right");
   else if (event.key === "Escape") {

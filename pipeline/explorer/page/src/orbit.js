@@ -12,7 +12,8 @@ export class Orbit {
     this.time = packed.arrays.time ?? new Float64Array(0);
     this.columns = new Map();
     split(packed, "states", model.states, this.columns);
-    split(packed, "quantities", model.quantities ?? [], this.columns);
+    const kept = packed.attrs.quantities?.map((name) => ({ name })) ?? model.quantities ?? [];
+    split(packed, "quantities", kept, this.columns);
     this.sections = new Map();
     split(packed, "section", model.states, this.sections);
     this.n = this.time.length;
@@ -60,9 +61,9 @@ export function withUnit({ label, name, unit }) {
   return unit && unit !== "1" ? `${text} [${unit}]` : text;
 }
 
-/** Colour of an orbit: its attractor's where it attracts, a warning's where it does not. */
+/** Colour of an orbit: its attractor's where it attracts; where it does not, the ink's, which no attractor has. */
 export function colourOf(orbit, view, colours) {
-  if (orbit.stable === false) return colours.warn;
+  if (orbit.stable === false) return colours.ink;
   const attractors = view.colours?.find((entry) => entry.name === "attractor");
   const category = attractors?.categories.find((entry) => entry.id === orbit.attrs.attractor);
   return category?.colour ?? colours.accent;

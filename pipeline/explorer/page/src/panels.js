@@ -78,6 +78,7 @@ class Panels {
       return;
     }
     this.grid.setAttribute("aria-busy", "true");
+    if (this.grid.hidden) this.say("Integrating the orbit …");
     let packed;
     try {
       packed = await this.source.orbit(selected);
@@ -134,7 +135,9 @@ class Panels {
       onPiece(kind, piece);
     });
     this.startJob = job;
-    return job.done;
+    const end = await job.done;
+    if (job === this.startJob && end.colour) this.portraits.endLive(end.colour);
+    return end;
   }
 
   destroy() {

@@ -96,24 +96,23 @@ export class ExportSource {
   }
 
   /** An answer that was written for one place of the axes. */
-  async answer(kind, key, empty) {
-    const { blocks, missing } = this.about.answers[kind];
-    const block = blocks[key];
-    if (block !== undefined) return (await this.json(`${kind}-${block}`))[key];
-    if (missing) throw new SourceError(missing);
-    return empty;
+  async answer(kind, key) {
+    const { blocks, missing, alike } = this.about.answers[kind];
+    if (alike) return alike;
+    if (blocks[key] === undefined) throw new SourceError(missing || `This copy has no ${kind} here.`);
+    return (await this.json(`${kind}-${blocks[key]}`))[key];
   }
 
   curves({ x, at }) {
-    return this.answer("curves", placeKey(this.described.axes, at, x), { curves: [] });
+    return this.answer("curves", placeKey(this.described.axes, at, x));
   }
 
   branches({ x, y, at }) {
-    return this.answer("branches", `y=${y}&${placeKey(this.described.axes, at, x)}`, { branches: [], points: [] });
+    return this.answer("branches", `y=${y}&${placeKey(this.described.axes, at, x)}`);
   }
 
   attractors({ at }) {
-    return this.answer("attractors", placeKey(this.described.axes, at), { attractors: [] });
+    return this.answer("attractors", placeKey(this.described.axes, at));
   }
 
   async plane({ at }) {
@@ -133,16 +132,16 @@ export class ExportSource {
     if (k === undefined || k === NONE) throw new SourceError("This cell has no points, so it has no orbit.");
     const stored = await this.packed(`orbits-${blocks.findLastIndex((first) => first <= k)}`);
     const { arrays, shapes } = partOf(stored, `${k}.`), attrs = { ...stored.attrs[k] };
-    attrs.note = this.noteOf(attrs, cell, index.arrays.how[cell]);
-    if (index.arrays.how[cell] <= 2 && attrs.cell !== cell) {
-      const own = await this.sections(cell), status = await this.layers({ ...this.single(cell) });
-      arrays.section = own.values;
-      shapes.section = own.shape;
-      attrs.status = this.about.status[status.status[0]] ?? attrs.status;
-      attrs.start = null;
+    const how = index.arrays.how[cell], same = how <= 2;
+    attrs.note = this.noteOf(attrs, cell, how);
+    const sections = await this.sections(same ? cell : attrs.cell);
+    arrays.section = sections.values;
+    shapes.section = sections.shape;
+    if (same && attrs.cell !== cell) {
+      const { status } = await this.layers(this.single(cell));
+      Object.assign(attrs, { status: this.about.status[status[0]] ?? attrs.status, start: null });
     }
-    attrs.stored = attrs.cell;
-    Object.assign(attrs, { cell, point });
+    Object.assign(attrs, { stored: attrs.cell, cell, point });
     return { attrs, arrays, shapes };
   }
 

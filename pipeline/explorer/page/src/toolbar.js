@@ -17,7 +17,7 @@ export class Toolbar {
     this.help = this.dialog();
     this.fields = el("div", { class: "fields" });
     this.toggles = el("div", { class: "toggles" });
-    this.element.append(this.fields, this.toggles, this.buttons(formats), this.help);
+    this.element.append(this.fields, this.toggles, this.buttons(formats));
     state.on(["x", "y", "at", "colour", "overlays"], () => this.show());
     this.show();
   }
@@ -75,8 +75,7 @@ export class Toolbar {
     return el("div", { class: "buttons" },
       button("+", "Zoom in", () => doing.zoom(0.6)), button("−", "Zoom out", () => doing.zoom(1 / 0.6)), button("All", "Show all", () => doing.reset()),
       this.menu("Save", pictures.concat(data)), this.menu("Zoom here", region, "A run of what the window shows, with more points"),
-      ...this.absent(),
-      button("?", "Keys and gestures", () => this.showHelp()));
+      ...this.absent());
   }
 
   /** What is not computed yet, with the commands that do. */
@@ -109,6 +108,12 @@ export class Toolbar {
     const rows = KEYS.map(([key, text]) => el("div", {}, el("dt", {}, el("kbd", { text: key })), el("dd", { text })));
     const close = el("button", { type: "button", text: "Close", on: { click: () => this.help.close() } });
     return el("dialog", { class: "help", "aria-label": "Keys and gestures" }, el("h2", { text: "Keys and gestures" }), el("dl", {}, ...rows), close);
+  }
+
+  /** The button that shows the keys, and what it shows: they stand outside of the toolbar. */
+  get helpButton() {
+    const button = el("button", { type: "button", "aria-label": "Keys and gestures", title: "Keys and gestures", text: "?", on: { click: () => this.showHelp() } });
+    return el("span", {}, button, this.help);
   }
 
   showHelp() {

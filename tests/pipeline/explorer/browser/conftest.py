@@ -107,7 +107,7 @@ def _silent(text: str) -> None:
 def served(directory: Path) -> Iterator[str]:
     """Serve the page of a run in a process of its own; gives its address."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "pipeline.cli.entry", "explore", str(directory), "--no-browser"]
+    command = [sys.executable, "-m", "pipeline.cli.main", "explore", str(directory), "--no-browser"]
     with subprocess.Popen(
         command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as process:

@@ -63,9 +63,9 @@ def _asked(page, name, *arguments):
     """What the page's source answers: attributes, and arrays as lists."""
     return page.evaluate(
         """async ([name, arguments_]) => {
-          const answer = await window.magpend.source[name](...arguments_);
-          if (!answer.arrays) return answer;
-          return { attrs: answer.attrs, arrays: Object.fromEntries(Object.entries(answer.arrays).map(([k, v]) => [k, Array.from(v)])) };
+          const { attrs, arrays } = await window.magpend.source[name](...arguments_);
+          const lists = Object.entries(arrays).map(([k, v]) => [k, Array.from(v)]);
+          return { attrs, arrays: Object.fromEntries(lists) };
         }""",
         [name, list(arguments)],
     )
@@ -82,8 +82,12 @@ def _compare(page, run):
             found = _asked(page, "diagram", query)
             assert set(found["arrays"]) == set(arrays)
             for name, values in arrays.items():
-                np.testing.assert_array_equal(np.array(found["arrays"][name]), values, err_msg=f"{query} {name}")
-            assert {k: found["attrs"][k] for k in ("x", "y", "unit", "at")} == {k: attrs[k] for k in ("x", "y", "unit", "at")}
+                np.testing.assert_array_equal(
+                    np.array(found["arrays"][name]), values, err_msg=f"{query} {name}"
+                )
+            assert {k: found["attrs"][k] for k in ("x", "y", "unit", "at")} == {
+                k: attrs[k] for k in ("x", "y", "unit", "at")
+            }
 
 
 @pytest.mark.parametrize("form", ["file", "folder"])
@@ -150,18 +154,7 @@ def test_folder__says_which_chunk_is_damaged(visit, copies, hosted, tmp_path):
     assert "sha256" in banner.inner_text()
     # another state's column is whole
     page.evaluate("window.magpend.state.set({y: 'psi2'})")
-    _drawn(visit_same(page))
-
-
-def visit_same(page):
-    """As what `visit` gives, of a page that is open."""
-
-    class Same:
-        pass
-
-    same = Same()
-    same.page = page
-    return same
+    page.locator(".facts-line", has_text="points").wait_for()
 
 
 def test_folder__an_edited_list_of_digests_is_noticed(visit, copies, hosted, tmp_path):
@@ -177,7 +170,9 @@ def test_folder__an_edited_list_of_digests_is_noticed(visit, copies, hosted, tmp
 def test_file__of_which_an_object_is_damaged_says_so(visit, copies, tmp_path):
     text = (copies / "copy.html").read_text("utf-8")
     place = text.index('id="data-column-0">') + 600
-    (tmp_path / "copy.html").write_text(f"{text[:place]}{'A' if text[place] != 'A' else 'B'}{text[place + 1 :]}", "utf-8")
+    (tmp_path / "copy.html").write_text(
+        f"{text[:place]}{'A' if text[place] != 'A' else 'B'}{text[place + 1 :]}", "utf-8"
+    )
     page = visit((tmp_path / "copy.html").as_uri()).page
     page.locator(".banner", has_text="damaged").wait_for()
 
@@ -197,8 +192,9 @@ def test_copy__of_two_axes_shows_each(visit, made, hosted, tmp_path, form):
     page = _drawn(opened)
     _compare(page, run)
     assert "cells were not computed" in page.locator(".notes").inner_text()
+    query = {"x": "q", "y": "psi1", "at": {"frequency": 1}}
     csv = page.evaluate(
-        "window.magpend.source.table('diagram', {x: 'q', y: 'psi1', at: {frequency: 1}}, 'csv').then((blob) => blob.text())"
+        "(query) => window.magpend.source.table('diagram', query, 'csv').then((blob) => blob.text())", query
     )
     arrays, _ = unpack_arrays(diagram(run, "q", "psi1", {"frequency": 1}))
     rows = [line.split(",") for line in csv.splitlines()]

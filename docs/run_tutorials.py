@@ -1,0 +1,215 @@
+"""Do what the tutorials say: ``python docs/run_tutorials.py [--pictures] [PAGE...]``.
+
+Each page is executed in a folder of its own, in this process but for what runs in the background. Marks in
+comments, which no reader sees, stand before blocks:
+
+    <!-- file: NAME -->       the block is written to this file
+    <!-- file: NAME; quick: LINE | LINE -->   and so are these lines, which make the work smaller
+    <!-- run -->              commands of magpend, or Python, are executed
+    <!-- background -->       each line is a program that runs until the page ends
+    <!-- printed -->          each line is among what the blocks before printed, numbers to a thousandth
+    <!-- picture: FILE -->    the picture in the next line is this file
+
+With ``--pictures`` they are written into the docs. Runs compute in this process (``--workers 0``), which is
+all that is different from typing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).resolve().parent
+PAGES = {path.stem: path for path in (*sorted((DOCS / "tutorials").glob("*.md")), DOCS / "rig.md")}
+PATIENCE_S = 60.0
+
+_BLOCK = re.compile(r"<!-- (file|run|background|printed)(?:: ([^>]*?))? -->\n```(\w*)\n(.*?)```", re.DOTALL)
+_PICTURE = re.compile(r"<!-- picture: (\S+) -->\n!\[[^\]]*\]\(([^)]+)\)")
+_NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+
+
+class TutorialError(AssertionError):
+    """A page says what is not so."""
+
+
+@dataclass
+class Session:
+    """A reader at work.
+
+    Attributes
+    ----------
+    folder : Path
+    printed : str
+        All that was printed so far.
+    names : dict
+        Of the Python blocks.
+    started : list
+        Programs in the background.
+    """
+
+    folder: Path
+    printed: str = ""
+    names: dict[str, Any] = field(default_factory=dict)
+    started: list[Any] = field(default_factory=list)
+
+    def do(self, kind: str, about: str, language: str, text: str) -> None:
+        """Do what a block says."""
+        if kind == "file":
+            name, _, quick = about.partition("; quick: ")
+            more = "".join(f"{line.strip()}\n" for line in quick.split("|")) if quick else ""
+            (self.folder / name).write_text(text + more, "utf-8")
+        elif kind == "background":
+            self.start(text.splitlines())
+        elif kind == "printed":
+            self.check(text)
+        elif language == "python":
+            with self.listening():
+                exec(compile(text, "tutorial", "exec"), self.names)
+        else:
+            for line in re.sub(r"\\\n\s*", " ", text).splitlines():
+                words = shlex.split(line, comments=True)
+                if words:
+                    self.command(words)
+
+    def command(self, words: list[str]) -> None:
+        """Call a command of magpend, which must succeed."""
+        from pipeline.cli.main import main
+
+        if words[0] != "magpend":
+            raise TutorialError(f"{words[0]}: only commands of magpend are run")
+        if words[1] == "run" and not {"--scheduler", "--dry-run"} & set(words):
+            words = [*words, "--workers", "0"]
+        before, sys.argv = sys.argv, words
+        code: Any = 0
+        try:
+            with self.listening():
+                main()
+        except SystemExit as end:
+            code = end.code
+        finally:
+            sys.argv = before
+        if code:
+            raise TutorialError(f"{shlex.join(words)}: exit code {code}\n{self.printed[-2000:]}")
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Be in the folder, and keep what is printed."""
+        text, before = io.StringIO(), Path.cwd()
+        os.chdir(self.folder)
+        try:
+            with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
+                yield
+        finally:
+            os.chdir(before)
+            self.printed += text.getvalue()
+
+    def start(self, lines: list[str]) -> None:
+        """Start programs, and wait for the files that a later one is told of."""
+        places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+        packages = os.pathsep.join([str(DOCS.parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+        around = {**os.environ, "PATH": places, "PYTHONPATH": packages}
+        for line in lines:
+            words = shlex.split(line, comments=True)
+            if self.started:
+                self._wait([self.folder / word for word in words if word.endswith(".json")])
+            self.started.append(
+                subprocess.Popen(
+                    words, cwd=self.folder, env=around, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+                )
+            )
+
+    def _wait(self, files: list[Path]) -> None:
+        until = time.monotonic() + PATIENCE_S
+        while not all(file.exists() for file in files):
+            if time.monotonic() > until or self.started[-1].poll() is not None:
+                raise TutorialError(f"{files[0].name}: did not appear")
+            time.sleep(0.05)
+
+    def check(self, text: str) -> None:
+        """Find each line of a block among what was printed."""
+        printed = self.printed.splitlines()
+        for line in text.splitlines():
+            if not any(alike(line, one) for one in printed):
+                raise TutorialError(f"is not printed any more: {line!r}; but:\n{self.printed[-3000:]}")
+
+    def end(self) -> None:
+        """Stop what runs in the background, the last first."""
+        for process in reversed(self.started):
+            process.terminate()
+        for process in self.started:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10.0)
+            process.kill()
+            process.wait()
+
+
+def alike(shown: str, printed: str) -> bool:
+    """Whether a line begins like another but for the spaces, numbers to a thousandth."""
+    wanted, found = shown.split(), printed.split()[: len(shown.split())]
+    return len(wanted) == len(found) and all(map(_same, wanted, found))
+
+
+def _same(wanted: str, found: str) -> bool:
+    if wanted == found:
+        return True
+    numbers, others = _NUMBER.findall(wanted), _NUMBER.findall(found)
+    if len(numbers) != len(others) or _NUMBER.sub("", wanted) != _NUMBER.sub("", found):
+        return False
+    pairs = zip(map(float, numbers), map(float, others), strict=True)
+    return all(math.isclose(a, b, rel_tol=1e-3, abs_tol=1e-9) for a, b in pairs)
+
+
+def follow(page: Path, folder: Path) -> dict[str, Path]:
+    """Do what a page says in a folder.
+
+    Returns
+    -------
+    dict of Path
+        By the page's own name of it, the file of each picture.
+
+    Raises
+    ------
+    TutorialError
+        If a command fails, prints something else, or a picture does not come.
+    """
+    text, session = page.read_text("utf-8"), Session(folder)
+    try:
+        for kind, about, language, block in _BLOCK.findall(text):
+            session.do(kind, about, language, block)
+    finally:
+        session.end()
+    pictures = {shown: folder / made for made, shown in _PICTURE.findall(text)}
+    if missing := [str(made) for made in pictures.values() if not made.is_file()]:
+        raise TutorialError(f"{page.name}: no picture {', '.join(missing)}")
+    return pictures
+
+
+def main() -> None:
+    """Follow the pages that are named, or all."""
+    words = sys.argv[1:]
+    for name in [word for word in words if word != "--pictures"] or PAGES:
+        with tempfile.TemporaryDirectory(prefix="magpend-tutorial-") as folder:
+            begun = time.process_time()
+            pictures = follow(PAGES[name], Path(folder))
+            print(f"{name}: {time.process_time() - begun:.1f} s of this process")
+            for shown, made in pictures.items() if "--pictures" in words else ():
+                (PAGES[name].parent / shown).write_bytes(made.read_bytes())
+                print(f"  {shown}: {made.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(DOCS.parent))
+    sys.path.insert(0, str(DOCS.parent / "pipeline" / "face"))
+    main()

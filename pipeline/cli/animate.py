@@ -1,0 +1,169 @@
+"""``magpend animate``: a motion as GIF, WebP or MP4."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipeline.cli.common import read_pairs
+from pipeline.cli.models import DEFAULT, names
+from pipeline.cli.options import completing
+from pipeline.cli.simulate import read_named
+
+if TYPE_CHECKING:
+    from pipeline.runs.filming import Start
+    from pipeline.store.run import Run
+
+
+def animate(
+    context: typer.Context,
+    directory: Annotated[
+        str | None, typer.Argument(metavar="[DIR]", help="Run directory, or s3://BUCKET/PREFIX.")
+    ] = None,
+    at: Annotated[
+        list[str] | None,
+        typer.Option(metavar="AXIS=VALUE", help="Value of an axis of the run: the point that is shown."),
+    ] = None,
+    nearest: Annotated[
+        bool, typer.Option("--nearest", help="Take the nearest values of the axes for --at, and say which.")
+    ] = False,
+    attractor: Annotated[
+        list[str] | None,
+        typer.Option(metavar="LETTER", help="Attractor at that point; by default all, side by side."),
+    ] = None,
+    cell: Annotated[
+        list[int] | None,
+        typer.Option(metavar="N", help="Cell of the run instead, counted through the dims of its cube."),
+    ] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Without a run: a name, a file, or package.module:NAME; else {DEFAULT}.",
+            autocompletion=completing(names),
+        ),
+    ] = None,
+    frequency_hz: Annotated[
+        float | None,
+        typer.Option("--frequency-hz", "--frequency", help="Without a run: drive frequency [Hz]; else 2.2."),
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="Without a run: parameter preset, or a file of one.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Without a run: a parameter.")
+    ] = None,
+    transient: Annotated[int, typer.Option(help="Of a start: periods before the film begins.")] = 0,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Length of the film [s], a little changed where whole periods fit; else 8."),
+    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second, of a GIF at most 50; else 25.")] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(help="Seconds of the model in one of film; else such that a period takes about two."),
+    ] = None,
+    size: Annotated[
+        int | None, typer.Option(help="Width of a frame [pixels], its height follows; else 800.")
+    ] = None,
+    portrait: Annotated[
+        str | None, typer.Option(metavar="STATE", help="Portrait that is shown; else what there is room for.")
+    ] = None,
+    degrees: Annotated[bool, typer.Option("--degrees", help="Degrees instead of radians.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="File, .gif, .webp or .mp4; by default in DIR/figures, or animation.gif."),
+    ] = None,
+) -> None:  # fmt: skip
+    """Draw motions as they move, as GIF, WebP or MP4: the model's drawing, and phase portraits.
+
+    Of a run: its attractors at a parameter point (--at) side by side, the cells that --cell names, or a start
+    of your own there. Without a run: a start of a model. A start is given by the model's names: --NAME VALUE,
+    or --NAME-deg VALUE of an angle or its rate; what is not given is 0. What repeats makes a film without a
+    jump. MP4 takes ffmpeg.
+    """
+    from pipeline.cli import console
+    from pipeline.plots.files import save_data
+    from pipeline.plots.films import film_problems, save_animation
+    from pipeline.runs.filming import animation
+    from pipeline.spec.problems import SpecError
+    from pipeline.store.local import unwritable
+    from pipeline.store.run import Run
+
+    start = _start(context, model, frequency_hz, preset, settings, transient, directory is None)
+    points = read_pairs("--at", at or [], "frequency=2.2")
+    clock = {"seconds": seconds, "fps": fps, "speed": speed, "size": size, "portrait": portrait}
+    options: dict[str, Any] = {k: v for k, v in clock.items() if v is not None}
+    options |= {"at": points, "nearest": nearest, "degrees": degrees}
+    run = None if directory is None else Run.open(directory)
+    target = out or _place(run, points, attractor, cell)
+    problems = _contradictions(directory, points, attractor, cell, start)
+    problems += film_problems(target, 25.0 if fps is None else fps)
+    if out is not None and not target.parent.is_dir():
+        problems.append(f"{target.parent}: no such folder; make it first.")
+    elif problem := unwritable(target.parent):
+        problems.append(f"{problem}; give another place: --out FILE.")
+    if problems:
+        raise SpecError(problems)
+    film = animation(
+        run, options, attractors=attractor or (), cells=cell or (), start=start, echo=console.note
+    )
+    if target.exists():
+        console.note(f"note: {target} was there already, and is replaced")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    console.note(f"{film.n_frames} frames, {film.n_frames / film.fps:.3g} s")
+    console.result(f"animation: {save_animation(film, target)}")
+    console.result(f"data: {save_data(film.figure, target)}")
+
+
+def _start(
+    context: typer.Context, model: str | None, frequency_hz: float | None, preset: str | None,
+    settings: list[str] | None, transient: int, alone: bool,
+) -> Start | None:  # fmt: skip
+    """Return what is given of a start; None of a run if nothing is."""
+    from pipeline.runs.filming import Start
+    from pipeline.spec.problems import SpecError
+
+    states = {name: values[0] for name, values in read_named(context.args, 1).items()}
+    given = {"--model": model, "--frequency": frequency_hz, "--preset": preset, "--set": settings}
+    if not alone and any(given.values()):
+        raise SpecError(
+            [f"{k}: a run has its own; drop it, or the directory." for k, v in given.items() if v]
+        )
+    if not alone and not states and not transient:
+        return None
+    overrides = read_pairs("--set", settings or [], "q=1.5")
+    frequency = overrides.pop("frequency_hz", overrides.pop("frequency", frequency_hz))
+    return Start(states, transient, model or DEFAULT, frequency, preset, overrides)
+
+
+def _contradictions(
+    directory: str | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None,
+    start: Start | None,
+) -> list[str]:  # fmt: skip
+    """Sentences for options that do not go together."""
+    of_run: dict[str, Any] = {"--at": at, "--attractor": attractor, "--cell": cell}
+    problems = []
+    if directory is None:
+        problems += [f"{k}: is for a run; name its directory." for k, v in of_run.items() if v]
+    of_run["a start (--transient, or a state)"] = start
+    chosen = [k for k, v in of_run.items() if v and k != "--at"]
+    if directory is not None and len(chosen) > 1:
+        problems.append(f"{' and '.join(chosen)}: a film shows one of these; drop the others.")
+    if cell and at:
+        problems.append("--at: a cell has its own point; drop --at or --cell.")
+    return problems
+
+
+def _place(
+    run: Run | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None
+) -> Path:
+    """File that a film goes to if none is named: in the run's figures, named by what it shows."""
+    if run is None:
+        return Path("animation.gif")
+    files = run.info.files
+    folder = files.local / "figures" if files.local else Path("figures") / files.name.rpartition("/")[2]
+    parts = [f"{name}_{value:.15g}" for name, value in at.items()]
+    parts += [f"{k}_{'_'.join(map(str, v))}" for k, v in (("attractor", attractor), ("cell", cell)) if v]
+    return folder / ("_".join(["animation", *parts]) + ".gif")

@@ -1,0 +1,84 @@
+"""``magpend reproduce``: a study computed, drawn and judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.exits import Exit
+from pipeline.cli.options import completing
+
+
+def studies() -> Iterable[str]:
+    """Names of the studies that ship."""
+    from pipeline.report.study import shipped_studies
+
+    return shipped_studies()
+
+
+def reproduce(
+    study: Annotated[
+        str,
+        typer.Argument(
+            metavar="STUDY",
+            help="Name of a study that ships, or a TOML file.",
+            autocompletion=completing(studies),
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where everything goes; by default reproduce/STUDY."),
+    ] = None,
+    figure: Annotated[
+        list[str] | None, typer.Option(metavar="N", help="This figure alone; may be repeated.")
+    ] = None,
+    smoke: Annotated[
+        bool, typer.Option("--smoke", help="The small size: minutes, and most is undecided.")
+    ] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(help="Worker processes, 0: none. By default one per core; with --smoke none.", min=0),
+    ] = None,
+) -> None:
+    """Compute, draw and judge the figures of a study, and write one HTML page on them.
+
+    Runs that are complete are taken, others go on where they were. Every claim has what came out with its
+    interval, and one of four verdicts; a coarse grid or a small sample decides nothing.
+    """
+    from pipeline.cli import console
+    from pipeline.report.reproduce import reproduce as carry_out
+    from pipeline.report.reproduce import spelled
+    from pipeline.report.study import load_study
+
+    found = load_study(study)
+    folder = out or Path("reproduce") / (found.name + ("-smoke" if smoke else ""))
+    _check_folder(folder)
+    n_workers = 0 if smoke and workers is None else workers
+    done = carry_out(found, folder, figures=figure or [], smoke=smoke, workers=n_workers, echo=console.note)
+    for j in done.judgements:
+        console.result(
+            f"{j.figure:>8}  {j.verdict.words}: {j.claim.statement} {spelled(j)} {j.reason}".rstrip()
+        )
+    console.result(f"report: {done.page} ({done.page.stat().st_size / 1e6:.1f} MB)")
+    if done.failed:
+        console.LOG.error(
+            f"{len(done.failed)} required claims are contradicted: "
+            + "; ".join(f"figure {j.figure}: {j.claim.statement}" for j in done.failed)
+        )
+        raise typer.Exit(int(Exit.CONTRADICTED))
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a place that cannot be written to, before anything is computed."""
+    from pipeline.spec.problems import SpecError
+    from pipeline.store.errors import RefusedError
+    from pipeline.store.local import unwritable
+
+    if folder.exists() and not folder.is_dir():
+        raise SpecError([f"--out {folder}: is a file; give a folder."])
+    there = next(place for place in (folder, *folder.absolute().parents) if place.is_dir())
+    if problem := unwritable(there):
+        raise RefusedError(f"{problem}; give another place: --out DIR.")

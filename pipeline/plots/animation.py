@@ -1,0 +1,225 @@
+"""Moving pictures: the model's own drawing and its phase portraits, motion beside motion.
+
+What moves is drawn over a background that is drawn once; so a frame takes some milliseconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from magpend_core.models.model import Model
+from pipeline.layout.vocabulary import model_of
+from pipeline.plots import labels, style
+from pipeline.plots.movers import Scene, Trail, moving_clock, moving_machine, moving_portrait
+
+SCREEN_DPI = 100
+MOST_ABREAST = 4
+"""Motions beside one another; more begin a second row."""
+
+Pixels = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Animation:
+    """A film that is drawn as it is asked for.
+
+    Attributes
+    ----------
+    figure : DataFigure
+        Its `data` are what is drawn.
+    movers : tuple
+        What moves: each sets its artists for a sample.
+    """
+
+    figure: style.DataFigure
+    movers: tuple[Any, ...]
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return int(self.figure.data.attrs["n_frames"])
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return float(self.figure.data.attrs["fps"])
+
+    def frames(self) -> Iterator[Pixels]:
+        """Draw the frames one after the other, each (height, width, 3)."""
+        canvas: Any = FigureCanvasAgg(self.figure)
+        with style.TEXT_LOCK:
+            canvas.draw()
+        background = canvas.copy_from_bbox(self.figure.bbox)
+        substeps = int(self.figure.data.attrs["substeps"])
+        for k in range(self.n_frames):
+            with style.TEXT_LOCK:
+                canvas.restore_region(background)
+                for mover in self.movers:
+                    for artist in mover.at(k * substeps):
+                        self.figure.draw_artist(artist)
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def plot_animation(
+    ds: xr.Dataset, *, degrees: bool = False, portrait: str = "", size: int = 800
+) -> Animation:
+    """Lay out a film of motions beside one another.
+
+    Parameters
+    ----------
+    ds
+        Result of `pipeline.runs.instants.filmed`, with the attribute ``fps``.
+    degrees
+        Degrees for angles and their rates.
+    portrait
+        State whose phase portrait is shown; by default of one motion all, of several the model's first.
+    size
+        Width of a frame [pixels]; even, as films want it.
+
+    Returns
+    -------
+    Animation
+        Motions that repeat within the film have their whole path behind them; of others it is drawn as it
+        is gone. Dots are sections.
+
+    Raises
+    ------
+    ValueError
+        If there is no portrait of that state, or degrees are asked for of a model without angles.
+    """
+    model = model_of(ds)
+    pairs = portraits_of(model, portrait, ds.sizes["motion"], degrees)
+    plan = _Plan.of(ds.sizes["motion"], len(pairs), model.drawing is not None, size)
+    frame = style.Frame(plan.width / style.MM)
+    fig = style.new_figure(plan.height, ds, frame, arranged=False, exact=True)
+    fig.set_dpi(SCREEN_DPI)
+    movers: list[Any] = []
+    scene = None if model.drawing is None else Scene.of(ds, model.drawing)
+    for k in range(ds.sizes["motion"]):
+        one = ds.isel(motion=k)
+        boxes = plan.boxes(k)
+        _title(fig, plan, boxes[0], str(one["name"].values))
+        trail = Trail.of(one)
+        if scene is not None:
+            movers.append(moving_machine(fig.add_axes(boxes[0]), scene, one, trail, named=k == 0))
+        places = boxes[scene is not None :]
+        movers += [
+            moving_portrait(fig.add_axes(p), one, c, trail, degrees)
+            for c, p in zip(pairs, places, strict=True)
+        ]
+    movers.append(moving_clock(fig, ds))
+    style.finish(fig)
+    return Animation(fig, tuple(movers))
+
+
+def portraits_of(model: Model, portrait: str, n: int, degrees: bool = False) -> tuple[tuple[str, str], ...]:
+    """Return the pairs of states that `plot_animation` shows of each of `n` motions; raises as it does."""
+    labels.some_angle(model, degrees, "animations")
+    if portrait:
+        found = tuple(pair for pair in model.portraits if portrait in pair)
+        if not found:
+            known = ", ".join(dict.fromkeys(name for pair in model.portraits for name in pair))
+            raise ValueError(f"unknown portrait {portrait!r}; there are portraits of: {known}")
+        return found[:1]
+    return model.portraits[: 3 if n == 1 else 1]
+
+
+# ---- places ------------------------------------------------------------------------------------
+
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Places of the panels [in]: motions in columns, or what there is of a single one side by side."""
+
+    n: int
+    n_pairs: int
+    drawn: bool
+    width: float
+    columns: int
+    drawing: float
+    portrait: float
+    left: float
+    below: float
+    above: float
+
+    @classmethod
+    def of(cls, n: int, n_pairs: int, drawn: bool, size: int) -> _Plan:
+        width = 2 * round(size / 2) / SCREEN_DPI
+        small = width / style.MM < style.COMPACT_MM
+        left, below, above = (0.5, 0.36, 0.24) if small else (0.66, 0.46, 0.3)
+        columns = n if n <= MOST_ABREAST else math.ceil(n / 2)
+        if n == 1:
+            height = min(0.56 * width, 6.0) if drawn or n_pairs > 1 else 0.7 * width
+            stacked = n_pairs if drawn else 1
+            portrait = (height - above - below * (stacked + 0.6)) / stacked
+            return cls(n, n_pairs, drawn, width, 1, height - above - below, portrait, left, below, above)
+        pitch = width / columns
+        return cls(n, n_pairs, drawn, width, columns, 0.95 * pitch if drawn else 0.0,
+                   max(0.55 * (pitch - left), 0.6), left, below, above)  # fmt: skip
+
+    @property
+    def row(self) -> float:
+        """Height of a row of motions."""
+        if self.n == 1:
+            return self.drawing + self.above
+        return self.above + self.drawing + self.n_pairs * (self.portrait + self.below)
+
+    @property
+    def foot(self) -> float:
+        """Height of the line below."""
+        return self.below if self.n == 1 else 0.5 * self.below
+
+    @property
+    def height(self) -> float:
+        """Height of the frame; an even number of pixels."""
+        whole = self.foot + self.row * math.ceil(self.n / self.columns)
+        return 2 * round(whole * SCREEN_DPI / 2) / SCREEN_DPI
+
+    def boxes(self, k: int) -> list[Box]:
+        """Panels of a motion: its drawing, if there is one, then its portraits."""
+        return [self._box(*inches) for inches in (self._single() if self.n == 1 else self._column(k))]
+
+    def _single(self) -> list[Box]:
+        air = 0.12
+        if not self.drawn:
+            pitch = self.width / self.n_pairs
+            top = self.foot + self.below
+            high = self.height - top - self.above
+            return [(i * pitch + self.left, top, pitch - self.left - air, high) for i in range(self.n_pairs)]
+        half = min(0.52 * self.width, 1.25 * self.drawing)
+        boxes = [(air, self.foot, half - 2.0 * air, self.drawing)]
+        for i in range(self.n_pairs):
+            y = self.height - self.above - (i + 1) * self.portrait - i * self.below
+            boxes.append((half + self.left, y, self.width - half - self.left - air, self.portrait))
+        return boxes
+
+    def _column(self, k: int) -> list[Box]:
+        air, pitch = 0.08, self.width / self.columns
+        x = (k % self.columns) * pitch
+        top = self.height - (k // self.columns) * self.row - self.above
+        boxes = [(x + air, top - self.drawing, pitch - 2.0 * air, self.drawing)] if self.drawn else []
+        for i in range(self.n_pairs):
+            y = top - self.drawing - (i + 1) * self.portrait - i * self.below
+            boxes.append((x + self.left, y, pitch - self.left - air, self.portrait))
+        return boxes
+
+    def _box(self, x: float, y: float, width: float, height: float) -> Box:
+        return (x / self.width, y / self.height, width / self.width, height / self.height)
+
+
+def _title(fig: style.DataFigure, plan: _Plan, box: Box, text: str) -> None:
+    """Write a motion's name above its panels, as far as there is room."""
+    room = plan.width / plan.columns - 0.2
+    lines = style.folded(text, room, fig.look.legend).split("\n")
+    short = lines[0] if len(lines) == 1 else lines[0].rstrip(",:") + " \N{HORIZONTAL ELLIPSIS}"
+    fig.text(box[0], box[1] + box[3] + 0.07 / plan.height, short, fontsize=fig.look.legend, va="bottom")

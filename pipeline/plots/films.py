@@ -1,0 +1,153 @@
+"""How films become files: GIF and WebP by Pillow, MP4 by ffmpeg where it is installed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, features
+
+from pipeline.plots.animation import Animation, Pixels
+
+SUFFIXES = (".gif", ".webp", ".mp4")
+MOST_GIF_FPS = 50.0
+"""GIF counts hundredths of a second, and programs that show it take 1 for "as slow as before"."""
+
+PALETTE_FRAMES, PALETTE_COLOURS = 8, 96
+
+
+def film_problems(path: Path, fps: float) -> list[str]:
+    """Return sentences for what would keep a film from being written there, before anything is drawn."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        return [f"{path}: the suffix must be one of {', '.join(SUFFIXES)}."]
+    problems = []
+    if path.is_dir():
+        problems.append(f"{path}: is a folder; name a file in it.")
+    if suffix == ".gif" and fps > MOST_GIF_FPS:
+        problems.append(
+            f"--fps {fps:g}: a GIF has at most {MOST_GIF_FPS:g} frames a second; lower it, or write .webp."
+        )
+    if suffix == ".webp" and not features.check("webp"):
+        problems.append(f"{path}: this Pillow was built without WebP; write .gif, or install another Pillow.")
+    if suffix == ".mp4" and shutil.which("ffmpeg") is None:
+        problems.append(
+            f"{path}: MP4 takes the program ffmpeg, and there is none; install it, or write .gif."
+        )
+    return problems
+
+
+def save_animation(film: Animation, path: str | Path) -> Path:
+    """Write a film as GIF, WebP or MP4, by the suffix of the path.
+
+    GIF and WebP are repeated for ever. The file appears once it is whole; an existing one is replaced.
+
+    Parameters
+    ----------
+    film
+        The film.
+    path
+        Where to write; the folder must exist.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be written, or the format does not take the film; see `film_problems`.
+    OSError
+        If ffmpeg fails.
+    """
+    path = Path(path)
+    if problems := film_problems(path, film.fps):
+        raise ValueError(" ".join(problems))
+    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    write = {".gif": _gif, ".webp": _webp, ".mp4": _mp4}[path.suffix.lower()]
+    try:
+        write(film, part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def _about(film: Animation) -> str:
+    """What the file says of itself."""
+    attrs = film.figure.data.attrs
+    return "; ".join(f"{k}: {v}" for k, v in attrs.items() if k in ("title", "source", "run", "cube_digest"))
+
+
+def durations(n: int, fps: float, grain_ms: int) -> list[int]:
+    """Milliseconds that each frame is shown, in whole grains, which add up as they should."""
+    ends = np.round(np.arange(n + 1) * (1000.0 / fps / grain_ms)).astype(int)
+    return [int(d) * grain_ms for d in np.diff(ends)]
+
+
+def _gif(film: Animation, path: Path) -> None:
+    palette = _palette(film)
+    images = (
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in film.frames()
+    )
+    first = next(images)
+    first.save(
+        path, save_all=True, append_images=images, loop=0, duration=durations(film.n_frames, film.fps, 10),
+        optimize=False, disposal=1, comment=_about(film).encode("utf-8")[:250],
+    )  # fmt: skip
+
+
+def _palette(film: Animation) -> Image.Image:
+    """Colours that serve all frames: those of some of them, since a palette each would flicker."""
+    chosen = np.unique(np.linspace(0, film.n_frames - 1, PALETTE_FRAMES).astype(int))
+    frames = np.vstack([f for k, f in enumerate(_until(film, int(chosen[-1]))) if k in chosen])
+    inked = frames[(frames != 255).any(axis=-1)]
+    # paper stays white: among all pixels its colour would be a mean of it and of what is nearly white
+    found = Image.fromarray(inked[None]).quantize(PALETTE_COLOURS - 1, Image.Quantize.MEDIANCUT)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([255, 255, 255, *(found.getpalette() or [])[: 3 * (PALETTE_COLOURS - 1)]])
+    return palette
+
+
+def _until(film: Animation, last: int) -> Iterator[Pixels]:
+    for k, frame in enumerate(film.frames()):
+        yield frame
+        if k == last:
+            return
+
+
+def _webp(film: Animation, path: Path) -> None:
+    images = (Image.fromarray(frame) for frame in film.frames())
+    first = next(images)
+    first.save(
+        path, save_all=True, append_images=images, loop=0, duration=durations(film.n_frames, film.fps, 1),
+        quality=75, method=4,
+    )  # fmt: skip
+
+
+def _mp4(film: Animation, path: Path) -> None:
+    frames = film.frames()
+    first = next(frames)
+    height, width = first.shape[:2]
+    command = [
+        "ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s",
+        f"{width}x{height}", "-r", f"{film.fps:.10g}", "-i", "-", "-an", "-c:v", "libx264",
+        "-pix_fmt", "yuv420p", "-crf", "20",
+        "-movflags", "+faststart", "-metadata", f"comment={_about(film)}", str(path),
+    ]  # fmt: skip
+    process: Any = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        process.stdin.write(first.tobytes())
+        for frame in frames:
+            process.stdin.write(frame.tobytes())
+    except BrokenPipeError:
+        pass  # it has ended, and says why
+    _, said = process.communicate()
+    if process.returncode:
+        raise OSError(f"ffmpeg could not write {path.name}: {said.decode(errors='replace').strip()[-300:]}")

@@ -1,0 +1,367 @@
+"""What can be measured of a study's results: estimates with the interval in which the truth lies.
+
+A measure is a function of results and options that gives an `Estimate`. Nothing here knows a model: motions
+are the words of the run's own classifier, axes and quantities have names. Intervals are of 95 %: of shares by
+Clopper and Pearson, of what is located on an axis between its neighbouring values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.analysis.basins.numbers import binomial_interval
+from pipeline.analysis.selection import place
+from pipeline.analysis.sides import classify
+from pipeline.layout.vocabulary import split_dims
+from pipeline.spec.problems import SpecError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from pipeline.report.results import Results
+
+Options = Mapping[str, Any]
+Measure = Callable[["Results", Sequence[str], Options], "Estimate"]
+
+NOWHERE = math.nan
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What came out.
+
+    Attributes
+    ----------
+    value : float
+    low, high : float
+        Interval of 95 %; NaN where nothing could be measured.
+    text : str
+        What was counted or located, for people.
+    step : float or None
+        Largest step of the axis there, where it limits what can be told.
+    n : int or None
+        Independent cells, curves or periods that it rests on.
+    missing : str
+        Why nothing could be measured, empty otherwise.
+    """
+
+    value: float
+    low: float
+    high: float
+    text: str = ""
+    step: float | None = None
+    n: int | None = None
+    missing: str = ""
+
+
+def absent(why: str, step: float | None = None) -> Estimate:
+    """Nothing could be measured, and why."""
+    return Estimate(NOWHERE, NOWHERE, NOWHERE, step=step, missing=why)
+
+
+def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
+    """Cells of a run over its only axis, as (axis, cell), and the axis' name."""
+    cube = results.run(name).cube()
+    axes, starts = split_dims(cube["status"])
+    wide = [d for d in axes if cube.sizes[d] > 1] or list(axes[:1])
+    if len(wide) != 1:
+        raise SpecError([f"{name}: measured along one axis, and it has {', '.join(axes) or 'none'}."])
+    keep = ["orbit_period", "status", *(n for n in ("lyapunov", "lyapunov_flag") if n in cube)]
+    found = cube[keep]
+    words = classify(cube)
+    if words is not None:
+        found = found.assign(motion=words)
+    found = found.load()
+    rest = [d for d in (*axes, *starts) if d != wide[0]]
+    return found.stack(cell=rest).sortby(wide[0]).transpose(wide[0], "cell", ...), wide[0]
+
+
+def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
+    """Cells at the values of the axis that are asked for: ``at`` one, or from ``low`` to ``high``."""
+    values = ds[axis].values
+    if "at" in options:
+        at = _index(ds, axis, float(options["at"]))
+        return ds.isel({axis: [] if at is None else [at]})
+    slack = 1e-9 * max(abs(values).max(), 1.0)
+    low, high = float(options.get("low", -math.inf)), float(options.get("high", math.inf))
+    return ds.isel({axis: (values >= low - slack) & (values <= high + slack)})
+
+
+def _index(ds: xr.Dataset, axis: str, value: float) -> int | None:
+    """Place of a value on an axis; None if the axis does not have it."""
+    try:
+        return place(ds[axis], value)
+    except ValueError:
+        return None
+
+
+def _step(values: np.ndarray) -> float | None:
+    return float(np.diff(values).max()) if values.size > 1 else None
+
+
+def _matches(ds: xr.Dataset, options: Options) -> np.ndarray:
+    """Which cells are what is asked for: ``period`` one or several (0: not closed), ``motion`` a word."""
+    wanted = options.get("period")
+    periods = ds["orbit_period"].values
+    found = np.ones(periods.shape, bool)
+    if wanted is not None:
+        found &= np.isin(periods, np.atleast_1d(wanted))
+    if "motion" in options:
+        if "motion" not in ds:
+            raise SpecError(
+                [f"motion = {options['motion']!r}: the model of this run has no words for motions."]
+            )
+        words = str(ds["motion"].attrs["flag_meanings"]).split()
+        if options["motion"] not in words:
+            raise SpecError([f"motion = {options['motion']!r}: must be one of {', '.join(words)}."])
+        found &= ds["motion"].values == words.index(options["motion"])
+    return found
+
+
+def _share(count: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    low, high = binomial_interval(count, n, confidence=confidence, method="clopper-pearson")
+    return float(low), float(high)
+
+
+def least_share(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Share of the cells that have a period, or a motion, where it is least within a range of the axis.
+
+    Options: ``at``, or ``low`` and ``high``; ``period``, ``motion``. The interval is Clopper and Pearson's,
+    its level divided among the values of the axis (Bonferroni), since the least of many shares is taken.
+    """
+    ds, axis = _cells(results, of[0])
+    here = _within(ds, axis, options)
+    n_values, n = here.sizes[axis], here.sizes["cell"]
+    step = None if "at" in options else _step(ds[axis].values)
+    if n_values == 0:
+        return absent(f"the axis has no value {_asked(options)}", _step(ds[axis].values))
+    counts = _matches(here, options).sum(1)
+    k = int(counts.argmin())
+    low, high = _share(int(counts[k]), n, 1 - 0.05 / n_values)
+    where = f"{axis} {here[axis].values[k]:g}" + (f", the least of {n_values} values" if n_values > 1 else "")
+    return Estimate(counts[k] / n, low, high, f"{counts[k]} of {n} cells at {where}", step, n)
+
+
+def largest_share(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Share of the cells that have a period, or a motion, where it is largest within a range of the axis.
+
+    Options and interval as of `least_share`.
+    """
+    ds, axis = _cells(results, of[0])
+    here = _within(ds, axis, options)
+    n_values, n = here.sizes[axis], here.sizes["cell"]
+    if n_values == 0:
+        return absent(f"the axis has no value {_asked(options)}", _step(ds[axis].values))
+    counts = _matches(here, options).sum(1)
+    k = int(counts.argmax())
+    low, high = _share(int(counts[k]), n, 1 - 0.05 / n_values)
+    text = f"{counts[k]} of {n} cells at {axis} {here[axis].values[k]:g}, the largest of {n_values} values"
+    return Estimate(counts[k] / n, low, high, text, _step(ds[axis].values), n)
+
+
+def _asked(options: Options) -> str:
+    if "at" in options:
+        return f"{options['at']:g}"
+    return f"between {options.get('low', -math.inf):g} and {options.get('high', math.inf):g}"
+
+
+def window(
+    results: Results, of: Sequence[str], options: Options
+) -> tuple[Estimate, int, int, xr.Dataset, str]:
+    """Return the unbroken stretch about a value in which every cell has a period, and its places."""
+    ds, axis = _cells(results, of[0])
+    here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})
+    values, n = here[axis].values, here.sizes["cell"]
+    step, wanted = _step(values), float(options["contains"])
+    at = _index(here, axis, wanted) if values.size > 2 else None
+    if at is None:
+        return absent(f"the axis has no value {wanted:g} with others about it", step), 0, 0, here, axis
+    whole = np.asarray(_matches(here, options).all(1))
+    first = last = at
+    if not whole[at]:
+        text = f"not all of {n} cells have it at {values[at]:g}"
+        return Estimate(0.0, 0.0, 0.0, text, step, n), 0, 0, here, axis
+    while first > 0 and whole[first - 1]:
+        first -= 1
+    while last < values.size - 1 and whole[last + 1]:
+        last += 1
+    inner = float(values[last] - values[first])
+    outer = float(values[min(last + 1, values.size - 1)] - values[max(first - 1, 0)])
+    open_end = first == 0 or last == values.size - 1
+    text = f"all of {n} cells from {values[first]:g} to {values[last]:g}"
+    high = math.inf if open_end else outer
+    text += "; it reaches an end of the axis" if open_end else ""
+    middle = inner if open_end else 0.5 * (inner + outer)
+    return Estimate(middle, inner, high, text, step, n), first, last, here, axis
+
+
+def window_width(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Width of the unbroken stretch about a value in which every cell has a period.
+
+    Options: ``contains``, ``period`` (and ``motion``), ``low`` and ``high``. Its ends lie between
+    neighbouring values of the axis: that is the interval.
+    """
+    return window(results, of, options)[0]
+
+
+def beside_window(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Share of the cells next to such a stretch, on both sides, that have another period.
+
+    Options: as of `window_width`; ``other`` the periods that are looked for, ``within`` how far from its
+    ends.
+    """
+    found, first, last, here, axis = window(results, of, options)
+    if found.missing or found.value == 0.0:
+        return absent(found.missing or found.text, found.step)
+    values, within = here[axis].values, float(options["within"]) * (1 + 1e-9)
+    near = (values < values[first]) & (values >= values[first] - within)
+    near |= (values > values[last]) & (values <= values[last] + within)
+    cells = _matches(here.isel({axis: near}), {"period": options["other"]})
+    if not cells.size:
+        return absent(f"no value of the axis lies within {within:g} of its ends", found.step)
+    low, high = _share(int(cells.sum()), cells.size)
+    text = f"{cells.sum()} of {cells.size} cells within {options['within']:g} of its ends"
+    return Estimate(float(cells.mean()), low, high, text, found.step, cells.size)
+
+
+def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Share of the cells that end on the rarest of some motions at one value: above 0, all coexist.
+
+    Options: ``at``, ``motions``, ``period``.
+    """
+    shares = [
+        least_share(
+            results, of, {**{k: options[k] for k in ("at", "period") if k in options}, "motion": word}
+        )
+        for word in options["motions"]
+    ]
+    if any(share.missing for share in shares):
+        return shares[0]
+    rarest = min(shares, key=lambda share: share.value)
+    words = "; ".join(
+        f"{w}: {s.text.partition(' at ')[0]}" for w, s in zip(options["motions"], shares, strict=True)
+    )
+    return Estimate(rarest.value, rarest.low, rarest.high, words, rarest.step, rarest.n)
+
+
+def largest_exponent(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Largest Lyapunov exponent at one value [1/s], the mean over cells that are not closed.
+
+    Options: ``at``. The interval is that of the mean over the cells (Student's t): they are on one set, so
+    that what differs is the finite time of each.
+    """
+    ds, axis = _cells(results, of[0])
+    if "lyapunov" not in ds:
+        raise SpecError([f"{of[0]}: has no exponents; add [products] lyapunov = {{}} to its specification."])
+    here = _within(ds, axis, options)
+    if not here.sizes[axis]:
+        return absent(f"the axis has no value {_asked(options)}", _step(ds[axis].values))
+    values = here["lyapunov"].isel(exponent=0).values[0]
+    chosen = values[(here["orbit_period"].values[0] == 0) & np.isfinite(values)]
+    if chosen.size < 3:
+        return absent(f"{chosen.size} cells are not closed at {_asked(options)}")
+    from scipy.stats import t
+
+    half = float(t.ppf(0.975, chosen.size - 1) * chosen.std(ddof=1) / math.sqrt(chosen.size))
+    mean = float(chosen.mean())
+    return Estimate(mean, mean - half, mean + half, f"{chosen.size} cells that are not closed", n=chosen.size)
+
+
+def agreement(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Share of the values that two runs have in common at which most cells of both have the same period.
+
+    Options: ``low``, ``high``. Periods count up to 16; not closed is one outcome.
+    """
+    outcomes = []
+    for name in of[:2]:
+        ds, axis = _cells(results, name)
+        here = _within(ds, axis, options)
+        periods = here["orbit_period"].values
+        most = [int(np.bincount(np.clip(row, 0, 17)).argmax()) for row in periods]
+        outcomes.append({round(float(x), 9): p for x, p in zip(here[axis].values, most, strict=True)})
+        step = _step(ds[axis].values)
+    common = sorted(set(outcomes[0]) & set(outcomes[1]))
+    if len(common) < 2:
+        return absent(f"the runs have {len(common)} values in common there", step)
+    same = sum(outcomes[0][x] == outcomes[1][x] for x in common)
+    low, high = _share(same, len(common))
+    return Estimate(same / len(common), low, high, f"{same} of {len(common)} values", step, len(common))
+
+
+def share_above(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Share of a drive period, from its begin on, for which a quantity of the model at rest is positive.
+
+    Options: ``quantity``, ``frequency_hz``. The instant at which it changes sign is found by bisection; it
+    must be positive from the begin on, and change once.
+    """
+    from magpend_core import evaluate
+
+    parameters, f = results.run(of[0]).parameters, float(options["frequency_hz"])
+    rest = np.zeros(len(parameters.model.states))
+
+    def values(share: np.ndarray) -> np.ndarray:
+        states = np.broadcast_to(rest, (share.size, rest.size))
+        return np.asarray(evaluate([options["quantity"]], share / f, states, parameters, f)[:, 0])
+
+    edge = 1e-9
+    grid = np.concatenate([[edge], np.arange(1, 2048) / 2048, [1 - edge]])
+    signs = values(grid) > 0.0
+    changes = np.flatnonzero(signs[1:] != signs[:-1])
+    if not signs[0] or changes.size != 1:
+        text = (
+            "is not positive from the begin of the period on"
+            if not signs[0]
+            else "changes sign more than once"
+        )
+        return Estimate(0.0, 0.0, 0.0, f"{options['quantity']} {text}")
+    low, high = grid[changes[0]], grid[changes[0] + 1]
+    while high - low > 1e-12:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if values(np.array([middle]))[0] > 0 else (low, middle)
+    text = f"positive from the begin of the period to {low:.8f} of it, found by bisection"
+    return Estimate(low, low, high, text)
+
+
+def recorded_duty_cycle(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Share of the period in which a recorded drive is high, from its edges."""
+    from pipeline.rig.edges import edges_of
+
+    timing = edges_of(results.recording(of[0])).frequency()
+    half = 1.96 * timing.duty_cycle_error
+    text = f"{timing.n_periods} periods at {timing.frequency_hz:.6g} Hz"
+    return Estimate(
+        timing.duty_cycle, timing.duty_cycle - half, timing.duty_cycle + half, text, n=timing.n_periods
+    )
+
+
+def _of_torques(name: str) -> Measure:
+    def measure(results: Results, of: Sequence[str], options: Options) -> Estimate:
+        from pipeline.report import torque_curves
+
+        found: Estimate = getattr(torque_curves, name)(results.torques(of[0]), options)
+        return found
+
+    return measure
+
+
+MEASURES: dict[str, Measure] = {
+    "least_share": least_share,
+    "largest_share": largest_share,
+    "window_width": window_width,
+    "beside_window": beside_window,
+    "rarest_motion": rarest_motion,
+    "largest_exponent": largest_exponent,
+    "agreement": agreement,
+    "share_above": share_above,
+    "recorded_duty_cycle": recorded_duty_cycle,
+    "curves_described": _of_torques("curves_described"),
+    "torque_gain": _of_torques("gain_over_dipoles"),
+    "width_spread": _of_torques("width_spread"),
+    "signs_apart": _of_torques("signs_apart"),
+}
+"""By the names that studies use."""

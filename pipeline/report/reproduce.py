@@ -1,0 +1,280 @@
+"""A study carried out and judged: ``magpend reproduce``."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.report.measures import MEASURES, Estimate
+from pipeline.report.page import Block, Facts, Grid, Note, Outcome, Page, Part, Text, write
+from pipeline.report.pictures import picture
+from pipeline.report.report import made_by
+from pipeline.report.results import Results
+from pipeline.report.runs import provenance_of
+from pipeline.report.study import ClaimTable, FigureTable, Study
+from pipeline.report.verdicts import Verdict, judged
+from pipeline.runs.stopping import stoppable
+from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.store.local import write_atomically
+from pipeline.store.provenance import versions
+
+PAGE, CLAIMS = "report.html", "claims.json"
+Echo = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A claim, what came out, and its verdict.
+
+    Attributes
+    ----------
+    figure : str
+    claim : ClaimTable
+    estimate : Estimate
+    verdict : Verdict
+    plain : Verdict
+        The verdict as if nothing had been calibrated.
+    reason : str
+    """
+
+    figure: str
+    claim: ClaimTable
+    estimate: Estimate
+    verdict: Verdict
+    plain: Verdict
+    reason: str
+
+    @property
+    def fails(self) -> bool:
+        """Whether a required claim is contradicted; of one that was calibrated on, what came out changed."""
+        return self.claim.required and self.plain is Verdict.NOT_MET
+
+
+@dataclass(frozen=True)
+class Reproduced:
+    """What a study came to.
+
+    Attributes
+    ----------
+    folder : Path
+    page : Path
+    judgements : list of Judgement
+    """
+
+    folder: Path
+    page: Path
+    judgements: Sequence[Judgement]
+
+    @property
+    def failed(self) -> list[Judgement]:
+        """Required claims that are contradicted."""
+        return [judgement for judgement in self.judgements if judgement.fails]
+
+
+def reproduce(
+    study: Study,
+    folder: Path,
+    *,
+    figures: Sequence[str] = (),
+    smoke: bool = False,
+    workers: int | None = None,
+    echo: Echo = print,
+) -> Reproduced:
+    """Compute what a study needs, or what is missing of it, judge its claims and write its page.
+
+    Parameters
+    ----------
+    study
+        See `pipeline.report.study.load_study`.
+    folder
+        Where everything goes; made if it is not there. What it holds already is taken.
+    figures
+        Numbers of the figures; by default all.
+    smoke
+        Take the small sizes of the specifications.
+    workers
+        As for `pipeline.runs.run.run`.
+    echo
+        Prints a line.
+
+    Raises
+    ------
+    SpecError
+        If a figure is unknown; before anything is computed.
+    Exception
+        As `pipeline.runs.run.run`; what was committed stays, and the same call goes on.
+    """
+    chosen = _chosen(study, figures)
+    folder.mkdir(parents=True, exist_ok=True)
+    results = Results(study, folder, smoke=smoke, workers=workers, echo=echo)
+    results.prepare({name for figure in chosen for name in figure.needs})
+    with stoppable(str(folder)):
+        parts, judgements = [], []
+        for figure in chosen:
+            echo(f"figure {figure.number}: {figure.title}")
+            own = [judge(results, figure.number, claim) for claim in figure.claims]
+            parts.append(_part(results, figure, own))
+            judgements += own
+    name = f"report-{'-'.join(n for f in chosen for n in f.numbers)}.html" if figures else PAGE
+    parts += _provenance(results)
+    page = Page(study.table.title, _summary(results, judgements), parts, made_by())
+    write(page, folder / name)
+    write_atomically(folder / name.replace(PAGE[:6], CLAIMS[:6]).replace(".html", ".json"), _rows(judgements))
+    return Reproduced(folder, folder / name, judgements)
+
+
+def _chosen(study: Study, figures: Sequence[str]) -> list[FigureTable]:
+    every = study.table.figures
+    known = [number for figure in every for number in figure.numbers]
+    unknown = [unknown_name("figure", number, known) for number in figures if number not in known]
+    if unknown:
+        raise SpecError(unknown)
+    return [f for f in every if not figures or set(f.numbers) & set(figures)]
+
+
+def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
+    """Measure what a claim is about, and judge it.
+
+    A grid that is coarser, or a sample that is smaller, than the claim asks for decides nothing, whatever
+    came out.
+    """
+    try:
+        found = MEASURES[claim.measure](results, claim.of, claim.options)
+    except KeyError as error:
+        raise SpecError([f"figure {figure}: {claim.measure} lacks the option {error}."]) from None
+    plain, reason = judged(found.low, found.high, claim.least, claim.most), ""
+    if found.missing:
+        plain, reason = Verdict.UNDECIDED, f"Not measured: {found.missing}."
+    elif claim.step and found.step and found.step > claim.step * (1 + 1e-6):
+        plain = Verdict.UNDECIDED
+        reason = f"The axis has steps of {found.step:.4g}; {claim.step:g} and less decide."
+    elif claim.n and found.n is not None and found.n < claim.n:
+        plain, reason = Verdict.UNDECIDED, f"Rests on {found.n}; {claim.n} and more decide."
+    elif plain is Verdict.UNDECIDED:
+        reason = "The interval reaches beyond what is claimed: a larger sample, or a finer axis, decides."
+    if claim.calibrated and plain is not Verdict.UNDECIDED:
+        agrees = "agrees with it" if plain is Verdict.MET else "contradicts it"
+        return Judgement(figure, claim, found, Verdict.CALIBRATED, plain, f"What came out {agrees}.")
+    return Judgement(figure, claim, found, Verdict.CALIBRATED if claim.calibrated else plain, plain, reason)
+
+
+def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]) -> Part:
+    """Return the section of a figure: what the text says, pictures, verdicts, where they come from."""
+    many = len(figure.numbers) > 1
+    blocks: list[Block] = []
+    if figure.says:
+        blocks.append(Text(f"What the text says: {figure.says}"))
+    if figure.note:
+        blocks.append(Note(figure.note))
+    blocks += [picture(results, table) for table in figure.pictures]
+    blocks += [_outcome(judgement) for judgement in judgements]
+    blocks.append(Note("This section alone:", _command(results, figure)))
+    return Part(f"{'Figures' if many else 'Figure'} {figure.number}: {figure.title}", blocks)
+
+
+def _command(results: Results, figure: FigureTable) -> str:
+    smoke = " --smoke" if results.smoke else ""
+    shipped = results.study.name if results.study.path.name == "study.toml" else str(results.study.path)
+    name = shlex.quote(shipped)
+    out = shlex.quote(str(results.folder))
+    return f"magpend reproduce {name}{smoke} --figure {figure.numbers[0]} --out {out}"
+
+
+def _outcome(judgement: Judgement) -> Outcome:
+    claim = judgement.claim
+    return Outcome(
+        claim.statement, claim.source, f"Came out: {spelled(judgement)}", judgement.verdict, judgement.reason,
+        claim.required,
+    )  # fmt: skip
+
+
+def spelled(judgement: Judgement) -> str:
+    """Say what came out, with its interval, and what would meet the claim."""
+    found, claim = judgement.estimate, judgement.claim
+    if found.missing:
+        return "nothing."
+    unit = f" {claim.unit}" if claim.unit else ""
+    digits = _digits(found.high - found.low)
+    high = "more" if math.isinf(found.high) else digits.format(found.high)
+    text = f"{digits.format(found.value)}{unit} ({digits.format(found.low)} to {high})"
+    return f"{text}; {found.text}. Claimed: {_range(claim)}{unit}."
+
+
+def _digits(width: float) -> str:
+    """Return the format in which an interval of a width shows two digits of it."""
+    if not (math.isfinite(width) and width > 1e-8):
+        return "{:.7g}"
+    return f"{{:.{min(max(0, 1 - math.floor(math.log10(width))), 9)}f}}"
+
+
+def _range(claim: ClaimTable) -> str:
+    low, high = math.isfinite(claim.least), math.isfinite(claim.most)
+    if low and high:
+        return f"{claim.least:g}" if claim.least == claim.most else f"{claim.least:g} to {claim.most:g}"
+    return f"at least {claim.least:g}" if low else f"at most {claim.most:g}" if high else "any"
+
+
+def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
+    """Return what stands above the figures: what this is, all claims, where the numbers come from."""
+    table = results.study.table
+    counts = {verdict: sum(j.verdict is verdict for j in judgements) for verdict in Verdict}
+    failed = sum(j.fails for j in judgements)
+    blocks: list[Block] = [Note(table.source), *(Text(text) for text in table.about)]
+    size = "smoke size: it shows that everything works, and decides little" if results.smoke else "full size"
+    blocks.append(Facts({
+        "size": size,
+        "claims": ", ".join(f"{n} {verdict.words}" for verdict, n in counts.items() if n) or "none",
+        "required claims contradicted": str(failed),
+        "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
+    }))  # fmt: skip
+    rows = [
+        (j.figure, j.claim.statement, spelled(j).partition(";")[0].rstrip("."), _short(j)) for j in judgements
+    ]
+    if rows:
+        heads = ("figure", "claim", "came out (95 % interval)", "verdict")
+        blocks.append(Grid(heads, rows, "All claims", stacked=True))
+    return blocks
+
+
+def _short(judgement: Judgement) -> str:
+    """Return a verdict, and of what was calibrated on, whether it came out."""
+    if judgement.verdict is not Verdict.CALIBRATED:
+        return judgement.verdict.words
+    came = {Verdict.MET: "it came out", Verdict.NOT_MET: "it did not come out"}
+    return f"{judgement.verdict.words}; {came.get(judgement.plain, 'undecided whether it came out')}"
+
+
+def _provenance(results: Results) -> list[Part]:
+    """Return the section on what the figures were computed from: digests, versions, specifications."""
+    runs = results.computed()
+    if not runs:
+        return []
+    rows = [(name, run.info.title, str(run.plan.n_cells), run.digest) for name, run in runs.items()]
+    table = Grid(("run", "what", "cells", "digest of the cube"), rows, stacked=True)
+    own = [Part(f"Run {name}", list(provenance_of(run))) for name, run in runs.items()]
+    return [Part("Where this comes from", [table], own)]
+
+
+def _rows(judgements: Sequence[Judgement]) -> str:
+    """Spell all claims as JSON, for programs."""
+    rows = [
+        {
+            "figure": j.figure, "statement": j.claim.statement, "source": j.claim.source,
+            "measure": j.claim.measure, "of": list(j.claim.of), "least": _plain(j.claim.least),
+            "most": _plain(j.claim.most), "unit": j.claim.unit, "value": _plain(j.estimate.value),
+            "low": _plain(j.estimate.low), "high": _plain(j.estimate.high),
+            "text": j.estimate.text or j.estimate.missing, "verdict": j.verdict.words, "reason": j.reason,
+            "required": j.claim.required, "fails": j.fails,
+        }
+        for j in judgements
+    ]  # fmt: skip
+    return json.dumps(rows, indent=1, ensure_ascii=False) + "\n"
+
+
+def _plain(value: float) -> Any:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,111 @@
+"""What a study computes: runs, recordings of virtual rigs, fits of torque readings; each once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.report.study import Study
+from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.run import run
+from pipeline.runs.workflows import shipped_workflows
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from pipeline.rig.simulation import Rig
+
+Echo = Callable[[str], None]
+
+
+class Results:
+    """Results of a study in a folder.
+
+    Runs lie in ``runs/`` and are completed, not repeated; recordings and fits take seconds and are made anew,
+    to the same numbers.
+
+    Parameters
+    ----------
+    study
+        What is computed.
+    folder
+        Where; it is made.
+    smoke
+        Take the small sizes of the specifications.
+    workers
+        As for `pipeline.runs.run.run`.
+    echo
+        Prints a line.
+    """
+
+    def __init__(self, study: Study, folder: Path, *, smoke: bool, workers: int | None, echo: Echo) -> None:
+        self.study, self.folder, self.smoke = study, folder, smoke
+        self._workers, self._echo = workers, echo
+        self._runs: dict[str, AnalysedRun] = {}
+        self._recordings: dict[str, xr.Dataset] = {}
+        self._torques: dict[str, Any] = {}
+
+    def prepare(self, names: set[str]) -> None:
+        """Compute what has one of the names, runs first; what is there is taken."""
+        for name in self.study.table.runs:
+            if name in names:
+                self.run(name)
+
+    def spec(self, name: str) -> Path:
+        """Return the specification of a run: a file of the study, or one that ships."""
+        given = self.study.table.runs[name].spec
+        return (
+            self.study.file(given) if given.endswith(".toml") else shipped_workflows().get(given, Path(given))
+        )
+
+    def run(self, name: str) -> AnalysedRun:
+        """Return a run, computed or completed first."""
+        if name not in self._runs:
+            place = self.folder / "runs" / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            self._echo(f"{name}: {self.spec(name).name}")
+            run(self.spec(name), place, workers=self._workers, smoke=self.smoke, echo=self._echo)
+            self._runs[name] = AnalysedRun.of(place, self._echo)
+        return self._runs[name]
+
+    def computed(self) -> dict[str, AnalysedRun]:
+        """Return the runs that were computed so far."""
+        return dict(self._runs)
+
+    def rig(self, name: str) -> Rig:
+        """Return a virtual rig."""
+        from pipeline.rig.simulation import load_rig
+
+        return load_rig(self.study.file(self.study.table.recordings[name].rig))
+
+    def recording(self, name: str) -> xr.Dataset:
+        """Return what a virtual rig records; labelled as simulated."""
+        if name not in self._recordings:
+            from pipeline.rig.recordings import read_recording
+            from pipeline.rig.recordings.writing import write_raw
+            from pipeline.rig.simulation import simulated
+
+            self._echo(f"{name}: recording of a virtual rig")
+            raw, mapping = simulated(self.rig(name), is_csv=True)
+            place = self.folder / "recordings" / f"{name}.csv"
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_raw(raw, place)
+            place.with_suffix(".toml").write_text(mapping.toml(), "utf-8")
+            self._recordings[name] = read_recording(place, mapping)
+        return self._recordings[name]
+
+    def series(self, name: str, n_periods: int) -> xr.Dataset:
+        """Return a recording and the model from the same state."""
+        from pipeline.rig.measured.series import series_of
+
+        return series_of(self.recording(name), self.rig(name).parameters, n_periods=n_periods)
+
+    def torques(self, name: str) -> Any:
+        """Return the fit of torque readings."""
+        if name not in self._torques:
+            from pipeline.report.torque_curves import fitted
+
+            self._echo(f"{name}: fit of torque readings")
+            self._torques[name] = fitted(self.study.table.torques[name].header, self.study.path.parent)
+        return self._torques[name]

@@ -1,0 +1,109 @@
+"""What a fit of torque curves says of the law that is fitted: measures and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.report.measures import Estimate
+from pipeline.spec.problems import SpecError, unknown_name
+
+if TYPE_CHECKING:
+    from pipeline.plots.style import DataFigure
+    from pipeline.rig.magnet.fitting import Outcome
+
+_DRAWS, _SEED = 2000, 2018
+
+
+def fitted(header: str, folder: Path) -> Outcome:
+    """Fit torque readings: a header by its path, seen from a folder, or the name of one that ships."""
+    from pipeline.rig.magnet.fitting import fit_measurement
+    from pipeline.rig.magnet.measurement import find_measurement, read_measurement
+
+    own = folder / header
+    return fit_measurement(read_measurement(find_measurement(str(own) if own.is_file() else header)))
+
+
+def drawn(outcome: Outcome, name: str) -> DataFigure:
+    """Draw one of `pipeline.rig.magnet.figures.FIGURES`."""
+    from pipeline.rig.magnet.figures import FIGURES
+
+    if name not in FIGURES:
+        raise SpecError([unknown_name("figure of torque readings", name, FIGURES)])
+    return FIGURES[name](outcome)
+
+
+def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
+    """Share of the curves that a bump of their own describes with at least ``r2``."""
+    from pipeline.analysis.basins.numbers import binomial_interval
+
+    r2 = np.array([fit.quality.r2 for fit in outcome.curves])
+    count = int((r2 >= options["r2"]).sum())
+    low, high = binomial_interval(count, r2.size, method="clopper-pearson")
+    text = f"{count} of {r2.size} curves; R2 {r2.min():.3f} to {r2.max():.3f}, median {np.median(r2):.3f}"
+    return Estimate(count / r2.size, float(low), float(high), text, n=int(r2.size))
+
+
+def gain_over_dipoles(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
+    """How much of what point dipoles leave over (in squares) the joint fit explains: 1 is all, 0 nothing.
+
+    The interval is a bootstrap over whole curves, whose residuals may be as alike as they like.
+    """
+    own, other = (_squares(outcome, r) for r in (outcome.joint.residuals, outcome.dipoles.residuals))
+    rng = np.random.default_rng(_SEED)
+    drawn = rng.integers(0, own.size, (_DRAWS, own.size))
+    gains = 1.0 - own[drawn].sum(1) / other[drawn].sum(1)
+    low, high = np.quantile(gains, [0.025, 0.975])
+    q, d = outcome.joint.quality, outcome.dipoles.quality
+    text = f"R2 {q.r2:.4f} (rms {q.rms * 1e3:.0f} mN m) against {d.r2:.3f} (rms {d.rms * 1e3:.0f} mN m)"
+    return Estimate(float(1 - own.sum() / other.sum()), float(low), float(high), text, n=own.size)
+
+
+def _squares(outcome: Outcome, residuals: np.ndarray) -> np.ndarray:
+    return np.array([float((residuals[fit.curve.rows] ** 2).sum()) for fit in outcome.curves])
+
+
+def width_spread(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
+    """How much the bumps' widths change with the locked angle, as a share of their mean.
+
+    A parabola in the locked angle is fitted to the widths; its range over the angles measured is divided by
+    its mean. The interval is a bootstrap over the curves.
+    """
+    width = np.array([_width(fit.values) for fit in outcome.curves])
+    locked = np.array([fit.curve.locked for fit in outcome.curves])
+    rng = np.random.default_rng(_SEED)
+
+    def spread(rows: np.ndarray) -> float:
+        at = np.polyval(np.polyfit(locked[rows], width[rows], 2), np.unique(locked))
+        return float((at.max() - at.min()) / at.mean())
+
+    every = np.arange(width.size)
+    draws = [spread(rng.choice(every, every.size)) for _ in range(_DRAWS // 4)]
+    low, high = np.quantile(draws, [0.025, 0.975])
+    least, most = np.degrees([width.min(), width.max()])
+    text = f"widths {least:.2f} to {most:.2f} degrees over {width.size} curves"
+    return Estimate(spread(every), float(low), float(high), text, n=width.size)
+
+
+def _width(values: Mapping[str, float]) -> float:
+    from magpend_core.models.pendulum import magnet_torque as laws
+
+    return abs(float(values[laws.WIDTH]))
+
+
+def signs_apart(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
+    """Share of the readings whose torque has the sign of their side of the fitted transition line."""
+    from magpend_core.models.pendulum import magnet_torque as laws
+    from pipeline.analysis.basins.numbers import binomial_interval
+
+    m = outcome.measured
+    line = laws.transition(outcome.joint.values)
+    beyond = m.angle - np.polyval(line, m.locked)
+    clear = np.abs(m.torque) > options.get("clear", 0.0)
+    same = (np.sign(m.torque) == np.sign(beyond))[clear]
+    low, high = binomial_interval(int(same.sum()), same.size, method="clopper-pearson")
+    text = f"{same.sum()} of {same.size} readings that are clear of the noise"
+    return Estimate(float(same.mean()), float(low), float(high), text, n=len(outcome.curves))

@@ -1,0 +1,243 @@
+"""A film's instants, and motions integrated over them: what `pipeline.plots.animation` draws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from magpend_core.models.sectioned import of_flow
+from pipeline.layout.vocabulary import model_attribute, section_attributes
+from pipeline.products.animation import MOST_FRAMES, AnimationOptions
+from pipeline.spec.problems import SpecError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magpend_core.models.model import Model
+    from magpend_core.models.parameters import Parameters
+
+RTOL = 1e-9
+PERIOD_IN_FILM_S = 2.0
+"""What a period takes in the film if no speed is given: slow enough to follow, fast enough to wait for."""
+
+SAMPLES_PER_PERIOD = 240
+"""Lines look smooth; frames fall on samples."""
+
+MOST_SAMPLES = 2_000_000
+
+
+@dataclass(frozen=True)
+class Moving:
+    """One motion of a film.
+
+    Attributes
+    ----------
+    name, colour : str
+        For its title and its lines.
+    parameters : Parameters
+    frequency_hz : float
+        Of the drive; of a flow anything positive.
+    start : ndarray
+        State at time 0, which is the instant of a section.
+    section : ndarray
+        Section points (k, n_states) to be shown; k may be 0.
+    period_s : float
+        After which it repeats; NaN if it does not.
+    """
+
+    name: str
+    colour: str
+    parameters: Parameters
+    frequency_hz: float
+    start: np.ndarray
+    section: np.ndarray
+    period_s: float = math.nan
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Instants of a film.
+
+    Attributes
+    ----------
+    speed : float
+        Seconds of the model in a second of film.
+    duration : float
+        What the film shows [s].
+    n_frames : int
+    substeps : int
+        Samples from frame to frame.
+    repeats : bool
+        Whether the frame after the last would be the first.
+    """
+
+    speed: float
+    duration: float
+    n_frames: int
+    substeps: int
+    repeats: bool
+
+    @property
+    def times(self) -> np.ndarray:
+        """Instants of all samples [s], those of the frames and the end of the last among them."""
+        n = self.n_frames * self.substeps
+        return np.asarray(np.arange(n + 1) * (self.duration / n))
+
+
+def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
+    """Lay the instants of a film: whole periods where all motions repeat and enough of them fit.
+
+    Raises
+    ------
+    SpecError
+        If the film has too many frames, or shows too much time.
+    """
+    cycle = min((_cycle(m) for m in moving), default=1.0)
+    speed = options.speed or _nice(cycle / PERIOD_IN_FILM_S)
+    asked = options.seconds * speed
+    common = _common([m.period_s for m in moving if m.period_s != 0.0], cycle)
+    # what rests repeats whatever is shown
+    duration = asked if not common else common * max(1, round(asked / common))
+    repeats = common is not None and duration <= 2.0 * asked
+    if not repeats:
+        duration = asked
+    n_frames = max(2, round(duration / speed * options.fps))
+    substeps = max(1, math.ceil(duration / n_frames / cycle * SAMPLES_PER_PERIOD))
+    problems = []
+    if n_frames > MOST_FRAMES:
+        problems.append(
+            f"--seconds {options.seconds:g} at --fps {options.fps:g}: {n_frames} frames; at most "
+            f"{MOST_FRAMES}. Lower one of the two."
+        )
+    if len(moving) * n_frames * substeps > MOST_SAMPLES:
+        problems.append(
+            f"--seconds {options.seconds:g} at --speed {speed:g}: {duration / cycle:.4g} periods are too "
+            "many for a film; lower one of the two."
+        )
+    if problems:
+        raise SpecError(problems)
+    return Schedule(duration * options.fps / n_frames, duration, n_frames, substeps, repeats)
+
+
+def _cycle(one: Moving) -> float:
+    """Time that the eye takes for a period [s]: of the drive, or of a flow's own loop."""
+    if not one.parameters.model.autonomous:
+        return 1.0 / one.frequency_hz
+    return one.period_s if one.period_s > 0.0 else 2.0
+
+
+def _nice(value: float) -> float:
+    """Nearest of 1, 2, 5, 10, ... by ratio."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return min((factor * power for factor in (1.0, 2.0, 5.0, 10.0)), key=lambda v: abs(math.log(v / value)))
+
+
+def _common(periods: Sequence[float], cycle: float) -> float | None:
+    """Least time after which all repeat [s]; None if there is none, 0 if all rest."""
+    if any(math.isnan(p) for p in periods):
+        return None
+    if not periods:
+        return 0.0
+    if max(periods) - min(periods) < 1e-12 * max(periods):
+        return periods[0]
+    counts = [p / cycle for p in periods]
+    whole = [round(c) for c in counts]
+    if any(w < 1 or abs(c - w) > 1e-9 * w for c, w in zip(counts, whole, strict=True)):
+        return None
+    return math.lcm(*whole) * cycle
+
+
+def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
+    """Integrate motions over the instants of a film.
+
+    Parameters
+    ----------
+    moving
+        Of one model; at least one.
+    plan
+        The instants.
+
+    Returns
+    -------
+    Dataset
+        ``orbit`` (motion, sample, state), angles not wrapped; ``section`` (motion, point, state), NaN where
+        one has fewer; of a model with a drawing ``points`` (motion, sample, place, axis) and ``fixed``
+        (motion, fixed_place, axis); ``name``, ``colour``, ``period`` [s, NaN if it does not repeat] and
+        ``drive_frequency`` [Hz] by motion; ``time`` [s] by sample. The attributes hold the film's
+        ``n_frames``, ``substeps``, ``speed`` and ``repeats``, and model and parameters.
+
+    Raises
+    ------
+    ArithmeticError
+        If a trajectory diverges.
+    """
+    import xarray as xr
+
+    from magpend_core.trajectory import trajectory
+
+    model, times = moving[0].parameters.model, plan.times
+    orbits = np.stack([
+        np.tile(m.start, (times.size, 1)) if m.period_s == 0.0
+        else trajectory(of_flow(m.parameters), m.frequency_hz, m.start, times, rtol=RTOL, atol=RTOL)
+        for m in moving
+    ])  # fmt: skip
+    longest = max(len(m.section) for m in moving)
+    section = np.full((len(moving), longest, len(model.states)), np.nan)
+    for row, m in zip(section, moving, strict=True):
+        row[: len(m.section)] = m.section
+    units = {"units": "see state_units"}
+    ds = xr.Dataset(
+        {
+            "orbit": (("motion", "sample", "state"), orbits, {**units, "long_name": "motion"}),
+            "section": (("motion", "point", "state"), section, {**units, "long_name": "sections"}),
+            "name": ("motion", [m.name for m in moving]),
+            "colour": ("motion", [m.colour for m in moving]),
+            "period": ("motion", [m.period_s for m in moving], {"units": "s", "long_name": "period"}),
+            "drive_frequency": ("motion", [m.frequency_hz for m in moving], {"units": "Hz"}),
+        },
+        coords={"time": ("sample", times, {"units": "s", "long_name": "time since a section"}),
+                "state": list(model.state_names)},
+        attrs={
+            "title": f"animation of the {model.title}", "n_frames": plan.n_frames, "substeps": plan.substeps,
+            "speed": plan.speed, "repeats": int(plan.repeats), **_told(moving),
+        },
+    )  # fmt: skip
+    return _drawn(ds, moving, orbits)
+
+
+def _told(moving: Sequence[Moving]) -> dict[str, Any]:
+    """Attributes that tell what was integrated; parameters that differ between the motions, by motion."""
+    first = moving[0].parameters
+    lines = [f"{name} = {value!r}" for name, value in first.as_dict().items()]
+    told = {
+        "model": model_attribute(first.model), "parameters": "\n".join(lines),
+        "state_units": ", ".join(first.model.state_units), **section_attributes(first.model.crossing),
+    }  # fmt: skip
+    differing = [n for n in first if any(m.parameters[n] != first[n] for m in moving)]
+    return told | {f"{name}_by_motion": [m.parameters[name] for m in moving] for name in differing}
+
+
+def _drawn(ds: xr.Dataset, moving: Sequence[Moving], orbits: np.ndarray) -> xr.Dataset:
+    """With the places of the points of the model's drawing."""
+    drawing = _model(moving).drawing
+    if drawing is None:
+        return ds
+    about = {"units": drawing.unit, "long_name": "place, to the right and upwards"}
+    moved = [drawing.points(o, m.parameters.as_dict()) for o, m in zip(orbits, moving, strict=True)]
+    places = np.stack([np.stack([one[name] for name in one], axis=-2) for one in moved])
+    ds = ds.assign(points=(("motion", "sample", "place", "axis"), places, about))
+    ds = ds.assign_coords(place=list(moved[0]), axis=["x", "y"])
+    still = [drawing.fixed(m.parameters.as_dict()) for m in moving]
+    if still[0]:
+        fixed = np.stack([np.stack([np.asarray(p, np.float64) for p in one.values()]) for one in still])
+        ds = ds.assign(fixed=(("motion", "fixed_place", "axis"), fixed, about))
+        ds = ds.assign_coords(fixed_place=list(still[0]))
+    return ds
+
+
+def _model(moving: Sequence[Moving]) -> Model:
+    return moving[0].parameters.model

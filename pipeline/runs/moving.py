@@ -1,0 +1,258 @@
+"""The motions of a film: attractors and cells of a run, or a start.
+
+A motion begins at a section: of an attractor, of a cell, or where a start is given. It is integrated anew,
+as closely as portraits are, and never read off stored sections, between which there is nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magpend_core.models.sectioned import of_flow
+from pipeline.layout.letters import letter
+from pipeline.layout.vocabulary import (
+    CLOSED_ORBIT,
+    EQUILIBRIUM,
+    frequency_of,
+    parameters_of,
+    start_dims,
+)
+from pipeline.products.animation import AnimationOptions
+from pipeline.runs.derive import AnalysedRun, refused
+from pipeline.runs.instants import RTOL, Moving
+from pipeline.spec.problems import SpecError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magpend_core.models.parameters import Parameters
+
+MOST_MOTIONS = 8
+
+
+def of_attractors(
+    run: AnalysedRun, options: AnimationOptions, letters: Sequence[str] = ()
+) -> tuple[list[Moving], list[str]]:
+    """Return the attractors of a parameter point of a run as motions, and what is to be said of them.
+
+    Parameters
+    ----------
+    run
+        The run; its attractors are found first if that was not done.
+    options
+        With the axes in the run's own names.
+    letters
+        Which, by letter; by default those with the largest shares.
+
+    Raises
+    ------
+    SpecError
+        If the point is not one of the run, or an attractor is not there.
+    """
+    from pipeline.analysis.selection import choose
+    from pipeline.analysis.selection import start_dims as dims_of_starts
+    from pipeline.plots import palette
+    from pipeline.plots.door import attractors_of, values_of
+
+    with refused(run.name):
+        at, notes = values_of(run, options)
+        found = attractors_of(run, options)
+        part = choose(found, at, tuple(dims_of_starts(found)), "an animation shows one parameter point")
+    here = part.isel(attractor=np.flatnonzero(part["kind"].values > 0))
+    numbers, more = _chosen(run.name, here, letters)
+    cast = palette.cast_of(found, part)
+    parameters, frequency = _at_point(found, here)
+    moving = []
+    for number in numbers:
+        one = here.sel(attractor=number)
+        points = one["attractor_points"].transpose("point", "state").values
+        moving.append(
+            Moving(
+                cast.names[number], cast.colours[number], parameters, frequency, points[0],
+                 points[np.isfinite(points).all(axis=1)], _period(one, parameters, frequency),
+            )
+        )  # fmt: skip
+    return moving, [*notes, *more]
+
+
+def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[int], list[str]]:
+    """Numbers of the attractors that are shown, and what is to be said of others."""
+    there = [int(i) for i in here["attractor"].values]
+    if not there:
+        raise SpecError(
+            [f"{name}: no attractor was found at this point; look with magpend analyse attractors."]
+        )
+    by_letter = {letter(i): i for i in there}
+    if wrong := [text for text in letters if text.upper() not in by_letter]:
+        raise SpecError([
+            f"--attractor {text}: is not at this point; there: {', '.join(by_letter)}." for text in wrong
+        ])  # fmt: skip
+    if letters:
+        chosen = list(dict.fromkeys(by_letter[text.upper()] for text in letters))
+        if len(chosen) > MOST_MOTIONS:
+            raise SpecError(
+                [f"--attractor: {len(chosen)} are asked for; at most {MOST_MOTIONS} fit a frame."]
+            )
+        return chosen, []
+    ranked = np.argsort(-here["share"].values, kind="stable")[:MOST_MOTIONS]
+    left = len(there) - ranked.size
+    more = [f"{left} more attractors are not shown; choose with --attractor LETTER"] if left > 0 else []
+    return sorted(there[i] for i in ranked), more
+
+
+def _at_point(ds: xr.Dataset, here: xr.Dataset) -> tuple[Parameters, float]:
+    """Parameters at a point of a dataset, and the frequency there."""
+    values = {str(k): float(v) for k, v in here.coords.items() if not v.ndim and v.dtype.kind == "f"}
+    base = parameters_of(ds)
+    base = base.replace(**{k: v for k, v in values.items() if k in base})
+    return base, frequency_of(base.model, values)
+
+
+def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
+    """Period of an attractor [s]: of what rests any, of a bounded set none."""
+    kind, periods = int(one["kind"]), int(one["orbit_period"])
+    if kind == EQUILIBRIUM:
+        return 0.0
+    if kind != CLOSED_ORBIT:
+        return math.nan
+    if parameters.model.crossing is None and periods and not parameters.model.autonomous:
+        return periods / frequency
+    return float(one["period_s"]) if "period_s" in one else math.nan
+
+
+def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
+    """Return cells of a run as motions, from the first section that each has kept.
+
+    Parameters
+    ----------
+    run
+        The run.
+    numbers
+        Places of the cells in the cube, counted through all its dims in order, the last fastest.
+
+    Raises
+    ------
+    SpecError
+        If there is no such cell, or it has no sections.
+    """
+    from pipeline.plots.palette import COLOURS
+
+    _refuse_recorded(run)
+    cube = run.cube()
+    shape, dims = cube["status"].shape, cube["status"].dims
+    n = math.prod(shape)
+    problems = [
+        f"--cell {i}: the run has the cells 0 to {n - 1}, counted through {', '.join(map(str, dims))}."
+        for i in numbers
+        if not 0 <= i < n
+    ]
+    if len(numbers) > MOST_MOTIONS:
+        problems.append(f"--cell: {len(numbers)} are asked for; at most {MOST_MOTIONS} fit a frame.")
+    if problems:
+        raise SpecError(problems)
+    moving = []
+    for number, colour in zip(numbers, COLOURS, strict=False):
+        place = dict(zip(dims, np.unravel_index(number, shape), strict=True))
+        one = cube.isel(place).load()
+        points = one["section"].transpose("period_index", "state").values
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            from magpend_core.status import Status
+
+            status = Status(int(one["status"]))
+            problems.append(f"--cell {number}: has no sections to begin at ({status.sentence}).")
+            continue
+        parameters, frequency = _at_point(cube, one)
+        period = int(one["orbit_period"]) / frequency if "orbit_period" in one else 0.0
+        seen_by_drive = not parameters.model.autonomous and period > 0.0
+        name = f"cell {number}: {_where(one)}"
+        moving.append(
+            Moving(
+                name, colour, parameters, frequency, points[0], points, period if seen_by_drive else math.nan
+            )
+        )
+    if problems:
+        raise SpecError(problems)
+    return moving
+
+
+def _where(one: xr.Dataset) -> str:
+    """Values that tell a cell from others."""
+    said = []
+    for key, value in one.coords.items():
+        if value.ndim or str(key) in ("seed",):
+            continue
+        if value.dtype.kind == "f":
+            unit = str(value.attrs.get("units", ""))
+            said.append(f"{key} = {float(value):.6g}" + (f" {unit}" if unit not in ("", "1") else ""))
+        elif value.dtype.kind in "UO":
+            said.append(str(value.values))
+    return ", ".join(said)
+
+
+def _refuse_recorded(run: AnalysedRun) -> None:
+    if run.spec.recorded is not None:
+        raise SpecError([
+            f"{run.name}: its drive is the recording {run.spec.recorded.file}; an animation takes a run at a "
+            "frequency. Draw this one's sections: magpend plot section."
+        ])  # fmt: skip
+
+
+def of_start(
+    parameters: Parameters, frequency_hz: float, state: Sequence[float], n_transient: int = 0
+) -> Moving:
+    """Return the motion from a start, some periods later if wanted.
+
+    Parameters
+    ----------
+    parameters
+        Of any model.
+    frequency_hz
+        Of the drive; without one, of the clock in whose periods `n_transient` counts.
+    state
+        At time 0, the instant of a section.
+    n_transient
+        Periods that pass before the film begins.
+
+    Raises
+    ------
+    SpecError
+        If the number of periods is below 0.
+    ArithmeticError
+        If the trajectory diverges.
+    """
+    from magpend_core.trajectory import trajectory
+    from pipeline.plots.palette import COLOURS
+
+    if n_transient < 0:
+        raise SpecError([f"--transient {n_transient}: must be at least 0."])
+    start = np.asarray(state, dtype=np.float64)
+    if n_transient:
+        begin = np.array([n_transient / frequency_hz])
+        start = trajectory(of_flow(parameters), frequency_hz, start, begin, rtol=RTOL, atol=RTOL)[0]
+    said = ", ".join(f"{s.name} = {v:.4g}" for s, v in zip(parameters.model.states, start, strict=True))
+    return Moving(said, COLOURS[0], parameters, frequency_hz, start, np.empty((0, start.size)))
+
+
+def point_of_run(run: AnalysedRun, options: AnimationOptions) -> tuple[Parameters, float, list[str]]:
+    """Return the parameters and the frequency of a parameter point of a run, and what is to be said of it.
+
+    Raises
+    ------
+    SpecError
+        If more than one point is left, or the point is not one of the run.
+    """
+    from pipeline.analysis.selection import select_points
+    from pipeline.plots.door import values_of
+
+    _refuse_recorded(run)
+    cube = run.cube()
+    with refused(run.name):
+        at, notes = values_of(run, options)
+        part = select_points(cube, at, purpose="an animation shows one parameter point")
+    here = part.isel({d: 0 for d in part["status"].dims if d not in start_dims(part["status"].dims)})
+    return (*_at_point(cube, here), notes)

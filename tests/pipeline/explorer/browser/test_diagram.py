@@ -1,0 +1,487 @@
+"""The diagram in a real browser: the points drawn are those of the cube, and what is done to it shows."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pipeline.runs.run import run
+from pipeline.store.reading import open_run
+from tests.pipeline.explorer.browser.conftest import served
+
+WAIT_S = 60.0  # a machine that is busy with other tests
+
+
+@pytest.fixture(scope="module")
+def cube(looked_at: Path) -> xr.Dataset:
+    """Sections of the run whose page is looked at: cells in C order, then sections, then states."""
+    return open_run(looked_at).load()
+
+
+@pytest.fixture
+def page(visit: Callable[..., Any], explorer: str) -> Any:
+    """The page once its diagram is drawn."""
+    return drawn(visit(explorer))
+
+
+def drawn(opened: Any) -> Any:
+    opened.page.wait_for_selector(".diagram[data-drawn]")
+    until(opened.page, "window.magpend && !document.querySelector('.diagram[aria-busy]')")
+    return opened
+
+
+def until(page: Any, expression: str) -> None:
+    """Wait until an expression is true in the page, whose policy stops playwright's own waiting."""
+    end = time.monotonic() + WAIT_S
+    while not page.evaluate(expression):
+        assert time.monotonic() < end, f"still not so after {WAIT_S:.0f} s: {expression}"
+        page.wait_for_timeout(20)
+
+
+def settled(page: Any) -> None:
+    """Wait until nothing moves: the history is written half a second after the last change."""
+    page.wait_for_timeout(700)
+
+
+def state_of(page: Any) -> dict[str, Any]:
+    return dict(page.evaluate("window.magpend.state.get()"))
+
+
+def points_of(cube: xr.Dataset, state: str = "psi1") -> tuple[np.ndarray, np.ndarray]:
+    """Frequency and value of every cell's sections, cells in C order."""
+    dims = cube["status"].dims
+    values = cube["section"].sel(state=state).transpose(*dims, "period_index").values
+    frequency = np.broadcast_to(
+        cube["frequency"].values[:, None], (values.shape[0], int(np.prod(values.shape[1:-1])))
+    )
+    assert dims[0] == "frequency"
+    return frequency.ravel(), values.reshape(-1, values.shape[-1])
+
+
+def places_of(page: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Places on the page [px] of values in the diagram, from the page's own box and window."""
+    box, (x0, x1, y0, y1) = page.evaluate("[magpend.diagram.box, magpend.diagram.window]")
+    around = page.locator(".diagram").bounding_box()
+    left = around["x"] + box["left"] + (x - x0) / (x1 - x0) * box["width"]
+    top = around["y"] + box["top"] + (y1 - y) / (y1 - y0) * box["height"]
+    return np.stack([left, top], axis=-1)
+
+
+def click_on(page: Any, place: np.ndarray) -> None:
+    page.mouse.click(float(place[0]), float(place[1]))
+    until(page, "magpend.state.get().selected !== null")
+
+
+def nearest(places: np.ndarray, to: np.ndarray) -> tuple[float, int, int]:
+    """Least distance [px] of the points of all cells to a place, and whose it is."""
+    distances = np.linalg.norm(places - to, axis=-1)
+    cell, point = np.unravel_index(int(distances.argmin()), distances.shape)
+    return float(distances.min()), int(cell), int(point)
+
+
+def test_diagram__loads_without_complaints_and_asks_nobody_else(page: Any, cube: xr.Dataset) -> None:
+    n_cells, n_keep = cube["status"].size, cube.sizes["period_index"]
+    assert f"{n_cells * n_keep:,} points of {n_cells} cells" in page.page.locator(".facts-line").inner_text()
+    settled(page.page)
+    assert page.complaints == []
+    assert page.outside == []
+
+
+def test_diagram__a_hostile_title_stays_text(page: Any, looked_at: Path) -> None:
+    title = open_run(looked_at).attrs["title"]
+    assert "<img" in title
+    assert page.page.locator("h1").inner_text() == title
+    assert page.page.title().startswith(title)
+    assert page.page.locator("img").count() == 0
+
+
+def test_diagram__bitmap_has_the_cubes_points_and_nothing_else(page: Any, cube: xr.Dataset) -> None:
+    x, y = points_of(cube)
+    pixels = page.page.evaluate("""async () => {
+        const { diagram } = magpend, { box, window } = diagram;
+        const size = { width: Math.round(box.width), height: Math.round(box.height) };
+        const asked = { bounds: window, ...size, scale: 1, keep: true };
+        const { bitmap } = await diagram.points.ask("render", asked);
+        const canvas = new OffscreenCanvas(size.width, size.height), ctx = canvas.getContext("2d");
+        ctx.drawImage(bitmap, 0, 0);
+        const { data } = ctx.getImageData(0, 0, size.width, size.height), alpha = [];
+        for (let k = 3; k < data.length; k += 4) if (data[k]) alpha.push((k - 3) / 4);
+        return { ...size, window, alpha };
+    }""")
+    x0, x1, y0, y1 = pixels["window"]
+    column = np.floor((x - x0) / (x1 - x0) * pixels["width"]).astype(int)[:, None]
+    row = np.floor((y1 - y) / (y1 - y0) * pixels["height"]).astype(int)
+    drawn_at = np.zeros((pixels["height"], pixels["width"]), bool)
+    drawn_at.ravel()[pixels["alpha"]] = True
+    assert drawn_at[row, np.broadcast_to(column, row.shape)].all()
+    near = np.zeros_like(drawn_at)
+    for r, c in set(
+        zip(row.ravel().tolist(), np.broadcast_to(column, row.shape).ravel().tolist(), strict=True)
+    ):
+        near[max(0, r - 4) : r + 5, max(0, c - 4) : c + 5] = True
+    assert not (drawn_at & ~near).any()
+
+
+def test_diagram__a_click_selects_the_nearest_point_of_the_cube(page: Any, cube: xr.Dataset) -> None:
+    x, y = points_of(cube)
+    places = places_of(page.page, x[:, None] + 0 * y, y)
+    target = places[-1, 3] + np.array([3.0, 2.0])
+    least, _, _ = nearest(places, np.round(target))
+    click_on(page.page, np.round(target))
+    selected = state_of(page.page)["selected"]
+    chosen = places[selected["cell"], selected["point"]]
+    assert np.linalg.norm(chosen - np.round(target)) <= least + 1e-6
+    told = page.page.locator("p.sr-only[role=status]").inner_text()
+    assert f"cell {selected['cell']}, section {selected['point'] + 1}" in told
+    shown = float(re.search(r"= (−?[\d.]+) rad", told).group(1).replace("−", "-"))  # type: ignore[union-attr]
+    assert shown == pytest.approx(y[selected["cell"], selected["point"]], rel=1e-4)
+
+
+def test_diagram__hover_tells_values_of_the_cube(page: Any, cube: xr.Dataset) -> None:
+    x, y = points_of(cube)
+    place = places_of(page.page, x[:1], y[0, :1])[0]
+    page.page.mouse.move(*place.tolist())
+    page.page.wait_for_selector(".tip:not([hidden])")
+    lines = page.page.locator(".tip > div").all_inner_texts()
+    assert float(lines[0].split("= ")[1].split()[0]) == pytest.approx(x[0])
+    told = float(lines[1].split("= ")[1].split()[0].replace("−", "-"))
+    assert np.abs(y[x == x[0]] - told).min() <= 1e-4 * abs(told)
+    page.page.mouse.move(5, 5)
+    page.page.wait_for_selector(".tip", state="hidden")
+
+
+def test_diagram__address_restores_the_view(
+    page: Any, visit: Callable[..., Any], explorer: str, cube: xr.Dataset
+) -> None:
+    one = page.page
+    one.select_option("select[name=y]", "psi2_dot")
+    until(
+        one, "magpend.diagram.vertical.name === 'psi2_dot' && !document.querySelector('.diagram[aria-busy]')"
+    )
+    one.select_option("select[name=colour]", "attractor")
+    one.locator(".legend-entry").first.click()
+    one.locator(".legend-entry").first.click()
+    one.locator(".legend-entry").last.click()
+    x, y = points_of(cube, "psi2_dot")
+    places = places_of(one, x[:, None] + 0 * y, y)
+    one.mouse.move(*places[0, 0].tolist())
+    for _ in range(3):
+        one.mouse.wheel(0, -200)
+    settled(one)
+    one.locator(".diagram").focus()
+    one.keyboard.press("Enter")
+    until(one, "magpend.state.get().selected !== null")
+    settled(one)
+    there = state_of(one)
+    assert there["window"] is not None
+    assert there["hidden"]["attractor"]
+    assert there["y"] == "psi2_dot"
+    other = drawn(visit(one.url)).page
+    assert state_of(other) == there
+    one.keyboard.press("Escape")
+    settled(one)
+    one.go_back()
+    settled(one)
+    assert state_of(one) == there
+
+
+def test_diagram__an_address_that_says_nothing_of_use_shows_the_beginning(
+    visit: Callable[..., Any], explorer: str
+) -> None:
+    opened = drawn(
+        visit(f"{explorer}#x=no&y=%3Cimg%3E&window=1,0,a&point=-3,x&at.q=9&hide.motion=z&plane=a,b")
+    )
+    begun = state_of(opened.page)
+    assert begun["y"] == "psi1"
+    assert begun["window"] is None
+    assert begun["selected"] is None
+    assert begun["hidden"] == {}
+    assert opened.complaints == []
+
+
+def test_diagram__keys_zoom_move_walk_and_tell(page: Any, cube: xr.Dataset) -> None:
+    one, says = page.page, page.page.locator("p.sr-only[role=status]")
+    one.locator(".diagram").focus()
+    full = one.evaluate("magpend.diagram.window")
+    one.keyboard.press("+")
+    inside = one.evaluate("magpend.diagram.window")
+    assert full[0] < inside[0] < inside[1] < full[1]
+    assert full[2] < inside[2] < inside[3] < full[3]
+    one.keyboard.press("ArrowRight")
+    moved = one.evaluate("magpend.diagram.window")
+    assert moved[0] > inside[0]
+    assert moved[1] - moved[0] == pytest.approx(inside[1] - inside[0])
+    one.keyboard.press("0")
+    assert one.evaluate("magpend.diagram.window") == full
+    one.keyboard.press("Enter")
+    until(one, "magpend.state.get().selected !== null")
+    x, y = points_of(cube)
+    begin = state_of(one)["selected"]
+    one.keyboard.press("ArrowRight")
+    until(one, f"magpend.state.get().selected.cell !== {begin['cell']}")
+    after = state_of(one)["selected"]
+    grid = np.unique(x)
+    assert x[after["cell"]] == grid[np.searchsorted(grid, x[begin["cell"]]) + 1]
+    column = y[x == x[after["cell"]]]
+    least = np.abs(column - y[begin["cell"], begin["point"]]).min()
+    assert abs(y[after["cell"], after["point"]] - y[begin["cell"], begin["point"]]) == pytest.approx(least)
+    assert f"cell {after['cell']}," in says.inner_text()
+    one.keyboard.press("Escape")
+    assert state_of(one)["selected"] is None
+    one.keyboard.press("Tab")
+    assert one.evaluate("document.activeElement.closest('.diagram')") is None
+
+
+def test_diagram__shift_and_drag_zooms_into_the_box(page: Any) -> None:
+    one = page.page
+    box, (x0, x1, y0, y1) = one.evaluate("[magpend.diagram.box, magpend.diagram.window]")
+    around = one.locator(".diagram").bounding_box()
+    left, top = around["x"] + box["left"], around["y"] + box["top"]
+    one.keyboard.down("Shift")
+    one.mouse.move(left + 0.25 * box["width"], top + 0.5 * box["height"])
+    one.mouse.down()
+    one.mouse.move(left + 0.75 * box["width"], top + 0.75 * box["height"], steps=4)
+    one.mouse.up()
+    one.keyboard.up("Shift")
+    window = one.evaluate("magpend.diagram.window")
+    wanted = [x0 + 0.25 * (x1 - x0), x0 + 0.75 * (x1 - x0), y1 - 0.75 * (y1 - y0), y1 - 0.5 * (y1 - y0)]
+    pixel = np.repeat([(x1 - x0) / box["width"], (y1 - y0) / box["height"]], 2)
+    assert np.all(np.abs(np.array(window) - wanted) <= pixel)
+    one.mouse.dblclick(left + 10, top + 10)
+    assert one.evaluate("magpend.diagram.window") == [x0, x1, y0, y1]
+
+
+def test_diagram__deep_zoom_keeps_its_ticks_apart(page: Any) -> None:
+    one = page.page
+    x = 2.2 + 1e-10
+    one.evaluate(f"magpend.diagram.moveTo([{x!r} - 1e-12, {x!r} + 1e-12, -0.1, 0.1])")
+    settled(one)
+    texts = svg_of(one)
+    label = next(text for text in texts if "drive frequency" in text)
+    assert "2.2" in label
+    assert "10⁻¹³" in label or "10⁻¹²" in label
+    assert len(set(texts)) == len(texts)
+
+
+def svg_of(page: Any) -> list[str]:
+    """Texts of the picture that Save hands out as SVG."""
+    return [node.text or "" for node in svg_root(page).iter("{http://www.w3.org/2000/svg}text")]
+
+
+def svg_root(page: Any) -> ElementTree.Element:
+    page.locator(".toolbar summary", has_text="Save").click()
+    with page.expect_download() as waiting:
+        page.get_by_role("button", name="Picture (SVG)").click()
+    return ElementTree.fromstring(Path(waiting.value.path()).read_text("utf-8"))
+
+
+def test_diagram__pictures_to_keep(page: Any, cube: xr.Dataset) -> None:
+    one = page.page
+    root = svg_root(one)
+    svg = "{http://www.w3.org/2000/svg}"
+    circles = [
+        path
+        for path in root.iter(f"{svg}path")
+        if path.get("fill", "none") != "none" and "A" in path.get("d", "")
+    ]
+    assert len(circles) == cube["status"].size * cube.sizes["period_index"] <= 20_000
+    assert any("drive frequency [Hz]" in (text.text or "") for text in root.iter(f"{svg}text"))
+    one.locator(".toolbar summary", has_text="Save").click()
+    with one.expect_download() as waiting:
+        one.get_by_role("button", name="Picture (PNG)").click()
+    data = Path(waiting.value.path()).read_bytes()
+    width = one.evaluate("magpend.diagram.width")
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    assert int.from_bytes(data[16:20], "big") == 2 * width
+
+
+def test_diagram__legend_switches_points_off(page: Any) -> None:
+    one = page.page
+    one.select_option("select[name=colour]", "attractor")
+    asked = "magpend.diagram.points.ask('points', { bounds: magpend.diagram.window, most: 1e6 })"
+    ask = f"{asked}.then((found) => found.length / 3)"
+    before = one.evaluate(ask)
+    entry = one.locator(".legend-entry").first
+    entry.click()
+    one.wait_for_timeout(200)
+    assert entry.get_attribute("aria-pressed") == "false"
+    assert 0 < one.evaluate(ask) < before
+    entry.click()
+    one.wait_for_timeout(200)
+    assert one.evaluate(ask) == before
+
+
+def test_diagram__a_lost_server_is_said_and_tried_again(page: Any) -> None:
+    one = page.page
+    one.route("**/api/diagram*", lambda route: route.abort())
+    one.select_option("select[name=y]", "psi2")
+    one.wait_for_selector(".banner:not([hidden])")
+    assert "The server does not answer" in one.locator(".banner").inner_text()
+    one.unroute("**/api/diagram*")
+    one.get_by_role("button", name="Try again").click()
+    one.wait_for_selector(".banner", state="hidden")
+    assert one.evaluate("magpend.diagram.vertical.name") == "psi2"
+
+
+def test_diagram__a_refusal_is_shown_as_the_server_says_it(page: Any) -> None:
+    one = page.page
+    asked = "magpend.source.diagram({ x: 'frequency', y: 'nothing', at: {} })"
+    answer = one.evaluate(f"{asked}.catch((error) => error.message)")
+    assert "nothing" in answer
+
+
+CONTRAST = """() => {
+    const parse = (colour) => colour.match(/[\\d.]+/g).map(Number);
+    const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+    const weights = [0.2126, 0.7152, 0.0722];
+    const light = (rgb) => weights.reduce((sum, weight, k) => sum + weight * linear(rgb[k] / 255), 0);
+    const ground = (element) => getComputedStyle(element).backgroundColor;
+    const found = [];
+    for (const element of document.querySelectorAll("h1, h2, p, button, summary, label, select, .run-name")) {
+        if (!element.checkVisibility() || !element.textContent.trim()) continue;
+        let behind = element;
+        while (behind.parentElement && ground(behind) === "rgba(0, 0, 0, 0)") behind = behind.parentElement;
+        const pair = [getComputedStyle(element).color, ground(behind)].map((c) => light(parse(c)) + 0.05);
+        found.push([element.textContent.trim().slice(0, 40), Math.max(...pair) / Math.min(...pair)]);
+    }
+    return found;
+}"""
+
+SMALL_TARGETS = """() => [...document.querySelectorAll("button, select, summary")]
+    .filter((element) => element.checkVisibility())
+    .map((element) => [element.textContent, element.getBoundingClientRect()])
+    .filter(([, { width, height }]) => Math.min(width, height) < 43.5)
+    .map(([text, { width, height }]) => [text, width, height])"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_diagram__texts_can_be_read(visit: Callable[..., Any], explorer: str, scheme: str) -> None:
+    one = drawn(visit(explorer, color_scheme=scheme)).page
+    paper = one.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (int(re.findall(r"\d+", paper)[0]) < 128) == (scheme == "dark")
+    found = one.evaluate(CONTRAST)
+    # 4.5 is level AA of the guidelines on accessible content (WCAG 2.2, 1.4.3)
+    assert len(found) > 8
+    assert [entry for entry in found if entry[1] < 4.5] == []
+
+
+def test_diagram__the_switch_of_colours_is_kept(page: Any) -> None:
+    one = page.page
+    one.locator(".theme-switch").click()
+    assert one.evaluate("document.documentElement.dataset.theme") == "dark"
+    assert "dark" not in one.url
+    one.reload()
+    one.wait_for_selector(".diagram[data-drawn]")
+    assert one.evaluate("document.documentElement.dataset.theme") == "dark"
+
+
+def test_diagram__narrow_pages_have_tabs_and_large_targets(
+    visit: Callable[..., Any], explorer: str, cube: xr.Dataset
+) -> None:
+    one = drawn(visit(explorer, width=390, height=844, has_touch=True)).page
+    assert one.evaluate("document.documentElement.scrollWidth") <= 390
+    small = one.evaluate(SMALL_TARGETS)
+    assert small == []
+    x, y = points_of(cube)
+    place = places_of(one, x[:1], y[0, :1])[0]
+    one.touchscreen.tap(*place.tolist())
+    until(one, "magpend.state.get().selected !== null")
+    one.locator("#tab-orbit").click()
+    assert one.locator(".diagram").is_hidden()
+    assert one.locator(".side-column").is_visible()
+    assert json.loads(one.evaluate("JSON.stringify(magpend.state.get().panel)")) == "orbit"
+    assert one.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+BIG = """
+kind = "sweep"
+model = "duffing"
+[axes]
+frequency_hz = { start = 0.15, stop = 0.25, num = 1000 }
+[initial_conditions]
+kind = "random"
+n = 20
+x = [-1.5, 1.5]
+v = [-1.0, 1.0]
+[integration]
+rtol = 1e-5
+atol = 1e-5
+n_transient = 100
+n_keep = 500
+"""
+
+FRAME_MS = 1000.0 / 60.0
+
+
+def frames_of(page: Any, gesture: Callable[[], None]) -> np.ndarray:
+    """Processor time [ms] of the page's own thread for each frame of a gesture, by the browser's trace.
+
+    Not the time between frames: other work on the machine would be in it.
+    """
+    events: list[dict[str, Any]] = []
+    client = page.context.new_cdp_session(page)
+    client.on("Tracing.dataCollected", lambda some: events.extend(some["value"]))
+    ended: list[Any] = []
+    client.on("Tracing.tracingComplete", lambda told: ended.append(told))
+    categories = {"includedCategories": ["devtools.timeline"], "excludedCategories": ["*"]}
+    client.send("Tracing.start", {"traceConfig": categories, "transferMode": "ReportEvents"})
+    gesture()
+    client.send("Tracing.end")
+    while not ended:
+        page.wait_for_timeout(50)
+    drawn_frames = [e for e in events if e.get("ph") == "X" and e["name"] == "FireAnimationFrame"]
+    return np.array([e.get("tdur", e["dur"]) for e in drawn_frames]) / 1000.0
+
+
+def drag_about(page: Any, steps: int = 40) -> None:
+    """Zoom into the middle and drag the diagram to and fro."""
+    around = page.locator(".diagram").bounding_box()
+    x, y = around["x"] + 0.5 * around["width"], around["y"] + 0.5 * around["height"]
+    page.mouse.move(x, y)
+    for _ in range(10):
+        page.mouse.wheel(0, -100)
+        page.wait_for_timeout(16)
+    page.mouse.down()
+    for k in range(steps):
+        page.mouse.move(x - 5 * k, y + 2 * k)
+        page.wait_for_timeout(16)
+    page.mouse.up()
+
+
+def test_diagram__frames_take_a_part_of_a_sixtieth_of_a_second(page: Any) -> None:
+    frames = frames_of(page.page, lambda: drag_about(page.page))
+    assert len(frames) >= 20
+    assert np.percentile(frames, 95) < 0.6 * FRAME_MS
+
+
+@pytest.mark.long
+def test_diagram__ten_million_points(visit: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "big.toml").write_text(BIG, "utf-8")
+    run(tmp_path / "big.toml", tmp_path / "big", workers=2, echo=lambda text: None)
+    with served(tmp_path / "big") as address:
+        opened = drawn(visit(address))
+        assert "10,000,000 points of 20,000 cells" in opened.page.locator(".facts-line").inner_text()
+        frames = frames_of(opened.page, lambda: drag_about(opened.page))
+        assert len(frames) >= 20
+        assert np.percentile(frames, 95) < 0.6 * FRAME_MS
+        opened.page.keyboard.press("0")
+        settled(opened.page)
+        cube = open_run(tmp_path / "big").load()
+        x, y = points_of(cube, "x")
+        places = places_of(opened.page, x[:, None] + 0 * y, y)
+        target = np.round(places[12_345, 67])
+        click_on(opened.page, target)
+        selected = state_of(opened.page)["selected"]
+        chosen = places[selected["cell"], selected["point"]]
+        assert np.linalg.norm(chosen - target) <= nearest(places, target)[0] + 1e-6
+        assert opened.complaints == []
+        assert opened.outside == []

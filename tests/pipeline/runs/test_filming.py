@@ -1,0 +1,247 @@
+"""Animations: what they show against an integration of another kind, the files, what is refused."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+from scipy.integrate import solve_ivp
+
+import magpend
+from pipeline.cli.exits import Exit
+from pipeline.plots.films import durations
+from pipeline.products.animation import AnimationOptions
+from pipeline.runs import instants
+from pipeline.runs.filming import Start, animation
+from pipeline.spec.problems import SpecError
+
+HZ = 0.11
+
+RUN = """
+kind = "sweep"
+model = "duffing"
+title = "two wells"
+[parameters]
+preset = "twin-well-periodic"
+[axes]
+frequency_hz = { values = [0.15915494309189535, 0.16] }
+[initial_conditions]
+kind = "list"
+points = [[1.0, 0.0], [-1.0, 0.0], [0.9, 0.1]]
+[integration]
+n_transient = 200
+n_keep = 8
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Two orbits of period 1, one in each well, found from three starts."""
+    folder = tmp_path_factory.mktemp("animations")
+    (folder / "wells.toml").write_text(RUN, "utf-8")
+    magpend.run(folder / "wells.toml", out=folder / "run", workers=0)
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    """A start of the driven pendulum, which has a drawing, at 6 frames a second."""
+    start = Start({"th": 0.4, "w": -0.2}, model="driven-pendulum", frequency_hz=HZ)
+    return animation(start=start, seconds=4, fps=6, size=400)
+
+
+def pendulum(t, y):
+    """The driven pendulum's equations, written out again."""
+    return [y[1], 1.66 * np.cos(2 * np.pi * HZ * t) - 0.2 * y[1] - np.sin(y[0])]
+
+
+def duffing(t, y, hz):
+    return [y[1], 0.2 * np.cos(2 * np.pi * hz * t) - 0.15 * y[1] + y[0] - y[0] ** 3]
+
+
+def test_animation__frames_are_where_another_integration_says(swinging):
+    """DOP853 of the equations as they stand here, and the bob at (sin th, -cos th)."""
+    data = swinging.figure.data
+    at_frames = data.time.values[:: data.attrs["substeps"]]
+    assert np.diff(at_frames) == pytest.approx(data.attrs["speed"] / 6.0)
+    assert data.attrs["speed"] == 5.0  # a period of 9.1 s takes about two
+    there = solve_ivp(
+        pendulum, (0.0, at_frames[-1]), [0.4, -0.2], "DOP853", at_frames, rtol=1e-11, atol=1e-11
+    )
+    found = data.orbit.isel(motion=0, sample=slice(None, None, data.attrs["substeps"])).values
+    np.testing.assert_allclose(found, there.y.T, atol=1e-6)
+    machine = swinging.movers[0]
+    for k in (0, 7, swinging.n_frames - 1):
+        machine.at(k * data.attrs["substeps"])
+        bob = np.array([np.sin(there.y[0, k]), -np.cos(there.y[0, k])])
+        np.testing.assert_allclose(np.ravel(machine.traced.dot.get_data()), bob, atol=1e-6)
+        np.testing.assert_allclose(np.transpose(machine.lines[0].get_data()), [[0.0, 0.0], bob], atol=1e-6)
+
+
+def test_animation__pixels_of_the_bob_are_where_the_data_are(swinging):
+    """The blue disc in the drawing's half of a frame, by the centre of its pixels."""
+    data, axes = swinging.figure.data, swinging.figure.axes[0]
+    frames = list(swinging.frames())
+    assert len(frames) == swinging.n_frames == 24
+    for k in (3, 20):
+        height, width, _ = frames[k].shape
+        rows, columns = np.nonzero((frames[k][:, : int(0.5 * width)] == [0x00, 0x72, 0xB2]).all(axis=-1))
+        place = data.points.isel(motion=0, sample=k * data.attrs["substeps"]).sel(place="bob").values
+        x, y = axes.transData.transform(place)
+        near = np.hypot(columns - x, height - rows - y) < 8.0
+        # the trail has the same colour, fading: most of the full colour is the disc's
+        assert near.sum() > 40
+        assert columns[near].mean() == pytest.approx(x, abs=1.5)
+        assert (height - rows[near]).mean() == pytest.approx(y, abs=1.5)
+
+
+def test_animation__attractors_side_by_side_repeat(run):
+    """Orbits from the run's own analysis; each at every frame as DOP853 from its section."""
+    film = animation(run, at={"frequency": 0.16}, seconds=3, fps=8, size=400)
+    data, hz = film.figure.data, 0.16
+    assert data.name.values.tolist() == ["A: period 1", "B: period 1"]
+    assert data.attrs["repeats"] == 1
+    assert "cube_digest" in data.attrs
+    n_periods = data.time.values[-1] * hz
+    assert n_periods == pytest.approx(round(n_periods), abs=1e-12)
+    for k in range(2):
+        orbit = data.orbit.isel(motion=k).values
+        np.testing.assert_allclose(orbit[-1], orbit[0], atol=1e-6)
+        there = solve_ivp(
+            duffing, (0.0, data.time.values[-1]), orbit[0], "DOP853", data.time.values,
+            args=(hz,), rtol=1e-10, atol=1e-10,
+        )  # fmt: skip
+        np.testing.assert_allclose(orbit, there.y.T, atol=1e-6)
+    cube = magpend.open_run(run).sel(frequency=hz)
+    kept = cube.section.isel(period_index=-1).values
+    starts = data.orbit.isel(sample=0).values
+    assert sorted(np.sign(starts[:, 0])) == [-1.0, 1.0]
+    assert all(np.abs(starts - point).max(axis=1).min() < 1e-4 for point in kept)
+
+
+def test_animation__cells_pass_through_their_sections(run):
+    """Cell 4 is the second start at the second frequency: its film goes through what the cube holds."""
+    film = animation(run, cells=[4], seconds=10, fps=5, speed=3.0)
+    data = film.figure.data
+    cube = magpend.open_run(run).isel(frequency=1, initial_condition=1)
+    assert "frequency = 0.16 Hz" in str(data.name.values[0])
+    sections = np.arange(4) / 0.16
+    assert sections[-1] < data.time.values[-1]
+    for i, name in enumerate(("x", "v")):
+        values = np.interp(sections, data.time.values, data.orbit.isel(motion=0, state=i).values)
+        # linear between samples
+        np.testing.assert_allclose(values, cube.section.sel(state=name).values[:4], atol=2e-4)
+
+
+def test_animate__files_open_with_their_frames_and_loop(main, run, tmp_path):
+    """GIF and WebP repeat for ever; MP4 where ffmpeg is."""
+    words = ["animate", run, "--at", "frequency=0.16", "--attractor", "b", "--seconds", "2", "--fps", "8"]
+    for suffix in ("gif", "webp"):
+        code, out, err = main(*map(str, [*words, "--size", "300", "--out", f"film.{suffix}"]))
+        assert code == 0, err
+        assert out.splitlines() == [f"animation: film.{suffix}", "data: film.nc"]
+        with Image.open(tmp_path / f"film.{suffix}") as film:
+            said = int(err.split(" frames")[0].split()[-1])
+            assert (film.n_frames, film.width, film.info["loop"]) == (said, 300, 0)
+            shown = []
+            for k in range(film.n_frames):
+                film.seek(k)
+                film.load()
+                shown.append(film.info["duration"])
+            assert sum(shown) == pytest.approx(1000 * said / 8.0, abs=10)
+    with xr.open_dataset(tmp_path / "film.nc", engine="scipy") as stored:
+        assert stored.orbit.dims == ("motion", "sample", "state")
+        assert stored.attrs["n_frames"] == said
+    assert "film.webp was there already" not in err
+    code, _, err = main(*map(str, [*words, "--size", "300", "--out", "film.webp"]))
+    assert code == 0
+    assert "note: film.webp was there already, and is replaced" in err
+    code, out, _ = main(*map(str, [*words, "--size", "300"]))
+    assert out.splitlines()[0] == f"animation: {run}/figures/animation_frequency_0.16_attractor_b.gif"
+    code, _, err = main(*map(str, [*words, "--size", "301", "--out", "film.mp4"]))
+    if shutil.which("ffmpeg"):
+        assert code == 0, err
+        assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+    else:
+        assert code == Exit.REFUSED
+
+
+def test_animate__mp4_without_ffmpeg_is_refused(main, tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    code, _, err = main("animate", "--model", "duffing", "--out", "film.mp4")
+    assert code == Exit.REFUSED
+    assert (
+        err
+        == "magpend: film.mp4: MP4 takes the program ffmpeg, and there is none; install it, or write .gif.\n"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["RUN", "--at", "frequency=0.1595"], "frequency = 0.1595 is not on its axis"),
+        (["RUN"], "frequency (2 values): choose a value of each"),
+        (["RUN", "--at", "frequency=0.16", "--attractor", "Z"], "--attractor Z: is not at this point; there"),
+        (["RUN", "--cell", "6"], "--cell 6: the run has the cells 0 to 5, counted through frequency, i"),
+        (["RUN", "--cell", "1", "--attractor", "A"], "--attractor and --cell: a film shows one of these"),
+        (["RUN", "--cell", "1", "--at", "frequency=0.16"], "--at: a cell has its own point"),
+        (["RUN", "--model", "duffing"], "--model: a run has its own"),
+        (["RUN", "--at", "frequency=0.16", "--y", "1"], "unknown state of duffing 'y'"),
+        (["RUN", "--at", "frequency=0.16", "--degrees"], "have no angle"),
+        (["RUN", "--at", "frequency=0.16", "--portrait", "y"], "unknown portrait 'y'; there are portr"),
+        (["--at", "q=1"], "--at: is for a run; name its directory."),
+        (["--out", "film.avi"], "film.avi: the suffix must be one of .gif, .webp, .mp4."),
+        (["--out", "gone/film.gif"], "gone: no such folder; make it first."),
+        (["--fps", "60"], "--fps 60: a GIF has at most 50 frames a second"),
+        (["--seconds", "0"], "seconds = 0.0: must be greater than 0"),
+        (["--seconds", "500", "--fps", "50"], "25000 frames; at most 5000. Lower one of the two."),
+        (["--speed", "1e6", "--model", "duffing"], "periods are too many for a film"),
+        (["--transient", "-1"], "--transient -1: must be at least 0."),
+        (["--size", "10"], "size = 10: must be at least 200"),
+    ],
+)  # fmt: skip
+def test_animate__refuses_in_one_sentence(main, run, tmp_path, words, said):
+    before = sorted(run.rglob("*"))
+    code, _, err = main("animate", *[str(run) if word == "RUN" else word for word in words])
+    assert code == Exit.REFUSED
+    assert said in err
+    assert "Traceback" not in err
+    assert not list(tmp_path.iterdir())
+    assert {p for p in sorted(run.rglob("*")) if p not in before} <= set((run / "derived").rglob("*"))
+
+
+def one_moving(period):
+    parameters = magpend.load_model("duffing").load()
+    return instants.Moving("", "0", parameters, 0.5, np.zeros(2), np.empty((0, 2)), period)
+
+
+def test_schedule__whole_periods_where_they_fit():
+    """Orbits of 2 and 3 drive periods of 2 s: 12 s together, at 1 s/s the nearest multiple of it."""
+    both = [one_moving(4.0), one_moving(6.0)]
+    plan = instants.schedule(both, AnimationOptions(seconds=13.0, fps=10.0, speed=1.0))
+    assert (plan.duration, plan.n_frames, plan.repeats) == (12.0, 120, True)
+    assert plan.times.size == plan.n_frames * plan.substeps + 1
+    short = instants.schedule(both, AnimationOptions(seconds=5.0, fps=10.0, speed=1.0))
+    assert (short.duration, short.repeats) == (5.0, False)
+    chaos = instants.schedule([*both, one_moving(np.nan)], AnimationOptions(seconds=13.0, speed=1.0))
+    assert (chaos.duration, chaos.repeats) == (13.0, False)
+    rest = instants.schedule([one_moving(0.0)], AnimationOptions(seconds=3.0, speed=1.0))
+    assert (rest.duration, rest.repeats) == (3.0, True)
+    assert instants.schedule(both, AnimationOptions()).speed == 1.0
+
+
+def test_durations__add_up():
+    assert durations(3, 30.0, 10) == [30, 40, 30]
+    assert sum(durations(300, 24.0, 10)) == 12_500
+
+
+def test_animation__a_start_of_a_run_is_at_its_point(run):
+    film = animation(run, at={"frequency": 0.16}, start={"x": 0.3}, seconds=1, fps=4)
+    assert film.figure.data.drive_frequency.values.tolist() == [0.16]
+    assert film.figure.data.orbit.values[0, 0].tolist() == [0.3, 0.0]
+    with pytest.raises(SpecError, match="unknown state"):
+        animation(run, at={"frequency": 0.16}, start={"z": 0.3})
