@@ -25,13 +25,9 @@ export function paintBranches(ctx, box, bounds, found, colours) {
     for (const branch of found.branches) {
       for (const segment of branch.segments) if (segment.stable === stable) trace(ctx, box, bounds, segment);
     }
-    ctx.setLineDash([]);
-    ctx.strokeStyle = colours.card;
-    ctx.lineWidth = 3.5;
-    if (stable) ctx.stroke();
     ctx.setLineDash(stable ? [] : [5, 4]);
     ctx.strokeStyle = colours.ink;
-    ctx.lineWidth = 1.5;
+    ctx.lineWidth = 1.2;
     ctx.stroke();
   }
   ctx.setLineDash([]);
