@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import ValidationError
+
 from pipeline.explorer.diagram import diagram
 from pipeline.explorer.explored import ExploredRun, ExplorerError
+from pipeline.explorer.messages import Region
+from pipeline.explorer.orbits import orbit
+from pipeline.explorer.overlays import attractors, branches, curves
+from pipeline.explorer.planes import plane
+from pipeline.explorer.regions import zoom_toml
+from pipeline.explorer.tables import FORMATS, table
+from pipeline.explorer.verticals import verticals
 from pipeline.explorer.view import describe_view
 
 JSON = "application/json; charset=utf-8"
@@ -90,11 +100,52 @@ def json_reply(value: Any) -> Reply:
 
 
 def _view(run: ExploredRun, query: Query, live: bool) -> Reply:
-    return json_reply(describe_view(run, live))
+    return run.remembered(
+        f"view {live}", lambda: json_reply({**describe_view(run, live), "directory": run.name})
+    )
 
 
 def _diagram(run: ExploredRun, query: Query, live: bool) -> Reply:
-    return Reply(diagram(run, query.text("x"), query.text("y"), query.at), BINARY)
+    x, y, at = query.text("x"), query.text("y"), query.at
+    key = ("diagram", x, y, *sorted(run.place(at, but=x).items()))
+    return run.large(repr(key), lambda: Reply(diagram(run, x, y, at), BINARY))
+
+
+def _curves(run: ExploredRun, query: Query, live: bool) -> Reply:
+    return json_reply(curves(run, query.text("x"), query.at))
+
+
+def _branches(run: ExploredRun, query: Query, live: bool) -> Reply:
+    return json_reply(branches(run, query.text("x"), query.text("y"), query.at))
+
+
+def _attractors(run: ExploredRun, query: Query, live: bool) -> Reply:
+    return json_reply(attractors(run, query.at))
+
+
+def _orbit(run: ExploredRun, query: Query, live: bool) -> Reply:
+    return Reply(orbit(run, query.count("cell"), query.count("point")), BINARY)
+
+
+def _plane(run: ExploredRun, query: Query, live: bool) -> Reply:
+    return Reply(plane(run, query.at), BINARY)
+
+
+def _table(run: ExploredRun, query: Query, live: bool) -> Reply:
+    kind, form = query.text("view"), query.text("format", "csv")
+    words = {name: query.count(name) for name in ("cell", "point") if name in query.words}
+    asked = {"x": query.text("x", ""), "y": query.text("y", ""), "at": query.at, **words}
+    content = table(run, kind, asked, form)
+    return Reply(content, FORMATS[form], f"{kind}.{form}")
+
+
+def _zoom(run: ExploredRun, query: Query, live: bool) -> Reply:
+    try:
+        region = Region.model_validate_json(query.body)
+    except ValidationError as error:
+        problems = [f"{'.'.join(map(str, p['loc'])) or 'body'}: {p['msg']}" for p in error.errors()[:5]]
+        raise ExplorerError("; ".join(problems)) from None
+    return Reply(zoom_toml(run, region).encode(), "text/plain; charset=utf-8")
 
 
 ANSWERS: dict[str, Answer] = {
@@ -102,5 +153,21 @@ ANSWERS: dict[str, Answer] = {
     for a in (
         Answer("view", _view, fresh=True),
         Answer("diagram", _diagram),
+        Answer("curves", _curves),
+        Answer("branches", _branches),
+        Answer("attractors", _attractors),
+        Answer("orbit", _orbit),
+        Answer("plane", _plane),
+        Answer("table", _table),
+        Answer("zoom", _zoom, method="POST"),
     )
 }
+
+
+def first_answers(run: ExploredRun, live: bool) -> None:
+    """Prepare what the page asks for first: the view, and the diagram that it begins with."""
+    with contextlib.suppress(Exception):  # whoever asks hears what is wrong
+        _view(run, Query({}), live)
+        axis = next((a for a in run.axes if a.name == run.path), run.axes[0])
+        at = {f"{_AT}{a.name}": "0" for a in run.axes if a.swept and a is not axis}
+        _diagram(run, Query({"x": axis.name, "y": verticals(run)[0].name, **at}), live)

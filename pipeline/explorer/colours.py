@@ -80,7 +80,7 @@ class Scheme:
 
 def schemes(run: ExploredRun) -> list[Scheme]:
     """Return the schemes that a run has, the one to begin with first."""
-    return list(_schemes(run))
+    return run.remembered("schemes", lambda: list(_schemes(run)))
 
 
 def _schemes(run: ExploredRun) -> Iterator[Scheme]:

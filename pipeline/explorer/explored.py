@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from pipeline.layout.cells import CellMap, Inputs, parameter_axes
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
 from pipeline.runs.derive import stored
 from pipeline.spec.problems import unknown_name
+from pipeline.store.files import DERIVED
+from pipeline.store.products import products_in
 from pipeline.store.run import Run
 
 if TYPE_CHECKING:
@@ -19,6 +22,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import xarray as xr
+
+
+T = TypeVar("T")
+
+MOST_LARGE = 2
+"""Diagrams that are kept in memory, of up to some 200 MB each."""
 
 
 class ExplorerError(ValueError):
@@ -71,7 +80,9 @@ class ExploredRun(Run):
             return super().cube(chunks, check=check)
         with self._lock:
             if "cube" not in self._opened:
-                self._opened["cube"] = super().cube()
+                opened = super().cube()
+                # once: each use of a coordinate would read it again
+                self._opened["cube"] = opened.assign_coords({n: c.load() for n, c in opened.coords.items()})
             found: xr.Dataset = self._opened["cube"]
             return found
 
@@ -83,6 +94,47 @@ class ExploredRun(Run):
                 self._opened[key] = None if self.spec.recorded is not None else stored(self, name)
             found: xr.Dataset | None = self._opened[key]
             return found
+
+    def refreshed(self) -> ExploredRun:
+        """The same run with what has been added since: cells, and results of analyses."""
+        if not self.complete:
+            return ExploredRun.of(Run.open(self.info.files))
+        if self._derived_names() == self.remembered("derived names", self._derived_names):
+            return self
+        # the cells of a complete run stay as they are
+        found = replace(self, _opened={}, _lock=threading.RLock())
+        found._opened["cube"] = self.cube()
+        found.remembered("derived names", found._derived_names)
+        return found
+
+    def _derived_names(self) -> list[str]:
+        return sorted(place.name for place in products_in(self.info.files.below(DERIVED)))
+
+    def remembered(self, key: str, make: Callable[[], T]) -> T:
+        """What was made under a name, made once however many ask at the same time."""
+        with self._lock:
+            lock = self._opened.setdefault(f"lock {key}", threading.Lock())
+        with lock:
+            if key not in self._opened:
+                self._opened[key] = make()
+            found: T = self._opened[key]
+            return found
+
+    def large(self, key: str, make: Callable[[], T]) -> T:
+        """As `remembered`, but for what is large: the last few alone are kept."""
+        with self._lock:
+            last: list[str] = self._opened.setdefault("large", [])
+            if key in last:
+                last.remove(key)
+            last.append(key)
+            while len(last) > MOST_LARGE:
+                self._opened.pop(last.pop(0), None)
+        return self.remembered(key, make)
+
+    @property
+    def path(self) -> str | None:
+        """The axis that walks follow; None in a sweep."""
+        return None if self.plan.path is None else self.plan.dims[self.plan.path]
 
     @property
     def axes(self) -> tuple[Axis, ...]:

@@ -111,7 +111,7 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
     explored = ExploredRun.of(run)
     if run.spec.recorded is not None:
         raise ExplorerError(
-            "the drive of this run is a recording: it does not repeat, and so no orbit is drawn from a section."
+            "the drive of this run is a recording, which does not repeat: no orbit is drawn from a section."
         )
     found = cell_of(explored, cell)
     section = found.section
@@ -290,23 +290,27 @@ def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
         if number >= 0:
             others = [tuple(int(i) for i in row) for row in np.argwhere(ids == number)[: MOST_SEEDS + 1]]
             chosen += [row for row in others if row != own]
-    rows = []
-    for row in chosen[:MOST_SEEDS]:
-        index = dict(zip(run.start_dims, row, strict=True))
-        values = {s.name: _start_value(cube, grid_dim(s.name), index) for s in run.model.states}
-        rows.append({**values, "label": _seed_label(cube, run, index)})
-    return rows
+    columns = {s.name: _starts_of(run, grid_dim(s.name)) for s in run.model.states}
+    return [
+        {
+            **{name: float(values[row]) for name, values in columns.items()},
+            "label": _seed_label(cube, run, row),
+        }
+        for row in chosen[:MOST_SEEDS]
+    ]
 
 
-def _start_value(cube: xr.Dataset, name: str, index: Mapping[str, int]) -> float:
-    """Initial value of a state."""
-    coordinate = cube.coords[name]
-    return float(coordinate.isel({d: i for d, i in index.items() if d in coordinate.dims}))
-
-
-def _seed_label(cube: xr.Dataset, run: ExploredRun, index: Mapping[str, int]) -> str:
-    if BRANCH in index:
-        walk = cube.isel({BRANCH: index[BRANCH]})
-        return f"start {int(walk['seed'])}, {str(walk['direction'].values)}"
+def _starts_of(run: ExploredRun, name: str) -> np.ndarray:
+    """Initial values of a state, over the dims of the starts."""
+    coordinate = run.cube().coords[name]
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in run.start_dims]
-    return f"start {int(np.ravel_multi_index(tuple(index.values()), sizes)) if sizes else 0}"
+    shaped = [n if d in coordinate.dims else 1 for d, n in zip(run.start_dims, sizes, strict=True)]
+    return np.broadcast_to(np.asarray(coordinate.values, np.float64).reshape(shaped), sizes)
+
+
+def _seed_label(cube: xr.Dataset, run: ExploredRun, row: tuple[int, ...]) -> str:
+    if BRANCH in run.start_dims:
+        walk = row[run.start_dims.index(BRANCH)]
+        return f"start {int(cube['seed'].values[walk])}, {cube['direction'].values[walk]}"
+    sizes = [run.plan.shape[run.plan.dims.index(d)] for d in run.start_dims]
+    return f"start {int(np.ravel_multi_index(row, sizes)) if sizes else 0}"

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import errno
 import json
+import logging
 import socket
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +21,7 @@ from typing import Any
 from tornado import httpserver, web
 
 from pipeline.explorer import page_html
-from pipeline.explorer.answers import ANSWERS, Answer, Query
+from pipeline.explorer.answers import ANSWERS, Answer, Query, first_answers
 from pipeline.explorer.explored import ExploredRun, ExplorerError
 from pipeline.explorer.live import LiveRun, live_problem
 from pipeline.explorer.security import Guard, Rate, headers_of, new_token
@@ -29,10 +30,18 @@ from pipeline.spec.problems import SpecError
 from pipeline.store.errors import StoreError
 from pipeline.store.run import Run
 
+LOG = logging.getLogger(__name__)
+
 HOST = "127.0.0.1"
 
 MOST_BODY, MOST_HEADERS = 64 * 1024, 16 * 1024
 """Bytes of a request."""
+
+LIMITS: dict[str, Any] = {
+    "max_body_size": MOST_BODY, "max_header_size": MOST_HEADERS, "max_buffer_size": MOST_BODY + MOST_HEADERS,
+    "idle_connection_timeout": 300.0, "body_timeout": 20.0,
+}  # fmt: skip
+"""What a connection may take."""
 
 MOST_ADDRESS = 4096
 """Characters of an address: more is none that the page makes."""
@@ -73,7 +82,6 @@ class Service:
     """
 
     def __init__(self, run: Run, guard: Guard) -> None:
-        self._source: Any = run.info.files
         self.run = ExploredRun.of(run)
         self.guard, self.rate = guard, Rate(PER_SECOND, BURST)
         self.static = static_files()
@@ -84,7 +92,11 @@ class Service:
 
     def refresh(self) -> None:
         """Look again at what stands in the directory: cells and analyses may have been added."""
-        self.run = ExploredRun.of(Run.open(self._source))
+        self.run = self.run.refreshed()
+
+    def warm(self) -> None:
+        """Begin with what the page asks for first, while the browser starts."""
+        self.pool.submit(first_answers, self.run, self.live is not None)
 
     async def work(self, function: Callable[[], Any]) -> Any:
         """Call a function in a thread; raises `ExplorerError` if too many wait."""
@@ -224,6 +236,9 @@ class ApiHandler(Handler):
             self.refuse(400, " ".join(error.problems))
         except (ValueError, ArithmeticError) as error:
             self.refuse(400, str(error))
+        except Exception:
+            LOG.exception("api/%s", answer.name)
+            self.refuse(500, "something went wrong that magpend did not expect; its terminal says what")
         else:
             self.set_header("Content-Type", reply.kind)
             if reply.filename:
@@ -337,11 +352,9 @@ async def _answer(
     echo: Callable[[str], None],
     opened: Callable[[str], None] | None,
 ) -> None:
-    server = httpserver.HTTPServer(
-        application(service), max_body_size=MOST_BODY, max_header_size=MOST_HEADERS,
-        max_buffer_size=MOST_BODY + MOST_HEADERS, idle_connection_timeout=300.0, body_timeout=20.0,
-    )  # fmt: skip
+    server = httpserver.HTTPServer(application(service), **LIMITS)
     server.add_socket(taken)
+    service.warm()
     address = f"http://{HOST}:{service.guard.port}/?token={service.guard.token}"
     echo(address)
     if opened is not None:

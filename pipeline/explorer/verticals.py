@@ -47,6 +47,10 @@ class Vertical:
 
 def verticals(run: ExploredRun) -> list[Vertical]:
     """Return what a run's diagram can show, first the model's first state that differs between sections."""
+    return run.remembered("verticals", lambda: _verticals(run))
+
+
+def _verticals(run: ExploredRun) -> list[Vertical]:
     model = run.model
     ordered = sorted(model.states, key=lambda s: s.name not in model.section_states)
     found = [

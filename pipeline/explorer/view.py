@@ -185,7 +185,7 @@ def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
         parameter = run.model.parameter(axis.parameter)
         label, unit = plain(parameter.symbol, parameter.name), parameter.unit
         meaning = parameter.meaning
-    path = run.plan.path is not None and run.plan.dims[run.plan.path] == axis.name
+    path = run.path == axis.name
     return {
         "name": axis.name, "parameter": axis.parameter, "label": label, "meaning": meaning, "unit": unit,
         "values": axis.values.tolist(), "path": path,

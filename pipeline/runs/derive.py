@@ -154,9 +154,13 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
         options other than by default, the first by its name among equals; None if there is none.
     """
     run = Run.open(source)
+    folder = run.info.files.below(DERIVED)
+    places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
+    if not places:  # then the version, which takes a moment, does not matter
+        return None
     current = {"cube_digest": run.digest, "analysis_version": code_version(name), "derived_product": name}
     found = []
-    for place in products_in(run.info.files.below(DERIVED)):
+    for place in places:
         with contextlib.suppress(DamagedError, FileNotFoundError):
             attrs = read_product_attrs(place)
             if all(attrs.get(key) == value for key, value in current.items()):

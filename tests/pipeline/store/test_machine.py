@@ -1,4 +1,4 @@
-"""A directory's life, drawn at random: tasks, kills, damage and repairs; it ends with the same bytes.
+"""A directory's life, drawn at random: tasks, kills, damage, repairs, extensions; the same bytes at the end.
 
 ``MAGPEND_LONG=1`` draws more and longer lives, ``HYPOTHESIS_PROFILE=fresh`` new ones.
 """
@@ -9,17 +9,23 @@ import contextlib
 import os
 import shutil
 import tempfile
+from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+import xarray as xr
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
+from magpend_core.status import Status
+from pipeline.compute import task
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
+from pipeline.runs.extend import extend
 from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.spec.parsing import load_spec
@@ -32,17 +38,18 @@ from pipeline.store.setup import create, establish
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
 
-N_TASKS = 5
-SPEC = f"""
+N_TASKS, N_WIDE = 5, 9
+SPEC = """
 kind = "sweep"
 model = "duffing"
 [axes]
-frequency_hz = {{ start = 0.15, stop = 0.25, num = {N_TASKS} }}
+frequency_hz = {{ start = 0.15, stop = 0.25, num = {n} }}
 [initial_conditions]
 kind = "grid"
 x = 0.1
 v = 0.1
 [integration]
+n_transient = 2
 n_keep = 2
 [execution]
 trajectories_per_task = 1
@@ -59,42 +66,50 @@ class KilledError(Exception):
     """Stands for SIGKILL."""
 
 
+def bytes_of(run: Path) -> dict[str, bytes]:
+    files = [f for top in ("cube.zarr", "commits") for f in (run / top).rglob("*") if f.is_file()]
+    return {f.relative_to(run).as_posix(): f.read_bytes() for f in files}
+
+
+@cache
+def computed(n: int) -> tuple[dict[str, bytes], xr.Dataset]:
+    """Bytes and cube of a run that nothing happens to."""
+    with tempfile.TemporaryDirectory(prefix="life-") as folder:
+        (Path(folder) / "spec.toml").write_text(SPEC.format(n=n))
+        run(Path(folder) / "spec.toml", Path(folder) / "run", workers=0, echo=silent)
+        return bytes_of(Path(folder) / "run"), Run.open(Path(folder) / "run").cube().load()
+
+
 class Directory:
-    """A run directory whose tasks compute made-up numbers."""
+    """A run directory whose tasks know their outcome beforehand."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "run"
-        (folder / "spec.toml").write_text(SPEC)
+        text = SPEC.format(n=N_TASKS)
+        (folder / "spec.toml").write_text(text)
         self.spec = load_spec(folder / "spec.toml")
         self.plan = make_plan(self.spec)
-        self.identity = identity_of(self.spec, self.plan, "made-up")
-        self.info = create(self.path, self.spec, self.plan, self.identity, SPEC)
+        self.identity = identity_of(self.spec, self.plan, task.kernel_version())
+        self.info = create(self.path, self.spec, self.plan, self.identity, text)
 
     def values(self, index: int) -> dict[str, np.ndarray]:
-        rng = np.random.default_rng(index)
-        shape = tuple(s.stop - s.start for s in self.plan.task(index))
-        found = {}
-        for v in self.plan.variables:
-            own = tuple(self.plan.sizes[d] for d in v.own_dims)
-            found[v.name] = rng.uniform(1, 5, (*shape, *own)).astype(v.dtype)
-        return found
+        cube, block = computed(N_TASKS)[1], self.plan.task(index)
+        return {v.name: cube[v.name].values[block] for v in self.plan.variables}
 
     def commit(self, index: int) -> None:
-        write_task(self.info, self.plan, index, self.values(index), {"bounded": 1})
+        values = self.values(index)
+        (status,) = values["status"].ravel()
+        write_task(self.info, self.plan, index, values, {Status(status).name.lower(): 1})
 
     def go_on(self) -> None:
         """What a run does."""
-        self.info = establish(self.path, self.spec, self.plan, self.identity, SPEC, silent)
+        self.info = establish(self.path, self.spec, self.plan, self.identity, SPEC.format(n=N_TASKS), silent)
         found = sound_commits(self.info, self.plan, silent)
         packer = Packer(self.info, self.plan, found)
         for index in range(N_TASKS):
             if index not in found:
                 self.commit(index)
                 packer.add(index)
-
-    def bytes(self) -> dict[str, bytes]:
-        files = [f for top in ("cube.zarr", "commits") for f in (self.path / top).rglob("*") if f.is_file()]
-        return {f.relative_to(self.path).as_posix(): f.read_bytes() for f in files}
 
 
 class Life(RuleBasedStateMachine):
@@ -106,10 +121,7 @@ class Life(RuleBasedStateMachine):
         for block in self.patches:
             block.start()
         self.folder = Path(tempfile.mkdtemp(prefix="life-"))
-        (self.folder / "model").mkdir()
-        model = Directory(self.folder / "model")
-        model.go_on()
-        self.wanted = model.bytes()
+        self.wanted = computed(N_TASKS)[0]
         self.run = Directory(self.folder)
 
     def teardown(self) -> None:
@@ -202,10 +214,23 @@ class Life(RuleBasedStateMachine):
     def finish(self):
         """Whatever happened: the same command ends with the bytes of a run that nothing happened to."""
         self.run.go_on()
-        assert self.run.bytes() == self.wanted
+        assert bytes_of(self.run.path) == self.wanted
         found = verify_run(self.run.path)
         assert (found.sound, found.n_committed, found.leftovers) == (True, N_TASKS, [])
         assert state(self.run.path).complete
+
+    @rule()
+    def extend(self):
+        """Refined, in whatever state: the bytes of a run that was so fine from the beginning."""
+        finer, wide = self.folder / "finer.toml", self.folder / "wide"
+        finer.write_text(SPEC.format(n=N_WIDE))
+        try:
+            extend(self.run.path, finer, wide, workers=0, echo=silent)
+        except StoreError:  # no cell is there to be taken, or run.json or metadata are not what they were
+            self.finish()
+            extend(self.run.path, finer, wide, workers=0, echo=silent)
+        assert bytes_of(wide) == computed(N_WIDE)[0]
+        shutil.rmtree(wide)
 
     @invariant()
     def is_read_as_written_or_not_at_all(self):
