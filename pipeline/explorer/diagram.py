@@ -108,9 +108,8 @@ def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
     table = _Table(run, upwards, sizes, kept)
     for selection in selections(ds[upwards.variable]):
         table.read(ds, selection)
-    rising = np.argsort(axis.values, kind="stable")
     lead = run.plan.dims.index(x) if axis.swept else None
-    return table.points(axis.values[rising], rising, lead, _cell_numbers(run, place))
+    return table.points(axis.values, lead, _cell_numbers(run, place))
 
 
 def _numbered(run: ExploredRun) -> xr.Dataset:
@@ -156,15 +155,12 @@ class _Table:
             )
             self.codes[scheme.name][where] = np.where(found.values < 0, NONE, found.values)
 
-    def points(self, x: np.ndarray, rising: np.ndarray, lead: int | None, cells: np.ndarray) -> Points:
-        """What was read, with the horizontal axis first, rising, and only what is there to be drawn."""
+    def points(self, x: np.ndarray, lead: int | None, cells: np.ndarray) -> Points:
+        """What was read, with the horizontal axis first, and only what is there to be drawn."""
 
         def ordered(array: np.ndarray) -> np.ndarray:
-            own = array.shape[len(self.dims) :]
             moved = array if lead is None else np.moveaxis(array, lead, 0)
-            if lead is not None and np.any(np.diff(rising) < 0):
-                moved = moved[rising]
-            return moved.reshape(-1, *own)
+            return moved.reshape(-1, *array.shape[len(self.dims) :])
 
         values = ordered(self.values)
         there = np.isfinite(values)

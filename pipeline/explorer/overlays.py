@@ -64,13 +64,11 @@ def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
     """
     explored = ExploredRun.of(run)
     axis, place = explored.axis(x), explored.place(at, but=x)
-    order = np.argsort(axis.values, kind="stable")
     found = [*_cube_exponents(explored, x, place), *_attractor_curves(explored, x, place)]
-    rising = axis.values[order].tolist()
     for one in found:
-        one["x"] = rising
+        one["x"] = axis.values.tolist()
         for key in {"y", "low", "high"} & one.keys():
-            one[key] = [finite(v) for v in np.asarray(one[key], np.float64)[order]]
+            one[key] = [finite(v) for v in np.asarray(one[key], np.float64)]
     return {"curves": found}
 
 
@@ -286,7 +284,7 @@ def _attractor(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cas
     closed = int(one["kind"]) == CLOSED_ORBIT and np.isfinite(multipliers).all()
     n_starts = math.prod(run.plan.shape[run.plan.dims.index(d)] for d in run.start_dims)
     count = int(one["n_cells"])
-    interval = (None, None)
+    interval: tuple[float | None, float | None] = (None, None)
     if BRANCH not in run.start_dims:
         low, high = binomial_interval(np.array([count]), n_starts)
         interval = (float(low[0]), float(high[0]))

@@ -46,7 +46,7 @@ def plain(symbol: str, name: str) -> str:
     """
     if not symbol:
         return name.replace("_", " ")
-    text = _FONT.sub(lambda found: found[1], symbol)
+    text = _FONT.sub(lambda found: f"{{{found[1]}}}", symbol)
     text = _ACCENT.sub(lambda found: f"{found[2] or found[3]}{{{_ACCENTS[found[1]]}}}", text)
     text = re.sub(r"\\([A-Za-z]+)", lambda found: _letter(found[1]), text)
     text = re.sub(r"\{([\u0300-\u036f])\}", r"\1", text)

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import errno
 import json
+import logging
 import socket
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -29,10 +30,18 @@ from pipeline.spec.problems import SpecError
 from pipeline.store.errors import StoreError
 from pipeline.store.run import Run
 
+LOG = logging.getLogger(__name__)
+
 HOST = "127.0.0.1"
 
 MOST_BODY, MOST_HEADERS = 64 * 1024, 16 * 1024
 """Bytes of a request."""
+
+LIMITS: dict[str, Any] = {
+    "max_body_size": MOST_BODY, "max_header_size": MOST_HEADERS, "max_buffer_size": MOST_BODY + MOST_HEADERS,
+    "idle_connection_timeout": 300.0, "body_timeout": 20.0,
+}  # fmt: skip
+"""What a connection may take."""
 
 MOST_ADDRESS = 4096
 """Characters of an address: more is none that the page makes."""
@@ -227,6 +236,9 @@ class ApiHandler(Handler):
             self.refuse(400, " ".join(error.problems))
         except (ValueError, ArithmeticError) as error:
             self.refuse(400, str(error))
+        except Exception:
+            LOG.exception("api/%s", answer.name)
+            self.refuse(500, "something went wrong that magpend did not expect; its terminal says what")
         else:
             self.set_header("Content-Type", reply.kind)
             if reply.filename:
@@ -340,10 +352,7 @@ async def _answer(
     echo: Callable[[str], None],
     opened: Callable[[str], None] | None,
 ) -> None:
-    server = httpserver.HTTPServer(
-        application(service), max_body_size=MOST_BODY, max_header_size=MOST_HEADERS,
-        max_buffer_size=MOST_BODY + MOST_HEADERS, idle_connection_timeout=300.0, body_timeout=20.0,
-    )  # fmt: skip
+    server = httpserver.HTTPServer(application(service), **LIMITS)
     server.add_socket(taken)
     service.warm()
     address = f"http://{HOST}:{service.guard.port}/?token={service.guard.token}"

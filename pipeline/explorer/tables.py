@@ -68,7 +68,8 @@ def _diagram(run: ExploredRun, asked: Asked) -> xr.Dataset:
     x, y = _needed(asked, "x"), _needed(asked, "y")
     upwards = vertical(run, y)
     found = points(run, x, y, asked["at"])
-    counts = np.diff(found.first.astype(np.int64))
+    ends = found.first.astype(np.int64)
+    counts = ends[1:] - ends[:-1]
     numbers = np.repeat(np.arange(len(found.cell)), counts)
     ds = xr.Dataset({
         "cell": ("row", found.cell.astype(np.int64)[numbers]),

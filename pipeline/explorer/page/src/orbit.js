@@ -61,9 +61,9 @@ export function withUnit({ label, name, unit }) {
   return unit && unit !== "1" ? `${text} [${unit}]` : text;
 }
 
-/** Colour of an orbit: its attractor's where it attracts, a warning's where it does not. */
+/** Colour of an orbit: its attractor's where it attracts; where it does not, the ink's, which no attractor has. */
 export function colourOf(orbit, view, colours) {
-  if (orbit.stable === false) return colours.warn;
+  if (orbit.stable === false) return colours.ink;
   const attractors = view.colours?.find((entry) => entry.name === "attractor");
   const category = attractors?.categories.find((entry) => entry.id === orbit.attrs.attractor);
   return category?.colour ?? colours.accent;

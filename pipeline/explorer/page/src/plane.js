@@ -7,6 +7,7 @@ import { number } from "./facts.js";
 import { axisOf, indicesOf } from "./orbit.js";
 import { brokenLines } from "./wrapping.js";
 
+const MOST_KEPT = 12;
 const RESOLUTIONS = [64, 128, 256, 512], COARSEST = 16;
 const TURN = 2 * Math.PI;
 export const NO_LIVE = "Live integration is off in this copy: open the run with magpend explore to integrate starts, compute slices and drag parameters.";
@@ -22,9 +23,9 @@ export class Plane {
   constructor(body, view, state, source, starter) {
     Object.assign(this, { view, state, source, starter, live: source.live, orbit: null, map: null, job: null });
     this.asked = 0;
-    this.paths = [];
-    this.dots = [];
+    this.kept = new Map();
     this.cross = null;
+    [this.paths, this.dots, this.end] = [[], [], null];
     this.pairs = view.planes?.length ? view.planes : [view.model.states.slice(0, 2).map((entry) => entry.name)];
     this.pair = this.chosenPair();
     this.build(body);
@@ -103,8 +104,10 @@ export class Plane {
     this.place = place;
     this.job?.cancel();
     this.forgetStart();
-    this.take(null);
-    if (isFollowed) return;
+    const kept = this.kept.get(place);
+    this.take(kept?.map ?? null);
+    if (kept) [this.image, this.below, this.fixed] = [kept.image, kept.below, kept.map.fixed];
+    if (kept || isFollowed) return;
     let map = null, problem = "";
     try {
       map = mapOf(await this.source.plane({ at: indicesOf(orbit, this.view) }));
@@ -177,16 +180,22 @@ export class Plane {
       ctx.imageSmoothingEnabled = false;
       ctx.drawImage(this.image, frame.x(x0), frame.y(y1), frame.x(x1) - frame.x(x0), frame.y(y0) - frame.y(y1));
     } else if (this.map?.dots) this.paintStarts(ctx, frame, colours);
+    for (const [k, width, colour] of [[0, 2.6, colours.card], [0, 1.2, colours.ink], [1, 3.6, colours.card], [1, 1.8, colours.ink]]) {
+      ctx.lineWidth = width;
+      ctx.strokeStyle = colour;
+      // what comes after the first periods is fainter: the plane below is to be seen
+      ctx.globalAlpha = k ? 1 : 0.35;
+      frame.trace(ctx, this.paths[k] ?? []);
+      ctx.stroke();
+    }
+    ctx.globalAlpha = 1;
+    ctx.strokeStyle = colours.card;
+    ctx.lineWidth = 1;
     for (const [x, y] of this.dots) {
       ctx.beginPath();
       ctx.arc(frame.x(x), frame.y(y), 3, 0, TURN);
-      ctx.fillStyle = colours.warn;
+      ctx.fillStyle = this.end ?? colours.ink;
       ctx.fill();
-    }
-    for (const [width, colour] of [[4, colours.card], [1.8, colours.ink]]) {
-      ctx.lineWidth = width;
-      ctx.strokeStyle = colour;
-      frame.trace(ctx, this.paths);
       ctx.stroke();
     }
   }
@@ -301,13 +310,17 @@ export class Plane {
   async begin(place) {
     if (!place || !this.orbit) return;
     this.cross = place;
+    this.read(place);
     this.forgetStart();
     const start = { ...this.fixed, [this.pair[0]]: place[0], [this.pair[1]]: place[1] };
     this.told.textContent = "Integrating this start ...";
     const begun = (this.begun = {});
     try {
       const end = await this.starter.start({ ...this.point, state: start }, (kind, piece) => begun === this.begun && this.add(kind, piece));
-      if (begun === this.begun && !end.cancelled) this.told.textContent = endSentence(end);
+      if (begun !== this.begun || end.cancelled) return;
+      this.told.textContent = endSentence(end);
+      this.end = end.colour;
+      this.frame.repaint();
     } catch (error) {
       if (begun === this.begun) this.told.textContent = error.message;
     }
@@ -315,7 +328,7 @@ export class Plane {
 
   forgetStart() {
     this.begun = null;
-    [this.paths, this.dots] = [[], []];
+    [this.paths, this.dots, this.end] = [[], [], null];
     this.frame.repaint();
   }
 
@@ -324,7 +337,9 @@ export class Plane {
     const [x, y] = this.pair.map((name, k) => this.around(kind === "path" ? piece.column(name) : piece.section(name), k));
     if (kind === "path") {
       const lines = brokenLines(x.values, y.values, x.wrapping, y.wrapping);
-      this.paths.push(...lines.map((line) => line.map((value, i) => value + (i % 2 ? y.middle : x.middle))));
+      const part = this.paths.length ? 0 : 1;
+      this.paths[part] ??= [];
+      this.paths[part].push(...lines.map((line) => line.map((value, i) => value + (i % 2 ? y.middle : x.middle))));
     } else {
       const back = (value, { wrapping, middle }) => (wrapping.cut ? value - TURN * Math.floor((value + Math.PI) / TURN) : value) + middle;
       for (let i = 0; i < x.values.length; i++) this.dots.push([back(x.values[i], x), back(y.values[i], y)]);
@@ -360,6 +375,13 @@ export class Plane {
     if (job === this.job) this.working(false);
   }
 
+  /** Keep the slice for when one comes back to this parameter value. */
+  keep() {
+    this.kept.delete(this.place);
+    this.kept.set(this.place, { map: this.map, image: this.image, below: this.below });
+    if (this.kept.size > MOST_KEPT) this.kept.delete(this.kept.keys().next().value);
+  }
+
   working(isWorking) {
     if (!isWorking) this.job = null;
     show(this.stop, isWorking);
@@ -374,7 +396,10 @@ export class Plane {
     this.progress.value = (before + share * (resolution ** 2 - before)) / wanted ** 2;
     this.map = mapOf({ ...piece, attrs: { ...piece.attrs, states: this.pair, fixed: this.fixed, source: "slice" } }, this.limits);
     this.image = imageOf(this.map, this.below?.image);
-    if (share >= 1) this.below = { ...this.map, image: this.image };
+    if (share >= 1) {
+      this.below = { ...this.map, image: this.image };
+      this.keep();
+    }
     this.showLegend();
     if (resolution < wanted) this.told.textContent = `${resolution} × ${resolution} of ${wanted} × ${wanted} starts`;
     this.frame.repaint();
@@ -431,7 +456,7 @@ function imageOf({ u, v, label, labels }, below = null) {
 
 function sourceSentence({ source, fixed, u, v, dots }) {
   const held = Object.entries(fixed).map(([name, value]) => `${name} = ${number(value)}`).join(", ");
-  const known = { basins: "Basins of attraction", starts: `The run's ${u.length} × ${v.length} starts` };
+  const known = { slice: `A computed slice of ${u.length} × ${v.length} starts`, basins: "Basins of attraction", starts: `The run's ${u.length} × ${v.length} starts` };
   const what = dots ? `The run's ${dots.length} starts` : known[source] ?? source;
   return held ? `${what}, at ${held}.` : `${what}.`;
 }

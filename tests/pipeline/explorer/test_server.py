@@ -1,0 +1,431 @@
+"""The explorer's server: who is answered, with what, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import socket
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+from tornado.httpclient import HTTPRequest
+from tornado.httpserver import HTTPServer
+from tornado.simple_httpclient import SimpleAsyncHTTPClient
+from tornado.websocket import websocket_connect
+
+from pipeline.explorer import browser, page_html, server
+from pipeline.explorer.arrays import unpack_arrays
+from pipeline.explorer.security import Guard, Rate, content_policy, new_token
+from pipeline.explorer.server import Service, application, listening
+from pipeline.spec.problems import SpecError
+from pipeline.store.run import Run
+
+# as in test_view.py, which computes it for most of what is read here
+TITLE = "</title><script>alert(1)</script>"
+
+
+class Client:
+    """A server in a thread of its own, and requests to it."""
+
+    def __init__(self, run):
+        self.socket = listening(0)
+        self.port = self.socket.getsockname()[1]
+        self.guard = Guard(new_token(), self.port)
+        self.service = Service(run, self.guard)
+        self.loop = asyncio.new_event_loop()
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+        assert self._ready.wait(30)
+
+    def _serve(self):
+        asyncio.set_event_loop(self.loop)
+
+        async def begin():
+            self.server = HTTPServer(application(self.service), **server.LIMITS)
+            self.server.add_socket(self.socket)
+            self._ready.set()
+
+        self.loop.create_task(begin())
+        self.loop.run_forever()
+
+    def wait(self, coroutine, timeout=120):
+        return asyncio.run_coroutine_threadsafe(coroutine, self.loop).result(timeout)
+
+    def ask(self, path, *, token=True, headers=None, method="GET", body=None):
+        """Status, headers and body of an answer."""
+        sent = {"Authorization": f"token {self.guard.token}"} if token else {}
+
+        async def fetch():
+            client = SimpleAsyncHTTPClient(force_instance=True)
+            request = HTTPRequest(
+                f"http://127.0.0.1:{self.port}{path}", method=method, headers={**sent, **(headers or {})},
+                body=body, follow_redirects=False, allow_nonstandard_methods=True, request_timeout=60,
+            )  # fmt: skip
+            try:
+                return await client.fetch(request, raise_error=False)
+            finally:
+                client.close()
+
+        answer = self.wait(fetch())
+        return SimpleNamespace(code=answer.code, headers=answer.headers, body=answer.body or b"")
+
+    def raw(self, text):
+        """What comes back to bytes that no client would send."""
+        with socket.create_connection(("127.0.0.1", self.port), timeout=20) as one:
+            one.sendall(text)
+            one.settimeout(20)
+            found = b""
+            while chunk := one.recv(65536):
+                found += chunk
+        return found
+
+    def close(self):
+        async def end():
+            self.server.stop()
+            await self.server.close_all_connections()
+            self.loop.stop()
+
+        asyncio.run_coroutine_threadsafe(end(), self.loop)
+        self._thread.join(30)
+        self.loop.close()
+        self.service.close()
+        self.service.pool.shutdown(wait=True)
+
+
+@pytest.fixture
+def made_run(made):
+    """A finished run of made-up numbers, with a title that would be a script if it were no text."""
+    for task in range(made.plan.n_tasks):
+        made.commit(task)
+    return made.info.directory
+
+
+@pytest.fixture
+def client(made_run):
+    found = Client(Run.open(made_run))
+    yield found
+    found.close()
+
+
+def sentence(answer):
+    return json.loads(answer.body)["error"]
+
+
+# ---- what is answered
+
+
+def test_api__answers_with_the_token(client, made_run):
+    view = client.ask("/api/view")
+    assert view.code == 200
+    found = json.loads(view.body)
+    assert found["title"] == "small sweep"
+    diagram = client.ask("/api/diagram?x=frequency&y=psi1&at.q=1")
+    assert diagram.code == 200
+    arrays, attrs = unpack_arrays(diagram.body)
+    assert attrs["at"] == {"q": 1}
+    assert len(arrays["y"]) == 5 * 12 * 3
+    download = client.ask("/api/table?view=diagram&format=csv&x=frequency&y=psi1&at.q=1")
+    assert download.headers["Content-Disposition"] == 'attachment; filename="diagram.csv"'
+    assert b"frequency [Hz]" in download.body
+
+
+def test_api__every_answer_has_the_policy(client):
+    """The page, an answer, a refusal and a place that is not there."""
+    for path, token in (("/", False), ("/api/view", True), ("/api/view", False), ("/nowhere", True)):
+        headers = client.ask(path, token=token).headers
+        policy = headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "script-src 'self';" in policy
+        assert "unsafe" not in policy
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert headers["Referrer-Policy"] == "no-referrer"
+        assert headers["Cache-Control"] == "no-store"
+        assert "Access-Control-Allow-Origin" not in headers
+        assert "Set-Cookie" not in headers
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/api/view", "/api/diagram?x=frequency&y=psi1&at.q=0", "/api/orbit?cell=0&point=0", "/api/table", "/",
+     "/api/zoom"],
+)  # fmt: skip
+@pytest.mark.parametrize("given", ["", "wrong", "token wrong"])
+def test_api__is_refused_without_the_token(client, path, given):
+    headers = {"Authorization": given} if given else {}
+    answer = client.ask(path, token=False, headers=headers)
+    assert answer.code == 403
+    assert client.guard.token.encode() not in answer.body
+    assert b"token" in answer.body
+
+
+def test_api__takes_the_token_as_an_argument(client):
+    assert client.ask(f"/api/view?token={client.guard.token}", token=False).code == 200
+    assert client.ask(f"/api/view?token={client.guard.token[:-1]}", token=False).code == 403
+    assert client.ask("/api/view?token=%ff%fe", token=False).code in (400, 403)
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "evil.example:8888"},
+        {"Host": "127.0.0.1"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site"},
+    ],
+)
+@pytest.mark.parametrize("path", ["/api/view", "/static/explorer.js", "/ws"])
+def test_api__refuses_other_pages_and_names(client, path, headers):
+    """With the right token, too: a name that points here, or a page of another port, is no reason."""
+    answer = client.ask(path, headers=headers)
+    assert answer.code == 403
+
+
+def test_api__this_page_is_answered(client):
+    own = {"Origin": f"http://127.0.0.1:{client.port}", "Sec-Fetch-Site": "same-origin"}
+    assert client.ask("/api/view", headers=own).code == 200
+    named = {"Host": f"localhost:{client.port}", "Origin": f"http://localhost:{client.port}"}
+    assert client.ask("/api/view", headers=named).code == 200
+
+
+@pytest.mark.parametrize(
+    ("path", "code", "said"),
+    [
+        ("/api/diagram", 400, "x is missing"),
+        ("/api/diagram?x=frequency&y=psi1&at.q=7", 400, "must be 0 to 1"),
+        ("/api/diagram?x=frequency&y=psi1&at.q=-1", 400, "whole number"),
+        ("/api/diagram?x=frequency&y=psi9&at.q=0", 400, "did you mean"),
+        ("/api/orbit?cell=99999999&point=0", 400, "cells 0 to"),
+        ("/api/orbit?cell=1e3&point=0", 400, "whole number"),
+        ("/api/plane?at.q=0", 400, "at.frequency is missing"),
+        ("/api/table?view=__class__&format=csv", 400, "unknown view"),
+        ("/api/table?view=diagram&format=../x", 400, "unknown format"),
+        ("/api/views", 404, "no such page"),
+        ("/api/zoom", 405, "POST"),
+    ],
+)
+def test_api__refuses_in_a_sentence(client, path, code, said):
+    answer = client.ask(path)
+    assert answer.code == code
+    assert said in sentence(answer)
+    assert "Traceback" not in sentence(answer)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/static/../server.py", "/static/%2e%2e/server.py", "/static/..%2fserver.py", "/static//etc/passwd",
+     "/static/explorer.css.map", "/static/", "/static/LICENSES.txt%00.js",
+     "/run.json", "/cube.zarr/zarr.json"],
+)  # fmt: skip
+def test_static__serves_its_own_files_alone(client, path):
+    text = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{client.port}\r\nConnection: close\r\n\r\n"
+    answer = client.raw(text.encode())
+    assert re.match(rb"HTTP/1\.1 (404|400|403) ", answer)
+    assert b"root:" not in answer
+    assert b"def serve" not in answer
+
+
+def test_static__is_what_is_installed(client):
+    for name, (content, kind) in server.static_files().items():
+        answer = client.ask(f"/static/{name}", token=False)
+        assert (answer.code, answer.body) == (200, content)
+        assert answer.headers["Content-Type"] == kind
+    assert {"explorer.js", "explorer.css"} <= server.static_files().keys()
+
+
+def test_page__has_the_token_and_no_script_of_its_own(client):
+    answer = client.ask(f"/?token={client.guard.token}", token=False)
+    assert answer.code == 200
+    text = answer.body.decode()
+    assert f'data-token="{client.guard.token}"' in text
+    assert not re.search(r"<script(?! src=\"static/explorer\.js\">)", text)
+    assert "<style" not in text
+    assert " on" not in re.sub(r">[^<]*<", "><", text)
+
+
+def test_page__a_title_stays_text():
+    text = page_html.page(TITLE, "abc")
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;" in text
+
+
+def test_zoom__takes_a_region_and_bounded_bodies(client):
+    body = json.dumps({"x": [2.2, 2.6], "axes": ["frequency", "psi1"], "at": {"q": 0}})
+    answer = client.ask("/api/zoom", method="POST", body=body)
+    assert answer.code == 200
+    assert "frequency_hz" in answer.body.decode()
+    for bad in ("", "[]", '{"x": [2.6, 2.2]}', '{"x": [NaN, 1]}', '{"x": [1, 2], "more": 1}'):
+        assert client.ask("/api/zoom", method="POST", body=bad).code == 400
+    head = (
+        f"POST /api/zoom HTTP/1.1\r\nHost: 127.0.0.1:{client.port}\r\n"
+        f"Content-Length: {server.MOST_BODY + 1}\r\nAuthorization: token {client.guard.token}\r\n\r\n"
+    )
+    assert b" 200 " not in client.raw(head.encode())
+
+
+def test_api__is_bounded_in_rate_and_in_length(client, monkeypatch):
+    client.service.rate = Rate(0.001, 3)
+    codes = [client.ask("/static/explorer.css").code for _ in range(5)]
+    assert codes == [200, 200, 200, 429, 429]
+    client.service.rate = Rate(1000.0, 1000)
+    answer = client.ask(f"/api/view?x={'a' * server.MOST_ADDRESS}")
+    assert answer.code == 414
+    client.service.waiting = server.THREADS + server.MOST_WAITING
+    assert client.ask("/api/view").code == 429
+    client.service.waiting = 0
+    assert client.ask("/api/view").code == 200
+
+
+def test_api__damage_is_said_and_nothing_is_shown(client, made_run):
+    section = made_run / "cube.zarr" / "section"
+    for file in section.rglob("*"):
+        if file.is_file() and file.name != "zarr.json":
+            content = bytearray(file.read_bytes())
+            content[len(content) // 2] ^= 1
+            file.write_bytes(bytes(content))
+    answer = client.ask("/api/diagram?x=frequency&y=psi1&at.q=0")
+    assert answer.code == 500
+    assert "magpend verify" in sentence(answer)
+
+
+def test_api__an_unexpected_error_tells_nothing_of_the_inside(client, monkeypatch, caplog):
+    def fails(*arguments):
+        raise RuntimeError("/home/somebody/secret")
+
+    answer = server.ANSWERS["view"]
+    monkeypatch.setattr(type(answer), "give", property(lambda self: fails), raising=False)
+    found = client.ask("/api/view")
+    assert found.code == 500
+    assert "secret" not in found.body.decode()
+
+
+def test_socket__needs_the_token_and_this_origin(client):
+    """The websocket is refused before it is one."""
+
+    async def connect(query, headers):
+        request = HTTPRequest(f"ws://127.0.0.1:{client.port}/ws{query}", headers=headers)
+        connection = await websocket_connect(request)
+        connection.close()
+        return True
+
+    own = {"Origin": f"http://127.0.0.1:{client.port}"}
+    assert client.wait(connect(f"?token={client.guard.token}", own))
+    for query, headers in (
+        ("", own),
+        ("?token=wrong", own),
+        (f"?token={client.guard.token}", {"Origin": "http://evil.example"}),
+    ):
+        with pytest.raises(Exception, match="403"):
+            client.wait(connect(query, headers))
+
+
+# ---- the parts
+
+
+def test_guard__compares_whole_tokens():
+    guard = Guard("abc", 1)
+    assert guard.knows("abc")
+    for other in ("", "ab", "abcd", "ABC", "äbc", "abc\x00"):
+        assert not guard.knows(other)
+    assert "abc" not in repr(guard)
+
+
+def test_new_token__is_long_and_new():
+    tokens = {new_token() for _ in range(50)}
+    assert len(tokens) == 50
+    assert min(map(len, tokens)) >= 43  # 32 bytes
+
+
+def test_content_policy__names_this_port_alone():
+    assert set(re.findall(r":(\d+)", content_policy(4711))) == {"4711"}
+
+
+def test_listening__is_on_loopback_and_says_what_is_taken():
+    one = listening(0)
+    try:
+        assert one.getsockname()[0] == "127.0.0.1"
+        with pytest.raises(SpecError, match="is taken"):
+            listening(one.getsockname()[1])
+        with pytest.raises(SpecError, match="0 to 65535"):
+            listening(70_000)
+    finally:
+        one.close()
+
+
+def test_redirect_file__is_for_this_user_alone(monkeypatch):
+    """A browser is started with the name of a file: the address with its token is no argument."""
+    path = browser.redirect_file("http://127.0.0.1:1/?token=a&b=\"'<")
+    assert path.stat().st_mode & 0o077 == 0
+    assert path.parent.stat().st_mode & 0o077 == 0
+    text = path.read_text("utf-8")
+    assert "token=a&amp;b=&quot;" in text
+    opened = []
+    done = threading.Event()
+    monkeypatch.setattr(browser.webbrowser, "open", lambda address: (opened.append(address), done.set()))
+    browser.open_browser("http://127.0.0.1:1/?token=secret")
+    assert done.wait(10)
+    assert opened[0].startswith("file://")
+    assert "secret" not in opened[0]
+
+
+# ---- the command
+
+
+def test_explore__serves_until_it_is_stopped(made_run, start):
+    """It prints the address, answers, changes nothing in the run, and ends with Ctrl-C as other commands."""
+    before = {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")}
+    process = start("explore", made_run, "--no-browser")
+    address = process.stdout.readline().strip()
+    found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{43})", address)
+    assert found, address
+    port, token = int(found[1]), found[2]
+    text = f"GET /api/view?token={token} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nConnection: close\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as one:
+        one.sendall(text.encode())
+        answer = b""
+        while chunk := one.recv(65536):
+            answer += chunk
+    assert answer.startswith(b"HTTP/1.1 200")
+    assert b"small sweep" in answer
+    with pytest.raises(OSError, match="refused"):  # on loopback of this version alone
+        socket.create_connection((_other_address(), port), timeout=5).close()
+    os.kill(process.pid, signal.SIGINT)
+    assert process.wait(20) == 130
+    assert "stopped" in process.stderr.read()
+    assert {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")} == before
+
+
+def _other_address():
+    """Another address of this machine: on Linux all of 127/8 is its own."""
+    return "127.0.0.2"
+
+
+def test_explore__refuses_what_is_no_run(tmp_path, main):
+    code, _, errors = main("explore", tmp_path, "--no-browser")
+    assert code == 2
+    assert "no run directory" in errors
+
+
+def test_explore__a_page_that_is_open_sees_new_cells(made, start):
+    """A run in progress is looked at again whenever the page is loaded."""
+    found = Client(Run.open(made.info.directory))
+    try:
+        assert json.loads(found.ask("/api/view").body)["cells"]["pending"] == made.plan.n_cells
+        made.commit(0)
+        view = json.loads(found.ask("/api/view").body)
+        assert view["cells"]["pending"] == made.plan.n_cells - made.plan.cells_in(0)
+        assert not view["complete"]
+        begun = time.monotonic()
+        assert found.ask("/api/diagram?x=frequency&y=psi1&at.q=0").code == 200
+        assert time.monotonic() - begun < 30
+    finally:
+        found.close()

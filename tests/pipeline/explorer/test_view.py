@@ -1,0 +1,578 @@
+"""What the page reads of a run, against the run's cube and its analyses."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.integrate import solve_ivp
+
+from magpend_core import rates
+from magpend_core.models import load_model, model_names
+from pipeline.explorer import diagram as diagrams
+from pipeline.explorer.answers import ANSWERS, Query
+from pipeline.explorer.arrays import unpack_arrays
+from pipeline.explorer.colours import NONE
+from pipeline.explorer.diagram import diagram
+from pipeline.explorer.explored import ExploredRun, ExplorerError
+from pipeline.explorer.orbits import cell_of, linearise, orbit
+from pipeline.explorer.overlays import attractors, branches, curves
+from pipeline.explorer.plain import plain
+from pipeline.explorer.planes import plane
+from pipeline.explorer.series import SAMPLES
+from pipeline.explorer.tables import table
+from pipeline.explorer.view import describe_view
+from pipeline.layout.vocabulary import DIVERGED, PERIODIC
+from pipeline.runs.derive import derive
+from pipeline.runs.run import run
+from pipeline.store.errors import DamagedError
+from pipeline.store.run import Run
+
+# the same model and section as in test_live.py: nothing more is compiled
+SWEEP = """
+kind = "sweep"
+title = "<script>alert(1)</script>"
+model = "duffing5"
+[axes]
+frequency_hz = { values = [0.15, 0.15915494309189535] }
+A = { values = [0.2, 0.25, 0.3] }
+[initial_conditions]
+kind = "grid"
+x = { start = -0.9375, stop = 0.9375, num = 6 }
+v = { start = -0.5, stop = 1.0, num = 4 }
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 150
+n_keep = 12
+[products]
+extremes = { quantities = ["energy"] }
+"""
+
+WALK = """
+kind = "continuation"
+model = "duffing5"
+[parameters]
+frequency_hz = 0.15915494309189535
+[axes]
+A = { start = 0.15, stop = 0.3, num = 4 }
+[continuation]
+path = "A"
+direction = "both"
+[initial_conditions]
+kind = "random"
+n = 3
+seed = 2
+x = [-1.0, 1.0]
+v = [-1.0, 1.0]
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 150
+n_keep = 12
+"""
+
+FLOW = """
+kind = "sweep"
+[model]
+name = "normal_form"
+states = { x = {}, y = {} }
+parameters = { mu = -0.1, omega = 2.0, cubic = 1.0, quintic = -1.0 }
+define = { s = "x**2 + y**2", g = "mu + cubic*s + quintic*s**2" }
+equations = { x = "g*x - omega*y", y = "omega*x + g*y" }
+[section]
+of = "y"
+value = 0.3
+longest = 20.0
+[initial_conditions]
+kind = "grid"
+x = { start = 0.6, stop = 0.9, num = 2 }
+y = { start = 0.3, stop = 0.35, num = 2 }
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 100
+n_keep = 12
+"""
+
+SAME = 1e-6
+"""Largest scaled distance between the end of an integrated period and the cube's next section: both are
+integrated to 1e-9, and a period of these systems multiplies errors by some tens at most."""
+
+
+def made(folder, text):
+    folder.mkdir()
+    spec = folder / "spec.toml"
+    spec.write_text(text, "utf-8")
+    run(spec, folder / "run", workers=0, echo=lambda line: None)
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    directory = made(tmp_path_factory.mktemp("view") / "sweep", SWEEP)
+    derive(directory, "basins")
+    return directory
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    directory = made(tmp_path_factory.mktemp("view") / "walk", WALK)
+    derive(directory, "branches", {"parameter": "A"})
+    return directory
+
+
+@pytest.fixture(scope="module")
+def flow(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("view") / "flow", FLOW)
+
+
+def wrapped(angle):
+    return angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+
+
+# ---- the view
+
+
+def test_describe_view__says_what_stands_in_a_run(sweep):
+    explored = ExploredRun.of(sweep)
+    found = describe_view(explored, True)
+    json.dumps(found, allow_nan=False)
+    cube = explored.cube()
+    assert found["title"] == "<script>alert(1)</script>"
+    assert found["name"] == "run"
+    assert str(sweep.parent) not in json.dumps(found)
+    assert found["digest"] == explored.digest
+    assert (found["complete"], found["live"], found["n_keep"]) == (True, True, 12)
+    assert found["cells"] == {
+        "total": cube.status.size, "pending": 0, "failed": int((cube.status == DIVERGED).sum())
+    }  # fmt: skip
+    assert [a["name"] for a in found["axes"]] == ["frequency", "A"]
+    assert found["axes"][1]["values"] == cube["A"].values.tolist()
+    assert found["starts"] == {"dims": ["x_0", "v_0"], "count": 24}
+    names = [v["name"] for v in found["verticals"]]
+    assert names[:2] == list(explored.model.state_names)
+    assert names[2:] == ["energy.min", "energy.max", "energy.mean"]
+    assert found["planes"][0] == ["x", "v"]
+    assert found["has"]["attractors"]
+    assert found["has"]["basins"]
+    assert not found["has"]["branches"]
+    assert [p["value"] is None for p in found["model"]["parameters"] if p["name"] == "A"] == [True]
+
+
+def test_describe_view__reads_what_is_computed_later(walk):
+    explored = ExploredRun.of(walk)
+    assert not describe_view(explored, False)["has"]["basins"]
+    assert describe_view(explored, False)["axes"][0]["path"]
+    assert explored.refreshed() is explored
+    derive(walk, "settling")
+    assert explored.refreshed() is not explored
+
+
+@pytest.mark.parametrize("name", model_names())
+def test_describe_view__labels_have_no_latex(name):
+    model = load_model(name)
+    for one in (*model.states, *model.quantities, *model.parameters):
+        label = plain(one.symbol, one.name)
+        assert label.strip()
+        assert not set(label) & set("\\{}$^")
+
+
+def test_plain__writes_greek_accents_and_subscripts():
+    assert plain(r"\dot{\theta}_1", "rate") == "θ\u0307₁"
+    assert plain(r"P_\mathrm{in}", "p") == "Pᵢₙ"
+    assert plain(r"\lambda", "l") == "λ"
+    assert plain("", "duty_cycle") == "duty cycle"
+
+
+# ---- the diagram
+
+
+@pytest.mark.parametrize("x", ["frequency", "A"])
+@pytest.mark.parametrize("y", ["v", "energy.max"])
+def test_diagram__has_every_point_of_the_cube(sweep, x, y):
+    """Cells are where their numbers say, and points are the cube's, whichever axis is horizontal."""
+    explored = ExploredRun.of(sweep)
+    cube = explored.cube().load()
+    other = "A" if x == "frequency" else "frequency"
+    arrays, attrs = unpack_arrays(diagram(explored, x, y, {other: 1}))
+    assert attrs["at"] == {other: 1}
+    assert np.all(np.diff(arrays["x"]) > 0)
+    assert np.all(np.diff(arrays["at"].astype(int)) >= 0)
+    assert len(arrays["first"]) == len(arrays["cell"]) + 1
+    status = cube["status"].values
+    for k, number in enumerate(arrays["cell"]):
+        index = np.unravel_index(number, status.shape)
+        one = cube.isel(dict(zip(cube["status"].dims, map(int, index), strict=True)))
+        assert float(one[x]) == arrays["x"][arrays["at"][k]]
+        assert float(one[other]) == float(cube[other][1])
+        own = arrays["y"][arrays["first"][k] : arrays["first"][k + 1]]
+        kept = (
+            one["section"].sel(state=y) if y == "v" else one["extremes"].sel(quantity="energy", extreme="max")
+        )
+        is_drawn = int(one["status"]) != DIVERGED
+        np.testing.assert_array_equal(own, kept.values if is_drawn else [])
+        assert arrays["status"][k] == int(one["status"])
+    assert len(arrays["cell"]) == status.size // cube.sizes[other]
+
+
+def test_diagram__colours_are_those_of_the_analyses(sweep):
+    explored = ExploredRun.of(sweep)
+    arrays, _ = unpack_arrays(diagram(explored, "A", "x", {"frequency": 0}))
+    ids = derive(sweep, "attractors")["attractor_id"].transpose("frequency", "A", "x_0", "v_0").values.ravel()
+    expected = ids[arrays["cell"]]
+    assert len(set(expected.tolist())) > 1
+    np.testing.assert_array_equal(arrays["colour_attractor"], np.where(expected < 0, NONE, expected))
+    named = {c["id"] for c in describe_view(explored, False)["colours"][0]["categories"]}
+    assert set(expected.tolist()) - {-1} <= named
+
+
+def test_diagram__tells_directions_and_seeds(walk):
+    explored = ExploredRun.of(walk)
+    arrays, _ = unpack_arrays(diagram(explored, "A", "x", {}))
+    cube = explored.cube()
+    branch = arrays["cell"] % cube.sizes["branch"]
+    np.testing.assert_array_equal(arrays["colour_direction"], cube["direction"].values[branch] == "down")
+    np.testing.assert_array_equal(arrays["colour_seed"], cube["seed"].values[branch])
+
+
+def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep, monkeypatch):
+    explored = ExploredRun.of(sweep)
+    whole, _ = unpack_arrays(diagram(explored, "A", "x", {"frequency": 0}))
+    monkeypatch.setattr(diagrams, "MOST_POINTS", 72 * 5)
+    part, attrs = unpack_arrays(diagram(explored, "A", "x", {"frequency": 0}))
+    assert (attrs["kept"], attrs["n_keep"]) == (5, 12)
+    k = int(np.flatnonzero(np.diff(whole["first"]) == 12)[0])
+    own = whole["y"][whole["first"][k] : whole["first"][k + 1]]
+    np.testing.assert_array_equal(part["y"][part["first"][k] : part["first"][k + 1]], own[-5:])
+    monkeypatch.setattr(diagrams, "MOST_POINTS", 71)
+    with pytest.raises(ExplorerError, match="71 cells at most"):
+        diagram(explored, "A", "x", {"frequency": 0})
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "at", "sentence"),
+    [
+        ("q", "x", {}, "unknown axis 'q'"),
+        ("A", "w", {"frequency": 0}, "unknown vertical axis 'w'"),
+        ("A", "x", {}, "at.frequency is missing"),
+        ("A", "x", {"frequency": 2}, "must be 0 to 1"),
+        ("A", "x", {"frequency": 0, "g": 1}, "unknown axis 'g'"),
+    ],
+)
+def test_diagram__refuses_in_a_sentence(sweep, x, y, at, sentence):
+    with pytest.raises(ExplorerError, match=sentence):
+        diagram(ExploredRun.of(sweep), x, y, at)
+
+
+def test_diagram__of_a_run_in_progress_has_what_is_committed(made_run):
+    """Pending cells are there without points; after a commit and a fresh look they have them."""
+    explored = ExploredRun.of(made_run.directory)
+    assert describe_view(explored, False)["cells"]["pending"] == made_run.plan.n_cells
+    made_run.commit(0)
+    assert explored.refreshed() is not explored
+    explored = explored.refreshed()
+    view = describe_view(explored, False)
+    committed = made_run.plan.cells_in(0)
+    assert not view["complete"]
+    assert view["cells"]["pending"] == made_run.plan.n_cells - committed
+    cube = explored.cube().load()
+    total = 0
+    for q in range(2):
+        arrays, _ = unpack_arrays(diagram(explored, "frequency", "psi1", {"q": q}))
+        counts = np.diff(arrays["first"].astype(int))
+        np.testing.assert_array_equal(counts > 0, arrays["status"] != 0)
+        total += int((counts > 0).sum())
+    assert total == committed == int((cube.status != 0).sum())
+
+
+def test_diagram__stops_at_a_damaged_chunk(made_run):
+    for task in range(made_run.plan.n_tasks):
+        made_run.commit(task)
+    section = made_run.directory / "cube.zarr" / "section"
+    chunk = next(f for f in sorted(section.rglob("*")) if f.is_file() and f.name != "zarr.json")
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(bytes(content))
+    explored = ExploredRun.of(made_run.directory)
+
+    def read():
+        for q in range(2):
+            diagram(explored, "frequency", "psi1", {"q": q})
+
+    with pytest.raises(DamagedError, match="not what was written"):
+        read()
+
+
+@pytest.fixture
+def made_run(made):
+    made.directory = made.info.directory
+    return made
+
+
+# ---- orbits
+
+
+def some_cells(explored, n=4):
+    status = explored.cube()["status"].values.ravel()
+    found = np.flatnonzero(status == PERIODIC)
+    return found[:: max(1, len(found) // n)][:n].tolist()
+
+
+@pytest.mark.parametrize("which", ["sweep", "walk", "flow"])
+def test_orbit__ends_where_the_cube_goes_on(which, request):
+    """The first point is the section asked for, and each period ends at the cube's next one."""
+    explored = ExploredRun.of(request.getfixturevalue(which))
+    cells = some_cells(explored)
+    assert cells
+    for number in cells:
+        cell = cell_of(explored, number)
+        for point in (0, 5):
+            arrays, attrs = unpack_arrays(orbit(explored, number, point))
+            step = SAMPLES
+            ends = arrays["states"][::step]
+            assert len(ends) == attrs["n_periods"] + 1
+            np.testing.assert_array_equal(ends[0], cell.section[point])
+            n = min(len(ends), len(cell.section) - point)
+            assert n >= 2
+            if which == "flow":  # returns need not take equally long
+                ends = ends[[0, -1]]
+                compared = cell.section[[point, point + attrs["n_periods"]]]
+            else:
+                ends, compared = ends[:n], cell.section[point : point + n]
+            assert np.abs(ends - compared).max() < SAME
+            assert attrs["period"] == cell.period
+            np.testing.assert_allclose(arrays["section_times"][-1], arrays["time"][-1], rtol=1e-12)
+
+
+def test_orbit__agrees_with_scipy(sweep):
+    """The whole path of one period is that of DOP853 on the model's own rates."""
+    explored = ExploredRun.of(sweep)
+    number = some_cells(explored)[0]
+    cell = cell_of(explored, number)
+    arrays, attrs = unpack_arrays(orbit(explored, number, 3))
+    assert attrs["frequency"] == cell.clock_hz
+
+    def slope(t, y):
+        return rates(t, y, cell.parameters, cell.clock_hz)
+
+    times = arrays["time"]
+    exact = solve_ivp(slope, (0.0, times[-1]), cell.section[3], "DOP853", times, rtol=1e-11, atol=1e-12)
+    # the continuous extension between steps of 1e-9 is of order 4
+    assert np.abs(exact.y.T - arrays["states"]).max() < 1e-6
+
+
+def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
+    explored = ExploredRun.of(sweep)
+    found = derive(sweep, "attractors")
+    for number in some_cells(explored, 6):
+        _, attrs = unpack_arrays(orbit(explored, number, 0))
+        index = explored.cell(number)
+        one = int(found["attractor_id"].isel(index))
+        assert attrs["attractor"] == one
+        assert attrs["at"] == {d: index[d] for d in ("frequency", "A")}
+        here = found.isel({d: index[d] for d in ("frequency", "A")})
+        assert attrs["share"] == float(here["share"][one])
+        assert attrs["low"] <= attrs["share"] <= attrs["high"]
+        assert len(attrs["seeds"]) == int(here["n_cells"][one])
+        start = {name: float(explored.cube()[f"{name}_0"][index[f"{name}_0"]]) for name in ("x", "v")}
+        assert attrs["start"] == start
+        assert {k: attrs["seeds"][0][k] for k in start} == start
+        assert attrs["parameters"]["A"] == float(explored.cube()["A"][index["A"]])
+        if int(here["orbit_period"][one]) == attrs["period"]:
+            real = here["multiplier_real"][one].values
+            np.testing.assert_allclose([m[0] for m in attrs["multipliers"]], real)
+            assert attrs["stable"]
+
+
+def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
+    """Polishing the cell's own section gives those that the analysis of attractors gives."""
+    explored = ExploredRun.of(sweep)
+    found = derive(sweep, "attractors")
+    compared = 0
+    for number in some_cells(explored, 6):
+        cell = cell_of(explored, number)
+        multipliers, seconds = linearise(cell)
+        index = explored.cell(number)
+        one = int(found["attractor_id"].isel(index))
+        here = found.isel(frequency=index["frequency"], A=index["A"], attractor=one)
+        if int(here["orbit_period"]) == cell.period:
+            expected = here["multiplier_real"].values + 1j * here["multiplier_imag"].values
+            np.testing.assert_allclose(np.sort_complex(multipliers), np.sort_complex(expected), atol=1e-6)
+            assert seconds == pytest.approx(cell.period / cell.clock_hz)
+            # they multiply to what the divergence makes of a volume in the time of the period
+            compared += 1
+    assert compared
+
+
+def test_orbit__exponents_of_a_flow_have_the_one_along_it(flow):
+    explored = ExploredRun.of(flow)
+    _, attrs = unpack_arrays(orbit(explored, some_cells(explored)[0], 0))
+    assert attrs["frequency"] is None
+    assert attrs["exponents"][0] == pytest.approx(0.0, abs=1e-9)
+    assert attrs["exponents"][1] < 0.0
+
+
+@pytest.mark.parametrize(
+    ("cell", "point", "sentence"), [(10_000, 0, "cells 0 to"), (0, 12, "sections 0 to 11|has no section")]
+)
+def test_orbit__refuses_in_a_sentence(sweep, cell, point, sentence):
+    with pytest.raises(ExplorerError, match=sentence):
+        orbit(ExploredRun.of(sweep), cell, point)
+
+
+def test_orbit__of_a_pending_cell_is_refused(made_run):
+    with pytest.raises(ExplorerError, match="not computed yet"):
+        orbit(ExploredRun.of(made_run.directory), 0, 0)
+
+
+# ---- what lies over and beside
+
+
+def test_curves__are_shares_and_exponents_of_the_analysis(sweep):
+    explored = ExploredRun.of(sweep)
+    found = derive(sweep, "attractors").isel(frequency=1)
+    listed = curves(explored, "A", {"frequency": 1})["curves"]
+    json.dumps(listed, allow_nan=False)
+    shares = {c["attractor"]: c for c in listed if c["group"] == "fractions"}
+    assert shares
+    for number, one in shares.items():
+        np.testing.assert_array_equal(one["y"], found["share"].isel(attractor=number).values)
+        assert all(low <= y <= high for low, y, high in zip(one["low"], one["y"], one["high"], strict=True))
+        assert one["x"] == found["A"].values.tolist()
+
+
+def test_branches__lie_on_the_diagram(walk):
+    """Where a branch is stable, points of the cube lie on it; every located point has its branch."""
+    explored = ExploredRun.of(walk)
+    found = branches(explored, "A", "x", {})
+    json.dumps(found, allow_nan=False)
+    assert found["note"] is None
+    stable = [s for b in found["branches"] for s in b["segments"] if s["stable"]]
+    cube = explored.cube().load()
+    tried = 0
+    for i in range(cube.sizes["A"]):
+        for j in np.flatnonzero(cube["status"].values[i] == PERIODIC):
+            value = float(cube["section"].sel(state="x").values[i, j, -1])
+            heights = [
+                np.interp(float(cube["A"][i]), *(np.array(s[k])[np.argsort(s["x"])] for k in ("x", "y")))
+                for s in stable
+                if min(s["x"]) <= float(cube["A"][i]) <= max(s["x"])
+            ]
+            if heights:
+                tried += 1
+                # branches are joined by straight lines between steps
+                assert np.abs(np.array(heights) - value).min() < 5e-3
+    assert tried
+    assert {p["branch"] for p in found["points"]} <= {b["id"] for b in found["branches"]}
+
+
+def test_branches__without_an_analysis_say_how_to_get_them(sweep):
+    found = branches(ExploredRun.of(sweep), "A", "x", {"frequency": 0})
+    assert found["branches"] == []
+    assert "magpend analyse branches" in found["note"]
+
+
+def test_attractors__are_those_of_the_point(sweep):
+    explored = ExploredRun.of(sweep)
+    here = derive(sweep, "attractors").isel(frequency=0, A=2)
+    found = attractors(explored, {"frequency": 0, "A": 2})["attractors"]
+    json.dumps(found, allow_nan=False)
+    assert {a["id"] for a in found} == set(np.flatnonzero(here["kind"].values > 0).tolist())
+    assert [a["share"] for a in found] == sorted((a["share"] for a in found), reverse=True)
+    for one in found:
+        points = here["attractor_points"].isel(attractor=one["id"]).transpose("point", "state").values
+        np.testing.assert_array_equal(one["section"], points[np.isfinite(points).all(axis=1)])
+
+
+def test_plane__has_the_label_of_every_start(sweep):
+    explored = ExploredRun.of(sweep)
+    arrays, attrs = unpack_arrays(plane(explored, {"frequency": 1, "A": 0}))
+    assert (attrs["states"], attrs["source"]) == (["x", "v"], "basins")
+    found = derive(sweep, "basins").isel(frequency=1, A=0)
+    expected = found["attractor_id"].transpose("v_0", "x_0")
+    np.testing.assert_array_equal(arrays["u"], expected["x_0"].values)
+    np.testing.assert_array_equal(arrays["v"], expected["v_0"].values)
+    diverged = found["status"].transpose("v_0", "x_0").values == DIVERGED
+    np.testing.assert_array_equal(arrays["label"], np.where(diverged, -2, expected.values))
+    assert set(np.unique(arrays["label"])) - {-1} <= {c["id"] for c in attrs["labels"]}
+
+
+def test_plane__of_scattered_starts_lists_them(walk):
+    explored = ExploredRun.of(walk)
+    arrays, attrs = unpack_arrays(plane(explored, {"A": 1}))
+    assert attrs["source"] is None
+    assert arrays["label"].size == 0
+    cube = explored.cube()
+    expected = np.stack([cube[f"{name}_0"].values for name in attrs["states"]], axis=1)
+    np.testing.assert_array_equal(arrays["starts"], expected)
+    assert len(arrays["start_label"]) == cube.sizes["branch"]
+
+
+# ---- tables
+
+
+@pytest.mark.parametrize("kind", ["diagram", "curves", "orbit", "plane", "attractors"])
+def test_table__has_the_same_rows_in_both_formats(sweep, kind, tmp_path):
+    explored = ExploredRun.of(sweep)
+    at = {"frequency": 0} if kind in ("diagram", "curves") else {"frequency": 0, "A": 1}
+    asked = {"x": "A", "y": "x", "at": at, "cell": some_cells(explored)[0], "point": 0}
+    text = table(explored, kind, asked).decode()
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    rows = list(csv.DictReader(io.StringIO("\n".join(lines))))
+    path = tmp_path / "table.nc"
+    path.write_bytes(table(explored, kind, asked, "nc"))
+    with xr.open_dataset(path, engine="scipy") as ds:
+        assert ds.sizes["row"] == len(rows) > 0
+        assert ds.attrs["cube_digest"] == explored.digest
+        numbers = [n for n in ds.data_vars if ds[n].dtype.kind == "f"]
+        for name in numbers:
+            heading = next(h for h in rows[0] if h == name or h.startswith(f"{name} ["))
+            read = [float(row[heading] or "nan") for row in rows]
+            np.testing.assert_array_equal(read, ds[name].values)
+
+
+def test_table__of_branches_and_its_refusals(walk):
+    explored = ExploredRun.of(walk)
+    asked = {"x": "A", "y": "x", "at": {}}
+    assert table(explored, "branches", asked).startswith(b"# title")
+    with pytest.raises(ExplorerError, match="unknown view"):
+        table(explored, "planet", asked)
+    with pytest.raises(ExplorerError, match="unknown format"):
+        table(explored, "curves", asked, "xlsx")
+    with pytest.raises(ExplorerError, match="cell is missing"):
+        table(explored, "orbit", asked)
+
+
+# ---- answers
+
+
+@pytest.mark.parametrize("text", ["-1", "1.0", "", "٣", "1" * 20, "0x1"])
+def test_query__takes_whole_numbers_alone(text):
+    with pytest.raises(ExplorerError, match="whole number"):
+        Query({"cell": text}).count("cell")
+
+
+def test_zoom__is_a_specification_of_the_region(sweep, tmp_path):
+    body = json.dumps({"x": [0.21, 0.24], "axes": ["A", "x"], "y": [0, 1], "at": {"frequency": 0}}).encode()
+    reply = ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, body), False)
+    path = tmp_path / "zoom.toml"
+    path.write_bytes(reply.content)
+    from pipeline.spec.parsing import load_spec
+
+    spec = load_spec(path)
+    assert spec.axes["A"].array()[[0, -1]].tolist() == [0.21, 0.24]
+    with pytest.raises(ExplorerError, match="x"):
+        ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, b'{"x": 3}'), False)
+
+
+def test_explored_run__is_the_run(sweep):
+    """Whoever holds an opened run may hand it over; an explored one is taken as it is."""
+    opened = Run.open(sweep)
+    explored = ExploredRun.of(opened)
+    assert ExploredRun.of(explored) is explored
+    assert explored.digest == opened.digest
