@@ -19,7 +19,7 @@ from pipeline.explorer.planes import plane
 from pipeline.explorer.regions import zoom_toml
 from pipeline.explorer.tables import FORMATS, table
 from pipeline.explorer.verticals import verticals
-from pipeline.explorer.view import describe_view
+from pipeline.explorer.view import commands, describe_view
 
 JSON = "application/json; charset=utf-8"
 BINARY = "application/octet-stream"
@@ -100,9 +100,11 @@ def json_reply(value: Any) -> Reply:
 
 
 def _view(run: ExploredRun, query: Query, live: bool) -> Reply:
-    return run.remembered(
-        f"view {live}", lambda: json_reply({**describe_view(run, live), "directory": run.name})
-    )
+    def described() -> Reply:
+        # commands as whoever started the server can give them; an export names no folder of its maker's
+        return json_reply({**describe_view(run, live), "commands": commands(run, run.name)})
+
+    return run.remembered(f"view {live}", described)
 
 
 def _diagram(run: ExploredRun, query: Query, live: bool) -> Reply:

@@ -400,7 +400,9 @@ def test_explore__serves_until_it_is_stopped(made_run, start):
         socket.create_connection((_other_address(), port), timeout=5).close()
     os.kill(process.pid, signal.SIGINT)
     assert process.wait(20) == 130
-    assert "stopped" in process.stderr.read()
+    said = process.stderr.read()
+    assert "stopped" in said
+    assert "so far" not in said.partition("Ctrl-C ends it")[2]
     assert {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")} == before
 
 

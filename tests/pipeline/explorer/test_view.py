@@ -156,7 +156,8 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
     assert found["starts"] == {"dims": ["x_0", "v_0"], "count": 24}
     names = [v["name"] for v in found["verticals"]]
     assert names[:2] == list(explored.model.state_names)
-    assert names[2:] == ["energy.min", "energy.max", "energy.mean"]
+    quantities = [q.name for q in explored.model.quantities]
+    assert names[2:] == [*quantities, "energy.min", "energy.max", "energy.mean"]
     assert found["planes"][0] == ["x", "v"]
     assert found["has"]["attractors"]
     assert found["has"]["basins"]
@@ -218,6 +219,20 @@ def test_diagram__has_every_point_of_the_cube(sweep, x, y):
         np.testing.assert_array_equal(own, kept.values if is_drawn else [])
         assert arrays["status"][k] == int(one["status"])
     assert len(arrays["cell"]) == status.size // cube.sizes[other]
+
+
+def test_diagram__shows_quantities_at_the_sections(sweep):
+    """The energy at the end of a period lies between its extremes over that period, and nowhere else."""
+    explored = ExploredRun.of(sweep)
+    found = [
+        unpack_arrays(diagram(explored, "frequency", y, {"A": 2}))[0]["y"]
+        for y in ("energy", "energy.min", "energy.max")
+    ]
+    energy, low, high = found
+    assert len(energy) == len(low) > 100
+    # extremes are those of the states at the steps' ends, of which the section is one
+    assert np.all((energy >= low - 1e-9) & (energy <= high + 1e-9))
+    assert np.ptp(energy) > 1e-3
 
 
 def test_diagram__colours_are_those_of_the_analyses(sweep):

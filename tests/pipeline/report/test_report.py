@@ -6,12 +6,14 @@ import html as markup
 import math
 import re
 import shlex
+import shutil
 
 import pytest
 
 from pipeline.report.report import report
 from pipeline.report.stored import stored_options
 from pipeline.runs.derive import derive
+from pipeline.runs.run import run as run_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.run import Run
 
@@ -37,11 +39,9 @@ closure_tolerance = 1e-2
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    from pipeline.runs.run import run
-
     folder = tmp_path_factory.mktemp("report")
     (folder / "spec.toml").write_text(SWEEP)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda _: None)
+    run_spec(folder / "spec.toml", folder / "run", workers=0, echo=lambda _: None)
     return folder
 
 
@@ -116,3 +116,8 @@ def test_stored_options__of_these_cells(folder):
     derive(run, "attractors", {"n_points": 8})
     assert stored_options(run, "attractors") == [{}, {"n_points": 8}]
     assert stored_options(run, "curves") == []
+    # what was found of other cells is not shown
+    (folder / "other.toml").write_text(SWEEP.replace("n_transient = 200", "n_transient = 210"))
+    run_spec(folder / "other.toml", folder / "other", workers=0, echo=lambda _: None)
+    shutil.copytree(folder / "run" / "derived", folder / "other" / "derived")
+    assert stored_options(Run.open(folder / "other"), "attractors") == []
