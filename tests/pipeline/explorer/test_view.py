@@ -424,6 +424,19 @@ def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
     assert compared
 
 
+def test_orbit__without_multipliers_says_that_they_come(walk):
+    explored = ExploredRun.of(walk)
+    assert explored.kept("attractors") is not None  # what branches rest on
+    number = some_cells(explored)[0]
+    object.__setattr__(explored, "_opened", {**explored._opened, "derived attractors": None})
+    _, attrs = unpack_arrays(orbit(explored, number, 0, linearised=False))
+    assert attrs["multipliers"] is attrs["stable"] is attrs["exponents"] is None
+    assert "in a moment" in attrs["note"]
+    _, attrs = unpack_arrays(orbit(explored, number, 0))
+    assert attrs["multipliers"]
+    assert attrs["note"] is None
+
+
 def test_orbit__exponents_of_a_flow_have_the_one_along_it(flow):
     explored = ExploredRun.of(flow)
     _, attrs = unpack_arrays(orbit(explored, some_cells(explored)[0], 0))
@@ -574,7 +587,7 @@ def test_query__takes_whole_numbers_alone(text):
 
 def test_zoom__is_a_specification_of_the_region(sweep, tmp_path):
     body = json.dumps({"x": [0.21, 0.24], "axes": ["A", "x"], "y": [0, 1], "at": {"frequency": 0}}).encode()
-    reply = ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, body), False)
+    reply = ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, body), None)
     path = tmp_path / "zoom.toml"
     path.write_bytes(reply.content)
     from pipeline.spec.parsing import load_spec
@@ -582,7 +595,7 @@ def test_zoom__is_a_specification_of_the_region(sweep, tmp_path):
     spec = load_spec(path)
     assert spec.axes["A"].array()[[0, -1]].tolist() == [0.21, 0.24]
     with pytest.raises(ExplorerError, match="x"):
-        ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, b'{"x": 3}'), False)
+        ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, b'{"x": 3}'), None)
 
 
 def test_explored_run__is_the_run(sweep):

@@ -93,6 +93,43 @@ def test_report__its_commands_work(folder, command):
         assert not re.search(r": computed", notes), c
 
 
+WALKS = """
+kind = "continuation"
+[axes]
+frequency_hz = { start = 2.05, stop = 2.11, num = 5 }
+[continuation]
+path = "frequency_hz"
+direction = "both"
+[initial_conditions]
+kind = "random"
+n = 4
+seed = 7
+psi1_deg = [-20.0, 20.0]
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 200
+n_keep = 16
+"""
+
+
+def test_report__jumps_of_walks_have_their_place(folder, command):
+    (folder / "walks.toml").write_text(WALKS)
+    run_spec(folder / "walks.toml", folder / "walks", workers=0, echo=lambda _: None)
+    html = written(command, folder, "walks")
+    found = derive(folder / "walks", "hysteresis")
+    assert found.sizes["jump"]
+    head = re.search(r"<tr><th scope=\"col\">direction</th>(.*?)</tr>", html)[1]
+    assert re.findall(r"<th scope=\"col\">(.*?)</th>", head) == [
+        "from frequency [Hz]", "to frequency [Hz]", "from attractor", "to attractor", "count",
+    ]  # fmt: skip
+    rows = re.findall(r"<tr><td>(up|down)</td><td>(.*?)</td><td>(.*?)</td><td>([A-Z])</td>", html)
+    names = [("up" if d > 0 else "down") for d in found["jump_direction"].values]
+    ends = ([f"{v:.6g}" for v in found[f"jump_{end}"].values] for end in ("from", "to"))
+    letters = [chr(65 + int(i)) for i in found["jump_from_id"].values]
+    assert rows == list(zip(names, *ends, letters, strict=True))
+
+
 def test_report__several_runs(folder, command):
     command(folder, "run", "spec.toml", "--out", "second", "--workers", "0")
     page = report([str(folder / "run"), str(folder / "second")], only_stored=True, echo=lambda _: None)
