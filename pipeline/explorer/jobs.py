@@ -111,7 +111,7 @@ class Desk:
             if self._current is not None:
                 self._current.cancel()
             if self._thread is None:
-                self._thread = threading.Thread(target=self._serve, daemon=True)
+                self._thread = threading.Thread(target=self._serve, name="magpend-desk", daemon=True)
                 self._thread.start()
         if left is not None:
             left.tell("done", cancelled=True)

@@ -154,6 +154,8 @@ def sentence_of(error: ValidationError) -> str:
     """One sentence for the first thing that is wrong."""
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
     jobs = {"start", "slice", "follow", "run", "cancel"}
+    if str(first["type"]).startswith("union_tag"):
+        return "do: must be start, slice, follow, run or cancel."
     place = ".".join(str(part) for part in first["loc"] if str(part) not in jobs)[:200]
     reason = str(first["msg"])[:300].rstrip(".")
     return f"{place}: {reason}." if place else f"the message cannot be read: {reason}."

@@ -120,6 +120,8 @@ def _rounded(name: str, low: float, high: float) -> tuple[float, float]:
     """Ends without the digits that a hand on a mouse cannot mean."""
     if not low < high:
         raise RequestError(f"{name}: the interval {low:g} to {high:g} is empty; its end must be greater.")
+    if not math.isfinite(high - low):
+        raise RequestError(f"{name}: the interval {low:g} to {high:g} is too long.")
     digits = DIGITS - 1 - math.floor(math.log10(high - low))
     ends = round(low, digits), round(high, digits)
     return ends if ends[0] < ends[1] else (low, high)

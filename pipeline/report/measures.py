@@ -85,18 +85,19 @@ def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
     """Cells at the values of the axis that are asked for: ``at`` one, or from ``low`` to ``high``."""
     values = ds[axis].values
     if "at" in options:
-        if not _has(values, float(options["at"])):
-            return ds.isel({axis: slice(0, 0)})
-        return ds.isel({axis: [place(ds[axis], float(options["at"]))]})
+        at = _index(ds, axis, float(options["at"]))
+        return ds.isel({axis: [] if at is None else [at]})
     slack = 1e-9 * max(abs(values).max(), 1.0)
     low, high = float(options.get("low", -math.inf)), float(options.get("high", math.inf))
     return ds.isel({axis: (values >= low - slack) & (values <= high + slack)})
 
 
-def _has(values: np.ndarray, value: float) -> bool:
-    """Whether an axis has a value, to within half its step."""
-    slack = 0.5 * float(np.diff(values).min()) if values.size > 1 else 0.0
-    return bool(np.abs(values - value).min() <= max(slack, 1e-9 * abs(value)) and slack < 0.05 * abs(value))
+def _index(ds: xr.Dataset, axis: str, value: float) -> int | None:
+    """Place of a value on an axis; None if the axis does not have it."""
+    try:
+        return place(ds[axis], value)
+    except ValueError:
+        return None
 
 
 def _step(values: np.ndarray) -> float | None:
@@ -177,10 +178,11 @@ def window(
     here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})
     values, n = here[axis].values, here.sizes["cell"]
     step, wanted = _step(values), float(options["contains"])
-    if values.size < 3 or not _has(values, wanted):
+    at = _index(here, axis, wanted) if values.size > 2 else None
+    if at is None:
         return absent(f"the axis has no value {wanted:g} with others about it", step), 0, 0, here, axis
     whole = np.asarray(_matches(here, options).all(1))
-    at = first = last = int(np.abs(values - wanted).argmin())
+    first = last = at
     if not whole[at]:
         text = f"not all of {n} cells have it at {values[at]:g}"
         return Estimate(0.0, 0.0, 0.0, text, step, n), 0, 0, here, axis
@@ -344,6 +346,7 @@ def _of_torques(name: str) -> Measure:
         found: Estimate = getattr(torque_curves, name)(results.torques(of[0]), options)
         return found
 
+    measure.__name__ = name
     return measure
 
 

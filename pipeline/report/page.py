@@ -1,8 +1,9 @@
 """A page of a report: what stands on it, and how it becomes one HTML file.
 
-A page is data: a title, sections, and in each section blocks of a few kinds (`Picture`, `Grid`, `Note`,
-`Facts`, `Source`). The template turns every text into text: nothing that a run, a specification or a study
-says becomes markup. The file needs nothing beside itself, asks nothing of a network and runs no script.
+A page is data: a title, sections, and in each section blocks of a few kinds (`Picture`, `Grid`, `Text`,
+`Note`, `Facts`, `Source`, `Outcome`). The template turns every text into text: nothing that a run, a
+specification or a study says becomes markup. The file needs nothing beside itself, asks nothing of a network
+and runs no script.
 """
 
 from __future__ import annotations
@@ -74,6 +75,8 @@ class Grid:
         What gives all its rows.
     n_more : int
         Rows that are left out.
+    stacked : bool
+        Whether a row becomes lines on a narrow screen, for tables with sentences in them.
     """
 
     columns: Sequence[str]
@@ -81,7 +84,16 @@ class Grid:
     caption: str = ""
     command: str = ""
     n_more: int = 0
+    stacked: bool = False
     kind: str = "grid"
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+    kind: str = "text"
 
 
 @dataclass(frozen=True)
@@ -141,7 +153,7 @@ class Outcome:
     kind: str = "outcome"
 
 
-Block = Picture | Grid | Note | Facts | Source | Outcome
+Block = Picture | Grid | Text | Note | Facts | Source | Outcome
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.report.measures import MEASURES, Estimate
-from pipeline.report.page import Block, Facts, Grid, Note, Outcome, Page, Part, write
+from pipeline.report.page import Block, Facts, Grid, Note, Outcome, Page, Part, Text, write
 from pipeline.report.pictures import picture
 from pipeline.report.report import made_by
 from pipeline.report.results import Results
@@ -121,6 +121,7 @@ def reproduce(
             parts.append(_part(results, figure, own))
             judgements += own
     name = f"report-{'-'.join(n for f in chosen for n in f.numbers)}.html" if figures else PAGE
+    parts += _provenance(results)
     page = Page(study.table.title, _summary(results, judgements), parts, made_by())
     write(page, folder / name)
     write_atomically(folder / name.replace(PAGE[:6], CLAIMS[:6]).replace(".html", ".json"), _rows(judgements))
@@ -155,7 +156,7 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
     elif claim.n and found.n is not None and found.n < claim.n:
         plain, reason = Verdict.UNDECIDED, f"Rests on {found.n}; {claim.n} and more decide."
     elif plain is Verdict.UNDECIDED:
-        reason = "The interval reaches beyond what is claimed; more cells, or a finer axis, decide."
+        reason = "The interval reaches beyond what is claimed: a larger sample, or a finer axis, decides."
     if claim.calibrated and plain is not Verdict.UNDECIDED:
         agrees = "agrees with it" if plain is Verdict.MET else "contradicts it"
         return Judgement(figure, claim, found, Verdict.CALIBRATED, plain, f"What came out {agrees}.")
@@ -167,7 +168,7 @@ def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]
     many = len(figure.numbers) > 1
     blocks: list[Block] = []
     if figure.says:
-        blocks.append(Note(f"What the text says: {figure.says}"))
+        blocks.append(Text(f"What the text says: {figure.says}"))
     if figure.note:
         blocks.append(Note(figure.note))
     blocks += [picture(results, table) for table in figure.pictures]
@@ -206,7 +207,7 @@ def spelled(judgement: Judgement) -> str:
 
 def _digits(width: float) -> str:
     """Return the format in which an interval of a width shows two digits of it."""
-    if not (math.isfinite(width) and width > 0.0):
+    if not (math.isfinite(width) and width > 1e-8):
         return "{:.7g}"
     return f"{{:.{min(max(0, 1 - math.floor(math.log10(width))), 9)}f}}"
 
@@ -223,7 +224,7 @@ def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
     table = results.study.table
     counts = {verdict: sum(j.verdict is verdict for j in judgements) for verdict in Verdict}
     failed = sum(j.fails for j in judgements)
-    blocks: list[Block] = [Note(table.source), *(Note(text) for text in table.about)]
+    blocks: list[Block] = [Note(table.source), *(Text(text) for text in table.about)]
     size = "smoke size: it shows that everything works, and decides little" if results.smoke else "full size"
     blocks.append(Facts({
         "size": size,
@@ -232,34 +233,31 @@ def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
     }))  # fmt: skip
     rows = [
-        (j.figure, j.claim.statement, spelled(j).partition(";")[0].rstrip("."), j.verdict.words)
-        for j in judgements
+        (j.figure, j.claim.statement, spelled(j).partition(";")[0].rstrip("."), _short(j)) for j in judgements
     ]
     if rows:
-        blocks.append(Grid(("figure", "claim", "came out (95 % interval)", "verdict"), rows, "All claims"))
-    return [*blocks, *_runs(results)]
+        heads = ("figure", "claim", "came out (95 % interval)", "verdict")
+        blocks.append(Grid(heads, rows, "All claims", stacked=True))
+    return blocks
 
 
-def _runs(results: Results) -> list[Block]:
-    """Return what the figures were computed from, with digests."""
-    rows = [
-        (
-            name,
-            run.info.title,
-            str(run.plan.n_cells),
-            run.digest,
-            f"magpend run {results.study.table.runs[name].spec}",
-        )
-        for name, run in results.computed().items()
-    ]
-    return (
-        [Grid(("run", "what", "cells", "digest of the cube", "specification"), rows, "Runs")] if rows else []
-    )
+def _short(judgement: Judgement) -> str:
+    """Return a verdict, and of what was calibrated on, whether it came out."""
+    if judgement.verdict is not Verdict.CALIBRATED:
+        return judgement.verdict.words
+    came = {Verdict.MET: "it came out", Verdict.NOT_MET: "it did not come out"}
+    return f"{judgement.verdict.words}; {came.get(judgement.plain, 'undecided whether it came out')}"
 
 
-def provenance(results: Results) -> list[Part]:
-    """Return a section per run with all that is known of it."""
-    return [Part(name, list(provenance_of(run))) for name, run in results.computed().items()]
+def _provenance(results: Results) -> list[Part]:
+    """Return the section on what the figures were computed from: digests, versions, specifications."""
+    runs = results.computed()
+    if not runs:
+        return []
+    rows = [(name, run.info.title, str(run.plan.n_cells), run.digest) for name, run in runs.items()]
+    table = Grid(("run", "what", "cells", "digest of the cube"), rows, stacked=True)
+    own = [Part(f"Run {name}", list(provenance_of(run))) for name, run in runs.items()]
+    return [Part("Where this comes from", [table], own)]
 
 
 def _rows(judgements: Sequence[Judgement]) -> str:
@@ -267,10 +265,11 @@ def _rows(judgements: Sequence[Judgement]) -> str:
     rows = [
         {
             "figure": j.figure, "statement": j.claim.statement, "source": j.claim.source,
-            "measure": j.claim.measure, "of": list(j.claim.of), "least": _plain(j.claim.least), "most": _plain(j.claim.most),
-            "unit": j.claim.unit, "value": _plain(j.estimate.value), "low": _plain(j.estimate.low),
-            "high": _plain(j.estimate.high), "text": j.estimate.text or j.estimate.missing,
-            "verdict": j.verdict.words, "reason": j.reason, "required": j.claim.required, "fails": j.fails,
+            "measure": j.claim.measure, "of": list(j.claim.of), "least": _plain(j.claim.least),
+            "most": _plain(j.claim.most), "unit": j.claim.unit, "value": _plain(j.estimate.value),
+            "low": _plain(j.estimate.low), "high": _plain(j.estimate.high),
+            "text": j.estimate.text or j.estimate.missing, "verdict": j.verdict.words, "reason": j.reason,
+            "required": j.claim.required, "fails": j.fails,
         }
         for j in judgements
     ]  # fmt: skip

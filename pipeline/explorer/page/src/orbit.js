@@ -61,9 +61,9 @@ export function withUnit({ label, name, unit }) {
   return unit && unit !== "1" ? `${text} [${unit}]` : text;
 }
 
-/** Colour of an orbit: its attractor's where it attracts, a warning's where it does not. */
+/** Colour of an orbit: its attractor's where it attracts; where it does not, the ink's, which no attractor has. */
 export function colourOf(orbit, view, colours) {
-  if (orbit.stable === false) return colours.warn;
+  if (orbit.stable === false) return colours.ink;
   const attractors = view.colours?.find((entry) => entry.name === "attractor");
   const category = attractors?.categories.find((entry) => entry.id === orbit.attrs.attractor);
   return category?.colour ?? colours.accent;
@@ -74,7 +74,7 @@ export function indicesOf(orbit, view) {
   if (orbit.attrs.at) return orbit.attrs.at;
   const at = {};
   for (const axis of view.axes) {
-    const value = axis.name === "frequency" ? orbit.attrs.frequency : orbit.attrs.parameters?.[axis.name];
+    const value = axis.name === "frequency" ? orbit.attrs.frequency : orbit.attrs.parameters?.[axis.parameter ?? axis.name];
     if (value === undefined || value === null) continue;
     at[axis.name] = axis.values.reduce((best, v, i) => (Math.abs(v - value) < Math.abs(axis.values[best] - value) ? i : best), 0);
   }

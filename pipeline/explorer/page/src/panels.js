@@ -135,7 +135,9 @@ class Panels {
       onPiece(kind, piece);
     });
     this.startJob = job;
-    return job.done;
+    const end = await job.done;
+    if (job === this.startJob && end.colour) this.portraits.endLive(end.colour);
+    return end;
   }
 
   destroy() {

@@ -64,6 +64,13 @@ export class Portrait {
     this.frame.repaint();
   }
 
+  /** Give the section points of that start the colour of what it ends on. */
+  endLive(colour) {
+    if (!this.live) return;
+    this.live.colour = colour;
+    this.frame.repaint();
+  }
+
   arrange() {
     const { orbit, live } = this, paths = live?.paths ?? [];
     if (!orbit && !paths.length) return;
@@ -105,8 +112,9 @@ export class Portrait {
     }
     if (this.live) {
       const places = this.live.paths.length ? this.places(this.live.x, this.live.y) : [];
-      ctx.fillStyle = colours.warn;
-      for (const [x, y] of places) ctx.fillRect(frame.x(x) - 1.5, frame.y(y) - 1.5, 3, 3);
+      // squares: section points of the orbit are discs
+      ctx.fillStyle = this.live.colour ?? colours.warn;
+      for (const [x, y] of places) ctx.fillRect(frame.x(x) - 2, frame.y(y) - 2, 4, 4);
     }
   }
 
@@ -178,9 +186,13 @@ export class Portraits {
     const names = [...view.model.states, ...(view.model.quantities ?? [])];
     if (names.length < 3) return;
     const options = names.map((entry) => [entry.name, entry.label || entry.name]);
-    const change = () => this.replace(across.select.value ? [across.select.value, upwards.select.value] : null, clock);
+    const change = () => {
+      upwards.element.hidden = !across.select.value;
+      this.replace(across.select.value ? [across.select.value, upwards.select.value] : null, clock);
+    };
     const across = labelledSelect("Another: across", [["", "none"], ...options], "", change);
     const upwards = labelledSelect("upwards", options, names[1].name, change);
+    upwards.element.hidden = true;
     body.append(el("div", { class: "controls" }, across.element, upwards.element));
   }
 
@@ -207,6 +219,10 @@ export class Portraits {
 
   addLive(kind, piece) {
     for (const portrait of this.all) portrait.addLive(kind, piece);
+  }
+
+  endLive(colour) {
+    for (const portrait of this.all) portrait.endLive(colour);
   }
 
   get frames() {

@@ -1,0 +1,643 @@
+"""What is computed live, against the cube and the analysis of the same run."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from magpend_core.orbits import polish_orbits
+from pipeline.explorer import slices
+from pipeline.explorer.arrays import unpack_arrays
+from pipeline.explorer.live import LiveRun, LiveSession, live_problem
+from pipeline.explorer.messages import MOST_BYTES, Region, RequestError, read_request
+from pipeline.explorer.regions import zoom_toml, zoomed
+from pipeline.explorer.settling import settle_cells
+from pipeline.layout.identity import identity_of
+from pipeline.layout.plan import make_plan
+from pipeline.runs.derive import derive
+from pipeline.runs.run import run
+from pipeline.runs.status import state
+from pipeline.spec.parsing import load_spec
+from pipeline.spec.problems import SpecError
+from pipeline.store.run import Run
+from pipeline.store.setup import create
+
+HZ = 0.15915494309189535
+
+DRIVEN = """
+kind = "sweep"
+model = "duffing5"
+[axes]
+A = { values = [0.2, 0.25] }
+[parameters]
+frequency_hz = 0.15915494309189535
+[initial_conditions]
+kind = "grid"
+x = { start = -0.9375, stop = 0.9375, num = 16 }
+v = { start = -0.5, stop = 1.0, num = 7 }
+[integration]
+rtol = 1e-7
+atol = 1e-7
+n_transient = %d
+n_keep = 12
+stop_when_closed = %s
+"""
+
+FLOW = """
+kind = "sweep"
+[model]
+name = "normal_form"
+states = { x = {}, y = {} }
+parameters = { mu = -0.1, omega = 2.0, cubic = 1.0, quintic = -1.0 }
+define = { s = "x**2 + y**2", g = "mu + cubic*s + quintic*s**2" }
+equations = { x = "g*x - omega*y", y = "omega*x + g*y" }
+[section]
+of = "y"
+value = 0.3
+longest = 20.0
+[axes]
+mu = { values = [-0.2, -0.1, 0.1] }
+[initial_conditions]
+kind = "grid"
+x = { start = -0.9, stop = 0.9, num = 3 }
+y = { start = -1.05, stop = 0.95, num = 3 }
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 100
+n_keep = 12
+"""
+
+
+class Watcher:
+    """A session, and what it has answered."""
+
+    def __init__(self, live):
+        self.answers, self._news = [], threading.Condition()
+        self.session = LiveSession(live, self._take)
+        self._next = 100
+
+    def _take(self, answer):
+        if isinstance(answer, bytes):
+            arrays, attrs = unpack_arrays(answer)
+            answer = {**attrs, "arrays": arrays}
+        else:
+            json.dumps(answer, allow_nan=False)
+        with self._news:
+            self.answers.append(answer)
+            self._news.notify_all()
+
+    def send(self, **message):
+        self._next += 1
+        self.session.receive(json.dumps({"id": self._next, **message}))
+        return self._next
+
+    def of(self, number):
+        return [a for a in list(self.answers) if a["id"] == number]
+
+    def wait(self, number, *kinds, timeout=120.0):
+        """The first answer to a message of one of some kinds."""
+        kinds = kinds or ("done", "error")
+
+        def found():
+            return next((a for a in self.of(number) if a["kind"] in kinds), None)
+
+        with self._news:
+            assert self._news.wait_for(found, timeout), f"no answer: {self.of(number)}"
+            return found()
+
+    def ask(self, *kinds, **message):
+        return self.wait(self.send(**message), *kinds)
+
+
+def made(folder, text):
+    folder.mkdir()
+    (folder / "spec.toml").write_text(text)
+    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda _: None)
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def directories(tmp_path_factory):
+    """Runs of a driven system, one of which stops when closed, and of a flow, with their attractors."""
+    folder = tmp_path_factory.mktemp("live")
+    found = {
+        "whole": made(folder / "whole", DRIVEN % (120, "false")),
+        "closing": made(folder / "closing", DRIVEN % (200, "true")),
+        "flow": made(folder / "flow", FLOW),
+    }
+    for directory in found.values():
+        derive(directory, "attractors")
+    return found
+
+
+@pytest.fixture
+def watch():
+    """Open sessions; they are closed at the end."""
+    opened = []
+
+    def begin(source):
+        live = source if isinstance(source, LiveRun) else LiveRun(Run.open(source))
+        watcher = Watcher(live)
+        opened.append((watcher, live))
+        return watcher
+
+    yield begin
+    for watcher, live in opened:
+        watcher.session.close()
+        watcher.session.join()
+        live.close()
+
+
+def start_of(cube, at):
+    names = [n for n in ("x", "v", "y") if f"{n}_0" in cube.coords]
+    one = cube.isel(at)
+    return one, {name: float(one[f"{name}_0"]) for name in names}
+
+
+# ---- starts --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["whole", "closing"])
+def test_start__has_the_bits_and_the_attractor_of_the_cell(directories, watch, name):
+    opened = Run.open(directories[name])
+    cube, attractors = opened.cube(), derive(directories[name], "attractors")
+    watcher, seen = watch(opened), set()
+    ids = attractors["attractor_id"].transpose("A", "x_0", "v_0").values
+    # cells of every attractor at each value, and of none
+    cells = [
+        (a, *i) for a in (0, 1) for k in np.unique(ids[a]) for i in np.argwhere(ids[a] == k)[:3].tolist()
+    ]
+    for a, x, v in cells:
+        one, start = start_of(cube, {"A": a, "x_0": x, "v_0": v})
+        number = watcher.send(do="start", parameters={"A": float(one["A"])}, state=start)
+        end = watcher.wait(number)
+        assert end["kind"] == "done", end
+        own = int(attractors["attractor_id"].isel(A=a, x_0=x, v_0=v))
+        assert end["attractor"] == (own if own >= 0 else None)
+        pieces = [p["arrays"]["section"] for p in watcher.of(number) if p["kind"] == "sections"]
+        # what is kept ends where the cube's does; a start that is run on has more
+        n = int(one["n_periods"])
+        np.testing.assert_array_equal(np.concatenate(pieces)[n - 12 : n], one["section"].values)
+        if one["orbit_period"] > 0:
+            assert end["period"] == int(one["orbit_period"])
+            assert end["status"] == "periodic"
+        seen.add(own)
+    assert seen == set(np.unique(ids))
+    assert len(seen) >= 5
+
+
+def test_start__shows_its_path_first_and_soon(directories, watch):
+    watcher = watch(directories["whole"])
+    watcher.ask(do="start", parameters={"A": 0.2}, state={"x": 0.3})  # compiles
+    began = time.perf_counter()
+    number = watcher.send(do="start", parameters={"A": 0.2}, state={"x": -0.3, "v": 0.1})
+    first = watcher.wait(number, "path")
+    assert time.perf_counter() - began < 0.2
+    watcher.wait(number)
+    paths = [a for a in watcher.of(number) if a["kind"] == "path"]
+    assert watcher.of(number)[0] is first
+    states = np.concatenate([p["arrays"]["states"] for p in paths])
+    time_s = np.concatenate([p["arrays"]["time"] for p in paths])
+    np.testing.assert_array_equal(states[0], [-0.3, 0.1])
+    # it passes the sections that are told, a period apart, and goes on smoothly between its pieces
+    sections = next(a for a in watcher.of(number) if a["kind"] == "sections")["arrays"]["section"]
+    for k in range(5):
+        i = int(np.abs(time_s - (k + 1) / HZ).argmin())
+        np.testing.assert_allclose(states[i], sections[k], atol=1e-4)  # two integrators at 1e-7
+    assert np.abs(np.diff(states, axis=0)).max() < 0.1
+
+
+def test_start__off_the_cube_is_told_by_its_orbit(directories, watch):
+    """Between the run's values, where nothing is known: equal orbits are one, different ones are not."""
+    watcher = watch(directories["whole"])
+    ends = [
+        watcher.ask(do="start", parameters={"A": 0.21}, state=s)
+        for s in ({"x": 0.9375, "v": 0.5}, {"x": 0.92, "v": 0.5}, {"x": 0.0, "v": 0.0})
+    ]
+    assert all(end["attractor"] is None and end["status"] == "periodic" for end in ends)
+    assert ends[0]["number"] == ends[1]["number"]
+    assert ends[0]["label"].startswith("not among the run's: period")
+
+
+def test_start__ends_of_a_flow(directories, watch):
+    """At rest or on the cycle, as the analysis says of the cell."""
+    cube, attractors = Run.open(directories["flow"]).cube(), derive(directories["flow"], "attractors")
+    watcher, kinds = watch(directories["flow"]), set()
+    for mu in (0, 1):
+        for at in ((1, 1), (0, 0), (2, 2), (1, 2)):
+            one, start = start_of(cube, {"mu": mu, "x_0": at[0], "y_0": at[1]})
+            end = watcher.ask(do="start", parameters={"mu": float(one["mu"])}, state=start)
+            own = int(attractors["attractor_id"].isel(mu=mu, x_0=at[0], y_0=at[1]))
+            assert end["attractor"] == own, (mu, at, end)
+            kinds.add(int(attractors["kind"].isel(mu=mu, attractor=own)))
+    assert kinds == {1, 3}
+
+
+def test_start__of_a_flow_beside_the_runs_values(directories, watch):
+    watcher = watch(directories["flow"])
+    rest = watcher.ask(do="start", parameters={"mu": -0.15}, state={"x": 0.05, "y": 0.1})
+    assert rest["label"] == "not among the run's: at rest"
+    cycle = watcher.ask(do="start", parameters={"mu": -0.15}, state={"x": 0.9, "y": 0.1})
+    assert (cycle["period"], cycle["attractor"]) == (1, None)
+
+
+def test_start__that_leaves_is_told(directories, watch):
+    watcher = watch(directories["flow"])
+    # the quintic term drives it apart
+    end = watcher.ask(do="start", parameters={"quintic": 1.0, "mu": 0.1}, state={"x": 2.0, "y": 2.0})
+    assert end["kind"] == "done"
+    assert end["attractor"] is None
+    assert end["status"] in ("diverged", "step_limit", "step_underflow")
+
+
+def test_start__is_superseded_and_cancelled(directories, watch):
+    watcher = watch(directories["whole"])
+    watcher.ask(do="start", parameters={"A": 0.2}, state={"x": 0.3})
+    first = watcher.send(do="start", parameters={"A": 0.2}, state={"x": 0.3}, periods=20_000)
+    second = watcher.send(do="start", parameters={"A": 0.2}, state={"x": 0.3})
+    assert watcher.wait(first)["cancelled"] is True
+    assert watcher.wait(second)["attractor"] is not None
+
+
+# ---- slices --------------------------------------------------------------------------------------
+
+
+def test_slice__is_that_of_the_cube_and_computes_no_start_twice(directories, watch, monkeypatch):
+    starts = []
+
+    def counted(place, integration, catalog, states, check):
+        starts.append(states)
+        return settle_cells(place, integration, catalog, states, check)
+
+    monkeypatch.setattr(slices, "settle_cells", counted)
+    opened = Run.open(directories["whole"])
+    attractors = derive(directories["whole"], "attractors")
+    cube = opened.cube()
+    watcher = watch(opened)
+    # its 16 columns are the run's own: centres of cells of 0.125; four of its rows are
+    number = watcher.send(
+        do="slice", parameters={"A": 0.2}, plane=["x", "v"], ranges=[[-1.0, 1.0], [-0.515625, 0.484375]],
+        resolution=32,
+    )  # fmt: skip
+    end = watcher.wait(number)
+    assert end["kind"] == "done", end
+    images = [a for a in watcher.of(number) if a["kind"] == "slice"]
+    whole = [a for a in images if a["share_done"] == 1.0]
+    assert [a["resolution"] for a in whole] == [16, 32]
+    fine, coarse = (a["arrays"]["label"] for a in reversed(whole))
+    np.testing.assert_array_equal(fine[::2, ::2], coarse)
+    assert sum(map(len, starts)) == 32 * 32
+    assert len(np.unique(np.concatenate(starts), axis=0)) == 32 * 32
+    u, v = whole[-1]["arrays"]["u"], whole[-1]["arrays"]["v"]
+    known = {line["id"] for line in end["labels"] if line["attractor"] is not None}
+    assert known <= set(attractors["attractor_id"].isel(A=0).values.ravel().tolist())
+    assert abs(sum(end["shares"].values()) - 1.0) < 1e-12
+    # a start of the plane ends where a live start, and so a cell, ends
+    rng = np.random.default_rng(1)
+    for row, column in rng.integers(0, 32, (8, 2)):
+        one = watcher.ask(
+            do="start", parameters={"A": 0.2}, state={"x": float(u[column]), "v": float(v[row])}
+        )
+        assert one["number"] == fine[row, column]
+    assert cube.sizes["x_0"] == 16
+
+
+def test_slice__at_the_cubes_own_starts(directories, watch):
+    attractors = derive(directories["whole"], "attractors").isel(A=1)
+    watcher = watch(directories["whole"])
+    number = watcher.send(
+        do="slice", parameters={"A": 0.25}, plane=["x", "v"], ranges=[[-1.0, 1.0], [-0.625, 3.375]],
+        resolution=16,
+    )  # fmt: skip
+    end = watcher.wait(number)
+    assert end["kind"] == "done", end
+    image = [a for a in watcher.of(number) if a["kind"] == "slice"][-1]["arrays"]
+    np.testing.assert_allclose(image["u"], attractors["x_0"].values, atol=1e-15)
+    np.testing.assert_allclose(image["v"][:7], attractors["v_0"].values, atol=1e-15)
+    own = attractors["attractor_id"].transpose("v_0", "x_0").values
+    np.testing.assert_array_equal(image["label"][:7][own >= 0], own[own >= 0])
+    assert (own >= 0).mean() > 0.9
+
+
+def test_slice__without_an_analysis_tells_orbits_apart(directories, watch):
+    watcher = watch(directories["whole"])
+    number = watcher.send(
+        do="slice", parameters={"A": 0.2, "d": 0.081}, plane=["x", "v"], ranges=[[-1, 1], [-0.5, 1]],
+        resolution=16,
+    )  # fmt: skip
+    end = watcher.wait(number)
+    orbits = [line for line in end["labels"] if "period" in line["label"]]
+    assert len(orbits) >= 5
+    assert all(line["attractor"] is None for line in end["labels"])
+    assert len({line["colour"] for line in orbits}) == len(orbits)
+    assert len({line["label"] for line in end["labels"]}) == len(end["labels"])
+
+
+def test_slice__ends_soon_when_cancelled(directories, watch):
+    watcher = watch(directories["whole"])
+    watcher.ask(do="slice", parameters={"A": 0.2}, plane=["x", "v"], ranges=[[-1, 1], [0, 1]], resolution=16)
+    number = watcher.send(
+        do="slice", parameters={"A": 0.2}, plane=["x", "v"], ranges=[[-1, 1], [-1, 1]], resolution=512
+    )
+    watcher.wait(number, "slice")
+    began = time.perf_counter()
+    watcher.send(do="cancel", job=number)
+    assert watcher.wait(number)["cancelled"] is True
+    assert time.perf_counter() - began < 0.8  # a call of the kernel in each thread, on a busy machine
+    n = len(watcher.of(number))
+    time.sleep(0.2)
+    assert len(watcher.of(number)) == n
+
+
+# ---- orbits that follow --------------------------------------------------------------------------
+
+
+def cell_of(live, **at):
+    status = live.cube["status"]
+    index = [at[str(d)] for d in status.dims]
+    return int(np.ravel_multi_index(index, status.shape))
+
+
+def closed_cell(live):
+    period = live.cube["orbit_period"].isel(A=0).transpose("x_0", "v_0").values
+    x, v = np.argwhere(period == 1)[0]
+    return cell_of(live, A=0, x_0=int(x), v_0=int(v))
+
+
+def test_follow__is_the_orbit_at_the_value(directories, watch):
+    live = LiveRun(Run.open(directories["whole"]))
+    watcher = watch(live)
+    orbit = watcher.ask(
+        "orbit", "error", do="follow", **{"from": {"cell": closed_cell(live), "point": 2}},
+        parameter="A", value=0.23,
+    )  # fmt: skip
+    assert orbit["kind"] == "orbit", orbit
+    assert (orbit["lost"], orbit["value"], orbit["parameters"]["A"]) == (False, 0.23, 0.23)
+    place = live.place({"A": 0.23}, None)
+    section = orbit["arrays"]["section"]
+    again = polish_orbits(
+        place.parameters.pack()[None], np.array([HZ]), section[-1:], np.array([orbit["period"]]),
+        system=live.model.system,
+    )  # fmt: skip
+    assert again.converged[0]
+    np.testing.assert_allclose(again.section[0], section[-1], atol=1e-7)
+    found = np.array([complex(*m) for m in orbit["multipliers"]])
+    np.testing.assert_allclose(np.abs(found), np.abs(again.multipliers[0]), rtol=1e-5)
+    # Liouville: the multipliers' product is exp(-d T)
+    np.testing.assert_allclose(np.prod(found).real, np.exp(-0.08 / HZ), rtol=1e-6)
+    assert orbit["stable"] == bool(np.abs(found).max() < 1.0)
+    states = orbit["arrays"]["states"]
+    np.testing.assert_allclose(states[0], states[-1], atol=1e-6)  # it closes
+
+
+def test_follow__goes_through_unstable_parts_and_says_where_it_is_lost(directories, watch):
+    live = LiveRun(Run.open(directories["whole"]))
+    watcher = watch(live)
+    held = {"cell": closed_cell(live), "point": 0}
+    stable = []
+    for value in (0.22, 0.3, 0.4, 0.55, 0.7, 0.9, 1.2, 1.6, 2.0, 3.0, 5.0):
+        orbit = watcher.ask("orbit", "error", do="follow", **{"from": held}, parameter="A", value=value)
+        assert orbit["kind"] == "orbit", orbit
+        stable.append(orbit["stable"])
+        held = {"orbit": orbit["orbit"]}
+        if orbit["lost"]:
+            break
+    back = watcher.ask("orbit", do="follow", **{"from": held}, parameter="A", value=1e-6)
+    lost = [a for a in (orbit, back) if a["lost"]]
+    assert lost
+    assert all("lost at A = " in a["sentence"] and a["value"] != a["wanted"] for a in lost)
+    assert {True} <= set(stable)
+
+
+def test_follow__refuses_with_a_sentence(directories, watch):
+    live = LiveRun(Run.open(directories["whole"]))
+    watcher, cell = watch(live), closed_cell(live)
+    for origin, parameter, value, word in (
+        ({"cell": 10**9, "point": 0}, "A", 0.2, "the cube has"),
+        ({"cell": cell, "point": 10**6}, "A", 0.2, "12 sections"),
+        ({"orbit": 77}, "A", 0.2, "no orbit of this page"),
+        ({"cell": cell}, "B", 0.2, "no parameter"),
+        ({"cell": cell}, "d", -1.0, "d = -1"),
+        ({"cell": cell}, "frequency", 1e-9, "must be from"),
+    ):
+        end = watcher.ask(do="follow", **{"from": origin}, parameter=parameter, value=value)
+        assert end["kind"] == "error"
+        assert word in end["error"]
+
+
+def test_follow__of_a_flow(directories, watch):
+    live = LiveRun(Run.open(directories["flow"]))
+    watcher = watch(live)
+    period = live.cube["orbit_period"].isel(mu=1).transpose("x_0", "y_0").values
+    x, y = map(int, np.argwhere(period == 1)[0])
+    orbit = watcher.ask(
+        "orbit", "error", do="follow", **{"from": {"cell": cell_of(live, mu=1, x_0=x, y_0=y)}},
+        parameter="mu", value=-0.2,
+    )  # fmt: skip
+    assert orbit["kind"] == "orbit", orbit
+    radius = np.hypot(*orbit["arrays"]["states"].T)
+    np.testing.assert_allclose(radius**2, 0.5 * (1.0 + np.sqrt(1.0 - 0.8)), atol=1e-7)
+    assert orbit["frequency"] is None
+    np.testing.assert_allclose(orbit["seconds"], np.pi, rtol=1e-8)
+    # at mu = -1/4 the two cycles meet
+    gone = watcher.ask(
+        "orbit", do="follow", **{"from": {"orbit": orbit["orbit"]}}, parameter="mu", value=-0.3
+    )
+    assert gone["lost"]
+    assert abs(gone["value"] + 0.25) < 1e-3
+    assert "fold" in gone["sentence"]
+
+
+# ---- regions -------------------------------------------------------------------------------------
+
+
+REGION = {"x": [-0.5, 0.5], "y": [0.0, 0.5], "axes": ["x_0", "v"], "at": {"A": 1}}
+
+
+def test_zoomed__is_the_region_and_reads_back(directories, tmp_path):
+    opened = Run.open(directories["whole"])
+    region = Region.model_validate_json(json.dumps(REGION))
+    (tmp_path / "zoom.toml").write_text(zoom_toml(opened, region))
+    spec = load_spec(tmp_path / "zoom.toml")
+    assert spec == zoomed(opened, region)[0]
+    assert spec.values["A"] == 0.25
+    assert not spec.axes
+    # a diagram's height is no range of starts, and digits that no hand can mean are not kept
+    one = Region.model_validate_json('{"x": [0.2012345678, 0.24], "y": [-1, 1], "axes": ["A", "x"]}')
+    spec, _ = zoomed(opened, one)
+    np.testing.assert_array_equal(spec.axes["A"].array(), [0.20123, 0.24])
+    assert spec.initial_conditions == opened.spec.initial_conditions
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ('{"x": [1, 0]}', "empty"),
+        ('{"x": [0, 1], "axes": ["q", null]}', "not what the run sweeps"),
+        ('{"x": [-1, 1], "axes": ["x", null], "at": {"A": 9}}', "2 values"),
+        ('{"x": [-1, 1], "axes": ["x", null], "at": {"A": -1}}', "2 values"),
+        ('{"x": [-1.7e308, 1.7e308], "axes": ["A", null]}', "too long"),
+    ],
+)
+def test_zoomed__refuses_with_a_sentence(directories, text, word):
+    region = Region.model_validate_json(text)
+    with pytest.raises((RequestError, SpecError), match=word):
+        zoomed(Run.open(directories["whole"]), region)
+
+
+def test_run__a_region_beside_the_run(directories, watch, tmp_path):
+    os.symlink(directories["whole"], tmp_path / "link")
+    watcher = watch(directories["whole"])
+    beside = directories["whole"].parent
+    before = {p.name for p in beside.iterdir()}
+    first = watcher.send(do="run", **REGION)
+    told = watcher.wait(first, "progress")
+    watcher.send(do="cancel", job=first)
+    assert watcher.wait(first)["cancelled"] is True
+    watcher.session.join()
+    # what was begun is gone on with, under the same name
+    second = watcher.send(do="run", **REGION)
+    end = watcher.wait(second)
+    assert end["kind"] == "done", end
+    assert end["name"] == told["name"]
+    assert {p.name for p in beside.iterdir()} == before | {end["name"]}
+    assert state(beside / end["name"]).complete
+    last = [a for a in watcher.of(second) if a["kind"] == "progress"][-1]
+    assert last["done"] == last["total"] == end["cells"] == 112
+    cube = Run.open(beside / end["name"]).cube()
+    np.testing.assert_allclose(cube["x_0"].values[[0, -1]], [-0.5, 0.5])
+
+
+def test_run__leaves_no_process_when_cancelled(directories, watch):
+    watcher = watch(directories["whole"])
+    number = watcher.send(do="run", **{**REGION, "x": [-0.4, 0.6]})
+    watcher.wait(number, "progress")
+    deadline = time.monotonic() + 20.0
+    while not (children := own_children()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert children
+    watcher.session.close()
+    watcher.session.join()
+    assert not own_children()
+
+
+def own_children():
+    """Processes of the command line that this one has started."""
+    import psutil
+
+    found = []
+    for child in psutil.Process().children(recursive=True):
+        try:
+            if "pipeline.cli.main" in child.cmdline() and child.status() != psutil.STATUS_ZOMBIE:
+                found.append(child.pid)
+        except psutil.Error:
+            continue
+    return found
+
+
+def test_run__of_too_much_is_refused(directories, watch, monkeypatch):
+    monkeypatch.setattr("pipeline.explorer.regions.MOST_CELLS", 50)
+    end = watch(directories["whole"]).ask(do="run", **REGION)
+    assert "112 cells" in end["error"]
+
+
+# ---- messages ------------------------------------------------------------------------------------
+
+
+HOSTILE = [
+    "",
+    "null",
+    "[]",
+    "[" * 60_000,
+    "{",
+    '{"id": 1}',
+    '{"id": -1, "do": "start"}',
+    '{"id": 1e400, "do": "cancel", "job": 1}',
+    '{"id": 1, "do": "delete"}',
+    '{"id": 1, "do": "start", "state": {"x": NaN}}',
+    '{"id": 1, "do": "start", "state": {"x": "1"}}',
+    '{"id": 1, "do": "start", "periods": 1000000000}',
+    '{"id": 1, "do": "start", "frequency": -1}',
+    '{"id": 1, "do": "start", "path": "/etc/passwd"}',
+    '{"id": 1, "do": "slice", "plane": ["x", "v"], "ranges": [[0, 1], [0, 1]], "resolution": 513}',
+    '{"id": 1, "do": "slice", "plane": ["x"], "ranges": [[0, 1], [0, 1]]}',
+    '{"id": 1, "do": "follow", "from": {"cell": -1}, "parameter": "A", "value": 1}',
+    '{"id": 1, "do": "follow", "from": {}, "parameter": "A", "value": 1}',
+    '{"id": 1, "do": "run", "x": [0, 1], "out": "../../x"}',
+    '{"id": 1, "do": "run", "x": [0]}',
+    '{"id": 1, "do": "start", "state": {"' + "x" * 5000 + '": 1}}',
+    '{"id": 1, "do": "start", "state": {' + ", ".join(f'"s{i}": 0' for i in range(300)) + "}}",
+    " " * (MOST_BYTES + 1),
+    b"\xff\xfe\x00",
+    "\ud800",
+]
+
+
+@pytest.mark.parametrize("text", HOSTILE, ids=lambda text: repr(text)[:40])
+def test_read_request__refuses_in_one_sentence(text):
+    with pytest.raises(RequestError) as caught:
+        read_request(text)
+    said = str(caught.value)
+    assert "\n" not in said
+    assert len(said) < 600
+
+
+def test_receive__answers_what_is_wrong_and_goes_on(directories, watch):
+    watcher = watch(directories["whole"])
+    for text in HOSTILE:
+        n = len(watcher.answers)
+        watcher.session.receive(text)
+        assert any(a["kind"] == "error" for a in watcher.answers[n:])
+    for wrong, word in (
+        ({"do": "start", "state": {"y": 1.0}}, "no state"),
+        ({"do": "start", "parameters": {"d": -1.0}}, "d = -1"),
+        ({"do": "start", "parameters": {"dd": 1.0}}, "not a parameter"),
+        ({"do": "start", "frequency": 1e6}, "must be from"),
+        ({"do": "slice", "plane": ["x", "x"], "ranges": [[0, 1], [0, 1]]}, "twice"),
+        ({"do": "slice", "plane": ["x", "w"], "ranges": [[0, 1], [0, 1]]}, "no state"),
+        ({"do": "slice", "plane": ["x", "v"], "ranges": [[1, 0], [0, 1]]}, "greater"),
+    ):
+        end = watcher.ask(**wrong)
+        assert end["kind"] == "error"
+        assert word in end["error"]
+    assert watcher.ask(do="start", parameters={"A": 0.2}, state={"x": 0.3})["kind"] == "done"
+
+
+def test_close__ends_jobs_and_answers(directories, watch):
+    watcher = watch(directories["whole"])
+    number = watcher.send(
+        do="slice", parameters={"A": 0.2}, plane=["x", "v"], ranges=[[-1, 1], [-1, 1]], resolution=512
+    )
+    watcher.wait(number, "slice")
+    watcher.session.close()
+    n = len(watcher.answers)
+    watcher.session.join(5.0)
+    assert not any(t.name.startswith("magpend-desk") and t.is_alive() for t in threading.enumerate())
+    assert len(watcher.answers) == n
+
+
+def test_live_problem__of_a_model_that_is_an_object(tmp_path, own, monkeypatch):
+    """Opening a run imports nothing, and so nothing of it can be computed live."""
+    from magpend_core.models import imported
+
+    trace = own.write_module(tmp_path, "live_mine")
+    monkeypatch.syspath_prepend(tmp_path)
+    text = own.spec('model = "live_mine:MINE"')
+    (tmp_path / "spec.toml").write_text(text)
+    spec = load_spec(tmp_path / "spec.toml")
+    plan = make_plan(spec)
+    create(tmp_path / "run", spec, plan, identity_of(spec, plan, "test-kernel"), text)
+    monkeypatch.setattr(imported, "_imported", {})
+    n = len(trace.read_text())
+    said = live_problem(Run.open(tmp_path / "run"))
+    assert said is not None
+    assert "live_mine:MINE" in said
+    with pytest.raises(RequestError):
+        LiveRun(Run.open(tmp_path / "run"))
+    assert len(trace.read_text()) == n

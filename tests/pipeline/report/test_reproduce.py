@@ -1,0 +1,213 @@
+"""``magpend reproduce``: a small study carried out, its claims judged; and the one that ships."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from pipeline.cli.exits import Exit
+from pipeline.report.study import load_study, shipped_studies
+from pipeline.spec.problems import SpecError
+
+SPEC = """
+kind = "sweep"
+[axes]
+frequency_hz = { values = [2.6, 2.8] }
+[initial_conditions]
+kind = "grid"
+psi1_deg = { start = -10, stop = 10, num = 3 }
+psi2_deg = { start = -10, stop = 10, num = 2 }
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 200
+n_keep = 16
+stop_when_closed = true
+closure_tolerance = 1e-2
+"""
+STUDY = """
+title = "A <b>small</b> study"
+source = "us"
+[runs.sweep]
+spec = "sweep.toml"
+[[figures]]
+number = "1"
+title = "Drive"
+[[figures.pictures]]
+kind = "quantities"
+of = "sweep"
+quantities = ["drive_torque", "energy"]
+frequency_hz = 2.6
+caption = "The drive."
+[[figures.claims]]
+statement = "High for less than half of the period <script>"
+source = "preset"
+measure = "share_above"
+of = ["sweep"]
+options = { quantity = "drive_torque", frequency_hz = 2.6 }
+most = 0.5
+required = true
+[[figures]]
+number = "2"
+title = "Section"
+[[figures.pictures]]
+kind = "plot"
+of = "sweep"
+figure = "section"
+options = { at = { frequency = 2.6 } }
+caption = "Points."
+"""
+FALSE = """
+[[figures.claims]]
+statement = "Nothing closes"
+source = "nobody"
+measure = "least_share"
+of = ["sweep"]
+options = { at = 2.6, period = 0 }
+least = 0.99
+required = true
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    (tmp_path / "sweep.toml").write_text(SPEC, "utf-8")
+
+    def write(text):
+        (tmp_path / "mine.toml").write_text(text, "utf-8")
+        return tmp_path / "mine.toml"
+
+    return write
+
+
+def test_reproduce__a_study_of_ones_own(study, main, tmp_path):
+    study(STUDY)
+    code, out, err = main("reproduce", "mine.toml", "--out", "done", "--workers", "0")
+    assert code == 0, err
+    html = (tmp_path / "done" / "report.html").read_text("utf-8")
+    assert "A &lt;b&gt;small&lt;/b&gt; study" in html
+    assert "<script" not in html
+    assert html.count("<img") == 2
+    (row,) = json.loads((tmp_path / "done" / "claims.json").read_text("utf-8"))
+    assert (row["verdict"], row["value"]) == ("met", pytest.approx(0.4927, abs=1e-9))
+    again, _, notes = main("reproduce", "mine.toml", "--out", "done", "--workers", "0")
+    assert again == 0
+    assert "nothing to do" in notes
+    assert html == (tmp_path / "done" / "report.html").read_text("utf-8")
+    alone, out, _ = main("reproduce", "mine.toml", "--out", "done", "--figure", "2", "--workers", "0")
+    assert (alone, out.count("report:")) == (0, 1)
+    assert (tmp_path / "done" / "report-2.html").read_text("utf-8").count("<img") == 1
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "verdict"), [(False, "not met"), (True, "calibrated on this, so no test")]
+)
+def test_reproduce__a_required_claim_is_contradicted(study, main, tmp_path, calibrated, verdict):
+    study(STUDY + FALSE + f"calibrated = {str(calibrated).lower()}\n")
+    code, out, err = main("reproduce", "mine.toml", "--out", "done", "--workers", "0")
+    assert code == Exit.CONTRADICTED
+    assert "1 required claims are contradicted: figure 2: Nothing closes" in err
+    assert f"2  {verdict}: Nothing closes" in out
+    assert (tmp_path / "done" / "report.html").is_file()
+
+
+def test_reproduce__one_that_is_not_required(study, main):
+    study(STUDY + FALSE.replace("required = true", ""))
+    code, out, _ = main("reproduce", "mine.toml", "--out", "done", "--workers", "0")
+    assert code == 0
+    assert "not met: Nothing closes" in out
+
+
+@pytest.mark.slow
+def test_reproduce__goes_on_after_a_kill(study, main, tmp_path):
+    study(STUDY + FALSE.replace("required = true", ""))
+    slow = SPEC.replace("n_transient = 200", "n_transient = 1500").replace("stop_when_closed = true\n", "")
+    (tmp_path / "sweep.toml").write_text(slow + "[execution]\ntrajectories_per_task = 2\n", "utf-8")
+    code = "import sys; from pipeline.cli.main import main; sys.argv[0] = 'magpend'; main()"
+    words = ["reproduce", "mine.toml", "--out", "done", "--workers", "0"]
+    process = subprocess.Popen([sys.executable, "-c", code, *words], cwd=tmp_path, start_new_session=True)
+    commits, end = tmp_path / "done" / "runs" / "sweep" / "commits", time.monotonic() + 120
+    while not list(commits.glob("0*.json")) and time.monotonic() < end and process.poll() is None:
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "done" / "report.html").exists()
+    code, _, err = main(*words)
+    assert code == 0, err
+    assert "cells done before" in err
+    killed = (tmp_path / "done" / "claims.json").read_bytes()
+    assert main(*words[:3], "whole", "--workers", "0")[0] == 0
+    assert killed == (tmp_path / "whole" / "claims.json").read_bytes()
+
+
+def test_load_study__all_that_is_wrong(study):
+    bad = STUDY.replace('of = ["sweep"]', 'of = ["swept"]').replace("share_above", "share_abov")
+    with pytest.raises(SpecError) as caught:
+        load_study(study(bad))
+    assert len(caught.value.problems) == 2
+    assert "unknown input 'swept'; did you mean sweep" in caught.value.problems[0]
+    assert "did you mean share_above" in caught.value.problems[1]
+    with pytest.raises(SpecError, match="titel: unknown key"):
+        load_study(study(STUDY.replace('title = "A', 'titel = "A', 1)))
+    with pytest.raises(SpecError, match=r"least = 2 is more than most = 0.5"):
+        load_study(study(STUDY.replace("most = 0.5", "most = 0.5\nleast = 2.0")))
+
+
+def test_reproduce__what_is_refused(study, main, tmp_path):
+    study(STUDY)
+    for words, message in (
+        (["mine.toml", "--figure", "3"], "unknown figure '3'"),
+        (["wojna2019"], "did you mean wojna2018"),
+        (["mine.toml", "--out", "sweep.toml"], "is a file"),
+    ):
+        code, _, err = main("reproduce", *words)
+        assert code == Exit.REFUSED
+        assert message in err
+    assert not (tmp_path / "reproduce").exists()
+
+
+def test_shipped_study__has_every_numerical_figure():
+    table = load_study("wojna2018").table
+    assert set(shipped_studies()) == {"wojna2018"}
+    numbers = [n for figure in table.figures for n in figure.numbers]
+    assert numbers == ["3", "4", "6", "7", "8", "9", "11", "12", "13", "14", "15", "16", "17"]
+    for figure in table.figures:
+        assert figure.pictures, figure.number
+        assert figure.says or figure.note, figure.number
+        for claim in figure.claims:
+            assert claim.source
+            # docs/model.md: what lies between 2 and 3 Hz was calibrated on
+            told = "preset's constants were chosen" in claim.source
+            assert claim.calibrated == told, claim.statement
+
+
+@pytest.mark.slow
+def test_shipped_study__smoke(main, tmp_path):
+    """The whole way at the small size: what the size does not touch is met, all else undecided or no test."""
+    code, _, err = main("reproduce", "wojna2018", "--smoke", "--out", "smoke")
+    assert code == 0, err
+    rows = json.loads((tmp_path / "smoke" / "claims.json").read_text("utf-8"))
+    of_runs = {"whole", "up", "down", "motions"}
+    for row in rows:
+        if set(row["of"]) & of_runs and row["measure"] != "share_above":
+            assert row["verdict"] in ("undecided", "calibrated on this, so no test"), row
+            assert "decide" in row["reason"] or "Not measured" in row["reason"], row
+    met = {row["measure"] for row in rows if row["verdict"] == "met"}
+    assert {"share_above", "recorded_duty_cycle", "curves_described", "torque_gain"} <= met
+    # the discs' field is no bump: docs/magnet.md has the widths grow from 3.5 to 4.3 degrees
+    (width,) = [row for row in rows if row["measure"] == "width_spread"]
+    assert width["verdict"] == "not met"
+    assert width["value"] == pytest.approx(2 * (4.3 - 3.5) / (4.3 + 3.5), abs=0.03)
+    html = (tmp_path / "smoke" / "report.html").read_text("utf-8")
+    assert "Not drawn" not in html
+    n_pictures = sum(len(figure.pictures) for figure in load_study("wojna2018").table.figures)
+    assert html.count("<img") == n_pictures
+    commands = re.findall(r"magpend reproduce wojna2018 --smoke --figure (\d+)", html)
+    assert commands == ["3", "6", "7", "8", "9", "11", "12", "13", "14", "15", "16", "17"]
