@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.explorer.copied_orbits import Room
-from pipeline.explorer.copy_html import folder_html
+from pipeline.explorer.copy_html import folder_html, static_text
 from pipeline.explorer.explored import ExploredRun
 from pipeline.explorer.export import MOST_ORBITS, Exported, add_all_orbits, finished, read_columns
 from pipeline.explorer.gather import Column, Copied, add_planes, gather, place_of
 from pipeline.explorer.verticals import vertical
 from pipeline.store.consolidate import Layer, write_cube
 from pipeline.store.errors import RefusedError
-from pipeline.store.files import entry_of
+from pipeline.store.files import CUBE, entry_of
 from pipeline.store.local import remove_tree, sync_folder, temporary_beside, unwritable
 from pipeline.store.run import Run
 
-INDEX, LIST, DATA = "index.html", "objects.json", "data"
+INDEX, LIST, DATA, LICENCES = "index.html", "objects.json", "data", "LICENSES.txt"
 
 QUANTITY = "quantity_"
 """What the names of quantities in the cube begin with."""
@@ -100,7 +100,7 @@ def check_folder(out: Path, force: bool) -> None:
         return
     if not force:
         raise RefusedError(f"{out}: exists already and is not overwritten; give another name, or --force.")
-    own = {INDEX, LIST, DATA, "cube.zarr"}
+    own = {INDEX, LIST, DATA, LICENCES, CUBE}
     if out.is_symlink() or not out.is_dir() or {p.name for p in out.iterdir()} - own:
         raise RefusedError(
             f"{out}: is not a folder that magpend export has made, so --force leaves it; remove it."
@@ -132,7 +132,10 @@ def _write(run: ExploredRun, folder: Path, quantities: Sequence[str], most_orbit
     digest = hashlib.sha256(listed).hexdigest()
     html = folder_html(run.info.title, f"magpend {copied.view['version']}", digest).encode()
     (folder / INDEX).write_bytes(html)
-    size = sum(entry["size"] for entry in entries.values()) + len(listed) + len(html)
+    # code of others is in the page's script
+    licences = static_text(LICENCES).encode()
+    (folder / LICENCES).write_bytes(licences)
+    size = sum(entry["size"] for entry in entries.values()) + len(listed) + len(html) + len(licences)
     return Exported(folder, size, orbits, copied.sentences)
 
 
