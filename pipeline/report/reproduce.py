@@ -110,7 +110,6 @@ def reproduce(
         As `pipeline.runs.run.run`; what was committed stays, and the same call goes on.
     """
     chosen = _chosen(study, figures)
-    folder.mkdir(parents=True, exist_ok=True)
     results = Results(study, folder, smoke=smoke, workers=workers, echo=echo)
     results.prepare({name for figure in chosen for name in figure.needs})
     with stoppable(str(folder)):
