@@ -1,0 +1,122 @@
+"""The tutorials as a reader follows them: what is typed, printed and drawn there is done here."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).parents[1]
+_SPEC = importlib.util.spec_from_file_location("run_tutorials", ROOT / "docs" / "run_tutorials.py")
+tutorials = importlib.util.module_from_spec(_SPEC)
+sys.modules[_SPEC.name] = tutorials
+_SPEC.loader.exec_module(tutorials)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", tutorials.PAGES)
+def test_tutorial__does_what_it_says(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = tutorials.PAGES[name]
+    for shown, made in tutorials.follow(page, tmp_path).items():
+        kept = page.parent / shown
+        assert kept.is_file(), f"make it with: python docs/run_tutorials.py --pictures {name}"
+        with Image.open(kept) as one, Image.open(made) as other:
+            assert one.size == other.size
+            assert getattr(one, "n_frames", 1) == getattr(other, "n_frames", 1)
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").rglob("*.md")), ids=lambda path: path.stem)
+def test_pictures__are_there(page):
+    for target in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", page.read_text("utf-8")):
+        assert (page.parent / target).is_file(), target
+
+
+PAGE = """
+<!-- file: words.txt -->
+```text
+one
+```
+
+<!-- run -->
+```python
+print("value 2.0004 at (3, 4)")
+```
+
+<!-- printed -->
+```text
+{line}
+```
+
+<!-- picture: {made} -->
+![words](words.png)
+"""
+
+
+def follow(tmp_path, line="value 2.0 at (3, 4)", made="words.txt"):
+    (tmp_path / "page.md").write_text(PAGE.format(line=line, made=made), "utf-8")
+    return tutorials.follow(tmp_path / "page.md", tmp_path)
+
+
+def test_follow__writes_runs_compares():
+    """What a page says is held against what came; see also each case below."""
+    assert tutorials.alike("  2  a 3.0001", " 2 a 3.0002 and more")
+    assert not tutorials.alike("2 a 3.1", "2 a 3.2")
+    assert not tutorials.alike("2 a 3", "2 a")
+
+
+def test_follow__a_page_that_holds(tmp_path):
+    assert follow(tmp_path) == {"words.png": tmp_path / "words.txt"}
+    assert (tmp_path / "words.txt").read_text("utf-8") == "one\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"line": "value 2.1 at (3, 4)"}, "is not printed any more: 'value 2.1"),
+        ({"line": "values 2.0 at (3, 4)"}, "is not printed any more"),
+        ({"made": "gone.png"}, "no picture"),
+    ],
+)
+def test_follow__a_page_that_does_not_hold(tmp_path, change, said):
+    with pytest.raises(tutorials.TutorialError, match=re.escape(said)):
+        follow(tmp_path, **change)
+
+
+def test_navigation__every_page_is_in_it():
+    """The first page lists all pages, once; the site's navigation is made of its lists."""
+    docs = ROOT / "docs"
+    listed = re.findall(r"^- \[[^\]]+\]\(([^)]+)\)", (docs / "index.md").read_text("utf-8"), re.MULTILINE)
+    pages = {p.relative_to(docs).as_posix() for p in docs.rglob("*.md")} - {"index.md"}
+    assert sorted(listed) == sorted(pages)
+
+
+def test_api__has_every_public_name():
+    import magpend
+
+    spec = importlib.util.spec_from_file_location("docs_conf", ROOT / "docs" / "conf.py")
+    conf = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(conf)
+    found = [name for names in conf.grouped().values() for name in names]
+    assert len(found) == len(set(found))
+    assert set(found) == {name for name in dir(magpend) if not name.startswith("_")}
+
+
+def test_build__finds_what_is_loaded_from_elsewhere(tmp_path):
+    spec = importlib.util.spec_from_file_location("docs_build", ROOT / "docs" / "build.py")
+    build = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(build)
+    (tmp_path / "a.html").write_text(
+        '<a href="https://a.example">fine</a><script src="https://b.example/x.js"></script>'
+        '<link rel="stylesheet" href="//c.example/y.css"><link rel="canonical" href="https://d.example">'
+        '<img alt="" src="here.png">',
+        "utf-8",
+    )
+    (tmp_path / "b.css").write_text("@font-face { src: url('https://e.example/f.woff2') }", "utf-8")
+    assert build.loaded_from_elsewhere(tmp_path) == [
+        "a.html: https://b.example/x.js", "a.html: //c.example/y.css", "b.css: https://e.example/f.woff2",
+    ]  # fmt: skip
