@@ -342,12 +342,12 @@ def _exponents(shown: Shown) -> Iterator[Block]:
         yield from _drawn(shown, "convergence", "Convergence of the largest Lyapunov exponent")
 
 
-def provenance_of(run: AnalysedRun) -> Iterator[Block]:
+def provenance_of(run: AnalysedRun, spec: str = "SPEC") -> Iterator[Block]:
     """Command, digests and versions of a run, and its specification; no host and no path of a home."""
     info = run.info
     made = dict(info.versions)
     facts = {
-        "command": f"magpend run SPEC --out {shlex.quote(run.name)}",
+        "command": f"magpend run {spec} --out {shlex.quote(run.name)}",
         "digest of the specification": info.digest,
         "digest of the cube": run.digest,
         "made": info.provenance.get("created", ""),
