@@ -21,6 +21,7 @@ from tornado.simple_httpclient import SimpleAsyncHTTPClient
 from tornado.websocket import websocket_connect
 
 from pipeline.explorer import browser, page_html, server
+from pipeline.explorer.answers import ANSWERS
 from pipeline.explorer.arrays import unpack_arrays
 from pipeline.explorer.security import Guard, Rate, content_policy, new_token
 from pipeline.explorer.server import Service, application, listening
@@ -377,7 +378,7 @@ def test_api__an_unexpected_error_tells_nothing_of_the_inside(client, monkeypatc
     def fails(*arguments):
         raise RuntimeError("/home/somebody/secret")
 
-    answer = server.ANSWERS["view"]
+    answer = ANSWERS["view"]
     monkeypatch.setattr(type(answer), "give", property(lambda self: fails), raising=False)
     found = client.ask("/api/view")
     assert found.code == 500
