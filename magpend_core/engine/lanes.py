@@ -125,7 +125,7 @@ class Rows(NamedTuple):
     ahead: int  # s, from the begin of the step to where `passed` is of
     resolution: int  # s, of the instant that is looked for; 0 if none is
     level: int  # of the section
-    constants: int  # last, so that systems with few and with many agree in all other rows
+    constants: int  # last and in fours, so that systems with few and with some more agree in all other rows
     size: int
 
 
@@ -135,7 +135,7 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
     counts = [
         system.n_states, system.tableau.n_stages * system.n_states, system.n_states, *[1] * 18,
         system.n_states if n_watched else 0, *[n_watched] * 6, *[2 * n] * 3, *[n] * 3, *[1 if n else 0] * 4,
-        system.n_constants + system.n_modes,
+        -(-(system.n_constants + system.n_modes) // 4) * 4,
     ]  # fmt: skip
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
     return Rows(*(int(x) for x in offsets))

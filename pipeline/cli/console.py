@@ -218,6 +218,12 @@ class Work:
         return f"{text}, {about}{duration(left)} left" if left > 0 else f"{text}, {duration(elapsed)} so far"
 
 
+def at_rest() -> None:
+    """Show no progress any more: what follows lasts until somebody ends it."""
+    if Display.current is not None:
+        Display.current.stop()
+
+
 @contextlib.contextmanager
 def progress(name: str) -> Iterator[None]:
     """Show the progress of what is done inside, which has a name."""

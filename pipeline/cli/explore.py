@@ -28,5 +28,9 @@ def explore(
     from pipeline.explorer.browser import open_browser
     from pipeline.explorer.server import serve
 
-    console.note("the page of the run is served at the following address; Ctrl-C ends it")
-    serve(directory, port, echo=console.result, opened=None if no_browser else open_browser)
+    def serving(address: str) -> None:
+        console.at_rest()
+        console.result(address)
+        console.note("the page is at this address, for this machine alone; Ctrl-C ends it")
+
+    serve(directory, port, echo=serving, opened=None if no_browser else open_browser)

@@ -6,6 +6,7 @@ them is replaced. With ``--check`` nothing is written, and the exit code is 1 if
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 import tomllib
@@ -240,6 +241,39 @@ def virtual_rig() -> str:
     return "\n\n".join(parts)
 
 
+def study() -> str:
+    """Keys of a study."""
+    from pipeline.report import study as tables
+
+    parts = [
+        _keys("STUDY.toml", tables.StudyTable, "", ("runs", "recordings", "torques", "figures")),
+        _keys("[runs.NAME]", tables.RunTable, "", ()),
+        _keys("[recordings.NAME]", tables.RecordingTable, "", ()),
+        _keys("[torques.NAME]", tables.TorqueTable, "", ()),
+        _keys("[[figures]]", tables.FigureTable, "", ("pictures", "claims")),
+        _keys("[[figures.pictures]]", tables.PictureTable, "", ()),
+        _keys("[[figures.claims]]", tables.ClaimTable, "", ()),
+    ]
+    return "\n\n".join(parts)
+
+
+def measures() -> str:
+    """What a claim can be about, and with which options."""
+    from pipeline.report import torque_curves
+    from pipeline.report.measures import MEASURES
+
+    rows = []
+    for name, measure in MEASURES.items():
+        text = inspect.getdoc(getattr(torque_curves, measure.__name__, measure)) or ""
+        first, _, more = text.partition("\n\n")
+        rows.append((f"`{name}`", _flat(first), _flat(more.replace("``", "`"))))
+    return table(("measure", "what it is", "options and interval"), rows)
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.replace("``", "`").split())
+
+
 def _keys(head: str, model: Any, more: str, left_out: Sequence[str] = ("kind",)) -> str:
     rows = []
     for name, info in model.model_fields.items():
@@ -337,6 +371,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "mapping": mapping,
     "findings": findings,
     "virtual rig": virtual_rig,
+    "study": study,
+    "measures": measures,
     "variables": variables,
     "statuses": statuses,
     "models": models,

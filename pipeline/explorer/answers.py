@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from pipeline.explorer.diagram import diagram
 from pipeline.explorer.explored import ExploredRun, ExplorerError
+from pipeline.explorer.live import LiveRun
 from pipeline.explorer.messages import Region
 from pipeline.explorer.orbits import orbit
 from pipeline.explorer.overlays import attractors, branches, curves
@@ -19,7 +20,7 @@ from pipeline.explorer.planes import plane
 from pipeline.explorer.regions import zoom_toml
 from pipeline.explorer.tables import FORMATS, table
 from pipeline.explorer.verticals import verticals
-from pipeline.explorer.view import describe_view
+from pipeline.explorer.view import commands, describe_view
 
 JSON = "application/json; charset=utf-8"
 BINARY = "application/octet-stream"
@@ -71,7 +72,7 @@ class Reply:
     filename: str = ""
 
 
-Give = Callable[[ExploredRun, Query, bool], Reply]
+Give = Callable[[ExploredRun, Query, LiveRun | None], Reply]
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,15 @@ class Answer:
     method : str
     fresh : bool
         Whether the directory is looked at again before.
+    integrates : bool
+        Whether it takes compiled code.
     """
 
     name: str
     give: Give
     method: str = "GET"
     fresh: bool = False
+    integrates: bool = False
 
 
 def json_reply(value: Any) -> Reply:
@@ -99,39 +103,43 @@ def json_reply(value: Any) -> Reply:
     return Reply(json.dumps(value, allow_nan=False).encode(), JSON)
 
 
-def _view(run: ExploredRun, query: Query, live: bool) -> Reply:
-    return run.remembered(
-        f"view {live}", lambda: json_reply({**describe_view(run, live), "directory": run.name})
-    )
+def _view(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
+    def described() -> Reply:
+        # commands as whoever started the server can give them; an export names no folder of its maker's
+        return json_reply({**describe_view(run, live is not None), "commands": commands(run, run.name)})
+
+    return run.remembered(f"view {live is not None}", described)
 
 
-def _diagram(run: ExploredRun, query: Query, live: bool) -> Reply:
+def _diagram(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     x, y, at = query.text("x"), query.text("y"), query.at
     key = ("diagram", x, y, *sorted(run.place(at, but=x).items()))
     return run.large(repr(key), lambda: Reply(diagram(run, x, y, at), BINARY))
 
 
-def _curves(run: ExploredRun, query: Query, live: bool) -> Reply:
+def _curves(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     return json_reply(curves(run, query.text("x"), query.at))
 
 
-def _branches(run: ExploredRun, query: Query, live: bool) -> Reply:
+def _branches(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     return json_reply(branches(run, query.text("x"), query.text("y"), query.at))
 
 
-def _attractors(run: ExploredRun, query: Query, live: bool) -> Reply:
+def _attractors(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     return json_reply(attractors(run, query.at))
 
 
-def _orbit(run: ExploredRun, query: Query, live: bool) -> Reply:
-    return Reply(orbit(run, query.count("cell"), query.count("point")), BINARY)
+def _orbit(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
+    # compiling what gives multipliers would take longer than anybody waits for an orbit
+    linearised = live is None or live.is_warm("maps")
+    return Reply(orbit(run, query.count("cell"), query.count("point"), linearised=linearised), BINARY)
 
 
-def _plane(run: ExploredRun, query: Query, live: bool) -> Reply:
+def _plane(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     return Reply(plane(run, query.at), BINARY)
 
 
-def _table(run: ExploredRun, query: Query, live: bool) -> Reply:
+def _table(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     kind, form = query.text("view"), query.text("format", "csv")
     words = {name: query.count(name) for name in ("cell", "point") if name in query.words}
     asked = {"x": query.text("x", ""), "y": query.text("y", ""), "at": query.at, **words}
@@ -139,7 +147,7 @@ def _table(run: ExploredRun, query: Query, live: bool) -> Reply:
     return Reply(content, FORMATS[form], f"{kind}.{form}")
 
 
-def _zoom(run: ExploredRun, query: Query, live: bool) -> Reply:
+def _zoom(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     try:
         region = Region.model_validate_json(query.body)
     except ValidationError as error:
@@ -156,7 +164,7 @@ ANSWERS: dict[str, Answer] = {
         Answer("curves", _curves),
         Answer("branches", _branches),
         Answer("attractors", _attractors),
-        Answer("orbit", _orbit),
+        Answer("orbit", _orbit, integrates=True),
         Answer("plane", _plane),
         Answer("table", _table),
         Answer("zoom", _zoom, method="POST"),
@@ -164,7 +172,7 @@ ANSWERS: dict[str, Answer] = {
 }
 
 
-def first_answers(run: ExploredRun, live: bool) -> None:
+def first_answers(run: ExploredRun, live: LiveRun | None) -> None:
     """Prepare what the page asks for first: the view, and the diagram that it begins with."""
     with contextlib.suppress(Exception):  # whoever asks hears what is wrong
         _view(run, Query({}), live)

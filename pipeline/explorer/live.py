@@ -93,6 +93,10 @@ class LiveRun:
         """Compile and read in the background what jobs need; `tell` hears how much of it is done."""
         self._warming.begin(tell)
 
+    def is_warm(self, what: str) -> bool:
+        """Whether what work needs is compiled: ``series``, ``sections``, ``maps`` or ``attractors``."""
+        return self._warming.has_done(what)
+
     # ---- parameter points --------------------------------------------------------------------
 
     def place(self, values: Mapping[str, float], frequency: float | None) -> Place:
@@ -238,7 +242,8 @@ class Warming:
         self._live, self._lock = live, threading.Lock()
         self._thread: threading.Thread | None = None
         self._done, self._listeners = 0, list[Callable[[int, int], None]]()
-        self._steps = (self._sections, self._series, self._maps, self._attractors)
+        # the orbit behind a point is what is asked for first
+        self._steps = (self._series, self._sections, self._maps, self._attractors)
 
     def begin(self, tell: Callable[[int, int], None] | None) -> None:
         """Begin unless that was done; `tell` hears of every step from now on."""
@@ -251,6 +256,11 @@ class Warming:
                 self._thread.start()
         if tell is not None:
             tell(done, len(self._steps))
+
+    def has_done(self, what: str) -> bool:
+        """Whether a step is over, well or not."""
+        with self._lock:
+            return f"_{what}" in [step.__name__ for step in self._steps[: self._done]]
 
     def _run(self) -> None:
         for step in self._steps:

@@ -168,6 +168,7 @@ def _attrs(run: ExploredRun, cell: Cell, told: dict[str, Any], linearised: bool)
     multipliers, seconds = told["multipliers"], told["seconds"]
     if multipliers is None and linearised and cell.period:
         multipliers, seconds = linearise(cell)
+    awaited = multipliers is None and not linearised and cell.period > 0
     exponents, source = _exponents(cell, multipliers, seconds)
     names = motions_of(run.cube())
     code = int(motion_codes(cell.data))
@@ -183,6 +184,7 @@ def _attrs(run: ExploredRun, cell: Cell, told: dict[str, Any], linearised: bool)
         **{key: told[key] for key in ("attractor", "share", "low", "high")},
         "stable": None if multipliers is None else bool(np.abs(multipliers).max() < 1.0),
         "multipliers": None if multipliers is None else [[float(m.real), float(m.imag)] for m in multipliers],
+        "note": "its multipliers are not ready yet: choose it again in a moment" if awaited else None,
         "exponents": exponents,
         "exponents_from": source,
         "start": _state(run, cell.start),

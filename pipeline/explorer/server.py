@@ -89,21 +89,41 @@ class Service:
         self.live = None if self.live_problem else LiveRun(self.run)
         self.pool = ThreadPoolExecutor(THREADS, "explorer")
         self.waiting = 0
+        self.compiled: asyncio.Event | None = None
 
     def refresh(self) -> None:
         """Look again at what stands in the directory: cells and analyses may have been added."""
         self.run = self.run.refreshed()
 
     def warm(self) -> None:
-        """Begin with what the page asks for first, while the browser starts."""
-        self.pool.submit(first_answers, self.run, self.live is not None)
+        """Begin with what the page asks for first, while the browser starts.
 
-    async def work(self, function: Callable[[], Any]) -> Any:
-        """Call a function in a thread; raises `ExplorerError` if too many wait."""
+        Called in the loop that answers: those who wait for something to be compiled wait there.
+        """
+        self.pool.submit(first_answers, self.run, self.live)
+        if self.live is None:
+            return
+        live, loop = self.live, asyncio.get_running_loop()
+        self.compiled = waiting = asyncio.Event()
+
+        def tell(done: int, total: int) -> None:
+            if live.is_warm("series"):
+                with contextlib.suppress(RuntimeError):  # the loop has ended
+                    loop.call_soon_threadsafe(waiting.set)
+
+        live.warm(tell)
+
+    async def work(self, function: Callable[[], Any], *, integrates: bool = False) -> Any:
+        """Call a function in a thread; raises `ExplorerError` if too many wait.
+
+        One that integrates waits until what it needs is compiled, once, and not in these threads.
+        """
         if self.waiting >= THREADS + MOST_WAITING:
             raise TooManyError("the server has more to do than it may; try again in a moment")
         self.waiting += 1
         try:
+            if integrates and self.compiled is not None:
+                await self.compiled.wait()
             return await asyncio.get_running_loop().run_in_executor(self.pool, function)
         finally:
             self.waiting -= 1
@@ -224,10 +244,10 @@ class ApiHandler(Handler):
         def work() -> Any:
             if answer.fresh:
                 service.refresh()
-            return answer.give(service.run, query, service.live is not None)
+            return answer.give(service.run, query, service.live)
 
         try:
-            reply = await service.work(work)
+            reply = await service.work(work, integrates=answer.integrates)
         except TooManyError as error:
             self.refuse(429, str(error))
         except (StoreError, OSError) as error:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.explorer.explored import ExplorerError
 from pipeline.explorer.plain import plain
+from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim, parameter_name
 from pipeline.spec.problems import unknown_name
 
 if TYPE_CHECKING:
@@ -57,6 +60,11 @@ def _verticals(run: ExploredRun) -> list[Vertical]:
         Vertical(s.name, plain(s.symbol, s.name), s.unit, s.on_circle, "section", _state(s.name))
         for s in ordered
     ]
+    if run.spec.recorded is None:  # the drive of a recording is another one at each section
+        found += [
+            Vertical(q.name, plain(q.symbol, q.name), q.unit, False, "section", _quantity(run, q.name))
+            for q in model.quantities
+        ]
     cube = run.cube()
     if "extremes" in cube:
         for name in map(str, cube["quantity"].values):
@@ -81,6 +89,47 @@ def vertical(run: ExploredRun, name: str) -> Vertical:
 
 def _state(name: str) -> Callable[[xr.Dataset], xr.DataArray]:
     return lambda part: part["section"].sel(state=name, drop=True)
+
+
+def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArray]:
+    """A quantity of the model at the instants of the sections, from the states that are kept there."""
+    model = run.model.flow
+    column = [q.name for q in model.quantities].index(name)
+
+    def values(part: xr.Dataset) -> xr.DataArray:
+        from magpend_core.pointwise import evaluate_packed
+
+        dims = [str(d) for d in part["status"].dims]
+        section = part["section"].transpose(*dims, "period_index", "state")
+        outer = [d for d in dims if not is_start_dim(d)]
+        rows = section.transpose(*outer, ...)
+        found = np.full(rows.shape[:-1], np.nan)
+        for index in np.ndindex(*(rows.sizes[d] for d in outer)):
+            packed, hertz = _point(
+                run, {d: float(part[d].values[i]) for d, i in zip(outer, index, strict=True)}
+            )
+            states = rows.values[index].reshape(-1, len(model.states))
+            finite = np.isfinite(states).all(axis=1)
+            out = np.empty((int(finite.sum()), len(model.quantities)))
+            if len(out):
+                evaluate_packed(model.system, np.zeros(len(out)), states[finite], packed, hertz, out)
+            own = np.full(len(states), np.nan)
+            own[finite] = out[:, column]
+            found[index] = own.reshape(found[index].shape)
+        return rows.isel(state=0, drop=True).copy(data=found)
+
+    return values
+
+
+def _point(run: ExploredRun, values: Mapping[str, float]) -> tuple[np.ndarray, float]:
+    """Packed parameters of the flow, and the frequency, at values of the swept axes."""
+    changed = {parameter_name(d): v for d, v in values.items() if d != FREQUENCY_DIM}
+    own = run.parameters
+    packed = np.array([changed.get(n, own[n]) for n in run.model.flow.parameter_names], np.float64)
+    crossing, fixed = run.model.crossing, run.spec.frequency_hz
+    if crossing is not None:
+        return packed, crossing.frequency_hz
+    return packed, values[FREQUENCY_DIM] if FREQUENCY_DIM in values else float(fixed or 1.0)
 
 
 def _extreme(quantity: str, kind: str) -> Callable[[xr.Dataset], xr.DataArray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import shlex
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ def describe_view(run: Run, live: bool) -> dict[str, Any]:
         "colours": [s.describe() for s in schemes(explored)],
         "has": _has(explored),
         "planes": [list(pair) for pair in planes(explored)],
-        "commands": _commands(explored),
+        "commands": commands(explored, _name(run)),
     }
 
 
@@ -215,11 +216,11 @@ def _has(run: ExploredRun) -> dict[str, bool]:
     }
 
 
-def _commands(run: ExploredRun) -> dict[str, str]:
-    """How to get what is not there."""
-    directory = _name(run)
+def commands(run: ExploredRun, directory: str) -> dict[str, str]:
+    """Return the command that gets each analysis that the page shows and the run has not."""
+    walks = run.plan.path is not None
     return {
-        name: f"magpend analyse {name} {directory}"
+        name: f"magpend analyse {name} {shlex.quote(directory)}"
         for name in ("attractors", "branches", "basins")
-        if run.kept(name) is None and not (name == "basins" and run.plan.path is not None)
+        if run.spec.recorded is None and run.kept(name) is None and not (name == "basins" and walks)
     }

@@ -346,6 +346,7 @@ def _of_torques(name: str) -> Measure:
         found: Estimate = getattr(torque_curves, name)(results.torques(of[0]), options)
         return found
 
+    measure.__name__ = name
     return measure
 
 

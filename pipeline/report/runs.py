@@ -292,7 +292,10 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     except SpecError as error:
         yield Note(str(error))
         return
-    rows = [_with_letters(row) for row in function_of(ANALYSES[name].table)(found).rows]
+    path = str(found.attrs.get("path", ""))
+    unit = str(found[path].attrs.get("units", "1")) if path in found.coords else "1"
+    axis = f"{path} [{unit}]" if unit != "1" else path
+    rows = [_with_letters(row, axis) for row in function_of(ANALYSES[name].table)(found).rows]
     command = command_of(f"analyse {name}", options, shown.directory)
     if rows:
         yield grid_of(rows, _CAPTIONS[name], command)
@@ -305,12 +308,22 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
         yield from _drawn(shown, drawn, f"{_CAPTIONS[name]}{where}", **options, **({"at": at} if at else {}))
 
 
-def _with_letters(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row in which attractors have the letters of the figures."""
-    found = {}
+_OF_ATTRACTORS = {
+    "attractor_id": "attractor",
+    "from_id": "from attractor",
+    "to_id": "to attractor",
+    "mirror_partner": "mirror partner",
+}
+
+
+def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """Return a row in which attractors have the letters of the figures, and ends of a range their axis."""
+    found: dict[str, Any] = {}
     for name, value in row.items():
-        is_id = name in ("attractor_id", "from_id", "to_id", "mirror_partner")
-        found[name.removesuffix("_id")] = ("-" if value < 0 else letter(int(value))) if is_id else value
+        if name in _OF_ATTRACTORS:
+            found[_OF_ATTRACTORS[name]] = "-" if value < 0 else letter(int(value))
+        else:
+            found[f"{name} {path}" if path and name in ("from", "to") else name] = value
     return found
 
 

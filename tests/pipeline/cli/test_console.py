@@ -77,6 +77,15 @@ def test_progress__first_line_within_seconds_and_without_reports(monkeypatch, ca
     assert "analyse: 0." in capsys.readouterr().err
 
 
+def test_at_rest__ends_the_lines_of_a_command_that_serves(monkeypatch, capsys):
+    monkeypatch.setattr(console, "FIRST_LINE_S", 0.2)
+    with progress("explore"):
+        console.at_rest()
+        time.sleep(0.5)
+    assert capsys.readouterr().err == ""
+    console.at_rest()  # without a display there is nothing to end
+
+
 def test_track__reports_each_item():
     heard = []
     with reporting(lambda *said: heard.append(said)):

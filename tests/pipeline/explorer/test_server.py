@@ -285,6 +285,37 @@ def test_api__is_bounded_in_rate_and_in_length(client, monkeypatch):
     assert client.ask("/api/view").code == 200
 
 
+def test_api__what_integrates_waits_for_what_it_needs(client):
+    """Others are answered meanwhile: they do not wait in the threads that read."""
+
+    async def hold():
+        client.service.compiled = asyncio.Event()
+
+    async def release():
+        client.service.compiled.set()
+
+    async def asked():
+        return client.service.waiting
+
+    client.wait(hold())
+    found = []
+    orbits = [
+        threading.Thread(target=lambda: found.append(client.ask("/api/orbit?cell=99999&point=0").code))
+        for _ in range(server.THREADS + 1)
+    ]
+    for one in orbits:
+        one.start()
+    until = time.monotonic() + 20
+    while client.wait(asked()) < len(orbits) and time.monotonic() < until:
+        time.sleep(0.01)
+    assert client.ask("/api/view").code == 200
+    assert found == []
+    client.wait(release())
+    for one in orbits:
+        one.join(30)
+    assert found == [400] * len(orbits)
+
+
 def test_api__damage_is_said_and_nothing_is_shown(client, made_run):
     section = made_run / "cube.zarr" / "section"
     for file in section.rglob("*"):
@@ -400,7 +431,9 @@ def test_explore__serves_until_it_is_stopped(made_run, start):
         socket.create_connection((_other_address(), port), timeout=5).close()
     os.kill(process.pid, signal.SIGINT)
     assert process.wait(20) == 130
-    assert "stopped" in process.stderr.read()
+    said = process.stderr.read()
+    assert "stopped" in said
+    assert "so far" not in said.partition("Ctrl-C ends it")[2]
     assert {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")} == before
 
 

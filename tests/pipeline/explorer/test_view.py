@@ -156,7 +156,8 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
     assert found["starts"] == {"dims": ["x_0", "v_0"], "count": 24}
     names = [v["name"] for v in found["verticals"]]
     assert names[:2] == list(explored.model.state_names)
-    assert names[2:] == ["energy.min", "energy.max", "energy.mean"]
+    quantities = [q.name for q in explored.model.quantities]
+    assert names[2:] == [*quantities, "energy.min", "energy.max", "energy.mean"]
     assert found["planes"][0] == ["x", "v"]
     assert found["has"]["attractors"]
     assert found["has"]["basins"]
@@ -218,6 +219,20 @@ def test_diagram__has_every_point_of_the_cube(sweep, x, y):
         np.testing.assert_array_equal(own, kept.values if is_drawn else [])
         assert arrays["status"][k] == int(one["status"])
     assert len(arrays["cell"]) == status.size // cube.sizes[other]
+
+
+def test_diagram__shows_quantities_at_the_sections(sweep):
+    """The energy at the end of a period lies between its extremes over that period, and nowhere else."""
+    explored = ExploredRun.of(sweep)
+    found = [
+        unpack_arrays(diagram(explored, "frequency", y, {"A": 2}))[0]["y"]
+        for y in ("energy", "energy.min", "energy.max")
+    ]
+    energy, low, high = found
+    assert len(energy) == len(low) > 100
+    # extremes are those of the states at the steps' ends, of which the section is one
+    assert np.all((energy >= low - 1e-9) & (energy <= high + 1e-9))
+    assert np.ptp(energy) > 1e-3
 
 
 def test_diagram__colours_are_those_of_the_analyses(sweep):
@@ -409,6 +424,19 @@ def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
     assert compared
 
 
+def test_orbit__without_multipliers_says_that_they_come(walk):
+    explored = ExploredRun.of(walk)
+    assert explored.kept("attractors") is not None  # what branches rest on
+    number = some_cells(explored)[0]
+    object.__setattr__(explored, "_opened", {**explored._opened, "derived attractors": None})
+    _, attrs = unpack_arrays(orbit(explored, number, 0, linearised=False))
+    assert attrs["multipliers"] is attrs["stable"] is attrs["exponents"] is None
+    assert "in a moment" in attrs["note"]
+    _, attrs = unpack_arrays(orbit(explored, number, 0))
+    assert attrs["multipliers"]
+    assert attrs["note"] is None
+
+
 def test_orbit__exponents_of_a_flow_have_the_one_along_it(flow):
     explored = ExploredRun.of(flow)
     _, attrs = unpack_arrays(orbit(explored, some_cells(explored)[0], 0))
@@ -559,7 +587,7 @@ def test_query__takes_whole_numbers_alone(text):
 
 def test_zoom__is_a_specification_of_the_region(sweep, tmp_path):
     body = json.dumps({"x": [0.21, 0.24], "axes": ["A", "x"], "y": [0, 1], "at": {"frequency": 0}}).encode()
-    reply = ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, body), False)
+    reply = ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, body), None)
     path = tmp_path / "zoom.toml"
     path.write_bytes(reply.content)
     from pipeline.spec.parsing import load_spec
@@ -567,7 +595,7 @@ def test_zoom__is_a_specification_of_the_region(sweep, tmp_path):
     spec = load_spec(path)
     assert spec.axes["A"].array()[[0, -1]].tolist() == [0.21, 0.24]
     with pytest.raises(ExplorerError, match="x"):
-        ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, b'{"x": 3}'), False)
+        ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, b'{"x": 3}'), None)
 
 
 def test_explored_run__is_the_run(sweep):

@@ -6,12 +6,14 @@ import html as markup
 import math
 import re
 import shlex
+import shutil
 
 import pytest
 
 from pipeline.report.report import report
 from pipeline.report.stored import stored_options
 from pipeline.runs.derive import derive
+from pipeline.runs.run import run as run_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.run import Run
 
@@ -37,11 +39,9 @@ closure_tolerance = 1e-2
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    from pipeline.runs.run import run
-
     folder = tmp_path_factory.mktemp("report")
     (folder / "spec.toml").write_text(SWEEP)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda _: None)
+    run_spec(folder / "spec.toml", folder / "run", workers=0, echo=lambda _: None)
     return folder
 
 
@@ -93,6 +93,43 @@ def test_report__its_commands_work(folder, command):
         assert not re.search(r": computed", notes), c
 
 
+WALKS = """
+kind = "continuation"
+[axes]
+frequency_hz = { start = 2.05, stop = 2.11, num = 5 }
+[continuation]
+path = "frequency_hz"
+direction = "both"
+[initial_conditions]
+kind = "random"
+n = 4
+seed = 7
+psi1_deg = [-20.0, 20.0]
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 200
+n_keep = 16
+"""
+
+
+def test_report__jumps_of_walks_have_their_place(folder, command):
+    (folder / "walks.toml").write_text(WALKS)
+    run_spec(folder / "walks.toml", folder / "walks", workers=0, echo=lambda _: None)
+    html = written(command, folder, "walks")
+    found = derive(folder / "walks", "hysteresis")
+    assert found.sizes["jump"]
+    head = re.search(r"<tr><th scope=\"col\">direction</th>(.*?)</tr>", html)[1]
+    assert re.findall(r"<th scope=\"col\">(.*?)</th>", head) == [
+        "from frequency [Hz]", "to frequency [Hz]", "from attractor", "to attractor", "count",
+    ]  # fmt: skip
+    rows = re.findall(r"<tr><td>(up|down)</td><td>(.*?)</td><td>(.*?)</td><td>([A-Z])</td>", html)
+    names = [("up" if d > 0 else "down") for d in found["jump_direction"].values]
+    ends = ([f"{v:.6g}" for v in found[f"jump_{end}"].values] for end in ("from", "to"))
+    letters = [chr(65 + int(i)) for i in found["jump_from_id"].values]
+    assert rows == list(zip(names, *ends, letters, strict=True))
+
+
 def test_report__several_runs(folder, command):
     command(folder, "run", "spec.toml", "--out", "second", "--workers", "0")
     page = report([str(folder / "run"), str(folder / "second")], only_stored=True, echo=lambda _: None)
@@ -116,3 +153,8 @@ def test_stored_options__of_these_cells(folder):
     derive(run, "attractors", {"n_points": 8})
     assert stored_options(run, "attractors") == [{}, {"n_points": 8}]
     assert stored_options(run, "curves") == []
+    # what was found of other cells is not shown
+    (folder / "other.toml").write_text(SWEEP.replace("n_transient = 200", "n_transient = 210"))
+    run_spec(folder / "other.toml", folder / "other", workers=0, echo=lambda _: None)
+    shutil.copytree(folder / "run" / "derived", folder / "other" / "derived")
+    assert stored_options(Run.open(folder / "other"), "attractors") == []

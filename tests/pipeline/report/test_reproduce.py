@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
@@ -118,6 +123,28 @@ def test_reproduce__one_that_is_not_required(study, main):
     code, out, _ = main("reproduce", "mine.toml", "--out", "done", "--workers", "0")
     assert code == 0
     assert "not met: Nothing closes" in out
+
+
+@pytest.mark.slow
+def test_reproduce__goes_on_after_a_kill(study, main, tmp_path):
+    study(STUDY + FALSE.replace("required = true", ""))
+    slow = SPEC.replace("n_transient = 200", "n_transient = 1500").replace("stop_when_closed = true\n", "")
+    (tmp_path / "sweep.toml").write_text(slow + "[execution]\ntrajectories_per_task = 2\n", "utf-8")
+    code = "import sys; from pipeline.cli.main import main; sys.argv[0] = 'magpend'; main()"
+    words = ["reproduce", "mine.toml", "--out", "done", "--workers", "0"]
+    process = subprocess.Popen([sys.executable, "-c", code, *words], cwd=tmp_path, start_new_session=True)
+    commits, end = tmp_path / "done" / "runs" / "sweep" / "commits", time.monotonic() + 120
+    while not list(commits.glob("0*.json")) and time.monotonic() < end and process.poll() is None:
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "done" / "report.html").exists()
+    code, _, err = main(*words)
+    assert code == 0, err
+    assert "cells done before" in err
+    killed = (tmp_path / "done" / "claims.json").read_bytes()
+    assert main(*words[:3], "whole", "--workers", "0")[0] == 0
+    assert killed == (tmp_path / "whole" / "claims.json").read_bytes()
 
 
 def test_load_study__all_that_is_wrong(study):

@@ -445,3 +445,21 @@ def test_run__credentials_are_nowhere(s3, write_spec, magpend, environment, tmp_
     texts += [path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()]
     assert not [text for text in texts if SECRET.encode() in text or KEY_ID.encode() in text]
     assert any(KEY_ID in header for _, _, header in s3.requests)
+
+
+def test_explorer__reads_a_run_there_as_in_a_folder(whole, made):
+    from pipeline.explorer.diagram import diagram
+    from pipeline.explorer.explored import ExploredRun
+    from pipeline.explorer.view import describe_view
+
+    for task in range(made.plan.n_tasks):
+        made.commit(task)
+    there, here = ExploredRun.of(PLACE), ExploredRun.of(made.info.directory)
+    views = [describe_view(run, False) for run in (there, here)]
+    assert views[0]["name"] == PLACE.rpartition("/")[2]
+    assert "one" in views[0]["commands"]["attractors"]
+    named = {"name": "", "commands": {}}
+    assert views[0] | named == views[1] | named
+    points = [diagram(run, "frequency", "psi1", {"q": 1}) for run in (there, here)]
+    assert points[0] == points[1]
+    assert there.refreshed() is there

@@ -11,31 +11,26 @@ export function shapesOf(points) {
 }
 
 /**
- * Paint branches: solid where stable, dashed where not, and a mark at each bifurcation.
+ * Paint branches: solid where stable, dashed where not. The stable ones lie under the points, which tell where
+ * orbits were found, by whom they are reached; the others over them.
  * @param {CanvasRenderingContext2D} ctx
  * @param {Object} box
  * @param {number[]} bounds
  * @param {{branches: Object[], points: Object[]}} found of api/branches
  * @param {Object} colours
+ * @param {boolean} stable which of them
  */
-export function paintBranches(ctx, box, bounds, found, colours) {
+export function paintBranches(ctx, box, bounds, found, colours, stable) {
   ctx.lineJoin = "round";
-  for (const stable of [false, true]) {
-    ctx.beginPath();
-    for (const branch of found.branches) {
-      for (const segment of branch.segments) if (segment.stable === stable) trace(ctx, box, bounds, segment);
-    }
-    ctx.setLineDash([]);
-    ctx.strokeStyle = colours.card;
-    ctx.lineWidth = 3.5;
-    if (stable) ctx.stroke();
-    ctx.setLineDash(stable ? [] : [5, 4]);
-    ctx.strokeStyle = colours.ink;
-    ctx.lineWidth = 1.5;
-    ctx.stroke();
+  ctx.beginPath();
+  for (const branch of found.branches) {
+    for (const segment of branch.segments) if (segment.stable === stable) trace(ctx, box, bounds, segment);
   }
+  ctx.setLineDash(stable ? [] : [5, 4]);
+  ctx.strokeStyle = colours.ink;
+  ctx.lineWidth = 1.2;
+  ctx.stroke();
   ctx.setLineDash([]);
-  paintPoints(ctx, box, bounds, found.points, colours);
 }
 
 function trace(ctx, box, bounds, { x, y }) {
@@ -53,7 +48,8 @@ function trace(ctx, box, bounds, { x, y }) {
   }
 }
 
-function paintPoints(ctx, box, bounds, points, colours) {
+/** Paint a mark at each bifurcation, with its label where there is room. */
+export function paintBifurcations(ctx, box, bounds, { points }, colours) {
   const shapes = shapesOf(points), taken = [];
   ctx.lineWidth = 1.5;
   ctx.textBaseline = "bottom";

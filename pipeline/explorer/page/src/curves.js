@@ -59,7 +59,7 @@ class Strip {
   constructor(group, curves) {
     Object.assign(this, { group, owner: curves, curves: [], width: 0, height: 0 });
     this.canvas = el("canvas", { role: "img", "aria-label": GROUPS[group] });
-    this.names = el("ul", { class: "curve-names" });
+    this.names = el("ul", { class: "curve-names", tabindex: "0", "aria-label": `${GROUPS[group]}, what is drawn` });
     this.plot = el("div", { class: "strip-plot" }, this.canvas);
     this.element = el("section", { class: "strip", "aria-label": GROUPS[group], hidden: true }, this.names, this.plot);
     this.gestures = new Gestures(this.plot, {
@@ -127,7 +127,7 @@ class Strip {
   }
 
   range(x0, x1) {
-    if (this.group === "fractions") return [0, 1];
+    if (this.group === "fractions") return [-0.05, 1.05];
     let [low, high] = [0, 0];
     for (const { x, y } of this.curves) {
       for (let i = 0; i < x.length; i++) {

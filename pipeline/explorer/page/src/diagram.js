@@ -2,7 +2,7 @@
 // wheel, fingers and keys do with it.
 
 import { FONT, boxOf, paintAxes, paintFrame, placeX, placeY, told } from "./axes.js";
-import { bifurcationAt, paintBranches } from "./branches.js";
+import { bifurcationAt, paintBifurcations, paintBranches } from "./branches.js";
 import { el } from "./dom.js";
 import { Gestures, bounded } from "./gestures.js";
 import { onKey } from "./keyboard.js";
@@ -237,8 +237,12 @@ export class Diagram {
     ctx.beginPath();
     ctx.rect(box.left, box.top, box.width, box.height);
     ctx.clip();
+    if (this.branches) paintBranches(ctx, box, this.window, this.branches, colours, true);
     points();
-    if (this.branches) paintBranches(ctx, box, this.window, this.branches, colours);
+    if (this.branches) {
+      paintBranches(ctx, box, this.window, this.branches, colours, false);
+      paintBifurcations(ctx, box, this.window, this.branches, colours);
+    }
     ctx.restore();
     paintFrame(ctx, box, colours);
   }

@@ -48,3 +48,17 @@ export function labelledSelect(text, options, value, onchange) {
   select.value = value;
   return { element: el("span", { class: "field" }, el("label", { for: id, text }), select), select };
 }
+
+/** A number as a field shows it: six significant digits. */
+export function shortened(value) {
+  return Number(value.toPrecision(6));
+}
+
+/** A number with its label; `change` takes what is a number. */
+export function numberField(text, value, change) {
+  const id = freshId("number");
+  const input = el("input", { id, type: "number", step: "any", value: shortened(value), on: {
+    change: () => Number.isFinite(input.valueAsNumber) && change(input.valueAsNumber),
+  } });
+  return el("span", { class: "field" }, el("label", { for: id, text }), input);
+}

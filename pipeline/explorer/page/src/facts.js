@@ -45,7 +45,7 @@ export function attractorName(id, view) {
 
 function parameterRows(orbit, view) {
   const { attrs } = orbit, found = [];
-  const swept = new Set(view.axes.map((axis) => axis.name));
+  const swept = new Set(view.axes.flatMap((axis) => [axis.name, axis.parameter]));
   if (attrs.frequency !== null && attrs.frequency !== undefined) found.push(["frequency [Hz]", number(attrs.frequency, 7), true]);
   for (const parameter of view.model.parameters) {
     const value = attrs.parameters?.[parameter.name];

@@ -6,6 +6,11 @@ import { Orbit, withUnit } from "./orbit.js";
 
 const STEPS = 1000, FREQUENCY = "frequency";
 
+/** Whether an axis is that of a parameter, or of the drive's frequency. */
+function isOf(axis, name) {
+  return axis.name === name || axis.parameter === name;
+}
+
 export class Follow {
   /**
    * @param {Element} body
@@ -16,8 +21,8 @@ export class Follow {
   constructor(body, view, live, panels) {
     Object.assign(this, { view, live, panels, orbit: null, from: null, wanted: null, busy: false });
     this.choices = this.parameters();
-    const first = view.axes.find((axis) => this.choices.some((entry) => entry.name === axis.name));
-    this.parameter = this.choices.find((entry) => entry.name === first?.name) ?? this.choices[0];
+    const first = view.axes.find((axis) => axis.path) ?? view.axes[0];
+    this.parameter = this.choices.find((entry) => first && isOf(first, entry.name)) ?? this.choices[0];
     this.build(body);
   }
 
@@ -27,7 +32,7 @@ export class Follow {
 
   parameters() {
     const found = this.view.model.parameters.map((entry) => ({ ...entry, text: withUnit(entry) }));
-    if (this.view.model.forced) found.unshift({ name: FREQUENCY, label: "frequency", unit: "Hz", text: "frequency [Hz]", low: 0, high: null });
+    if (this.view.model.forced) found.unshift({ name: FREQUENCY, label: "frequency", unit: "Hz", text: "frequency [Hz]" });
     return found;
   }
 
@@ -65,15 +70,14 @@ export class Follow {
     return (this.parameter.name === FREQUENCY ? orbit.attrs.frequency : orbit.attrs.parameters?.[this.parameter.name]) ?? this.parameter.value;
   }
 
-  /** Bounds of the slider: what the run sweeps, else a third to either side. */
+  /** Bounds of the slider: what the run sweeps, or what the view proposes; else a third to either side. */
   arrange() {
-    const value = this.valueOf(this.orbit), axis = this.view.axes.find((entry) => entry.name === this.parameter.name);
+    const value = this.valueOf(this.orbit), { name, low, high } = this.parameter;
+    const axis = this.view.axes.find((entry) => isOf(entry, name));
     const reach = Math.abs(value) / 3 || 1;
-    let [low, high] = [value - reach, value + reach];
-    if (axis?.values.length > 1) [low, high] = [Math.min(...axis.values), Math.max(...axis.values)];
-    const bounded = (bound, fallback) => (bound === null || bound === undefined ? fallback : bound);
-    this.low = Math.max(low, bounded(this.parameter.low, -Infinity));
-    this.high = Math.min(high, bounded(this.parameter.high, Infinity));
+    [this.low, this.high] = [value - reach, value + reach];
+    if (axis?.values.length > 1) [this.low, this.high] = [Math.min(...axis.values), Math.max(...axis.values)];
+    else if (low < value && value < high) [this.low, this.high] = [low, high];
     this.mark(value);
   }
 

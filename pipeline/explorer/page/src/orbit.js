@@ -74,7 +74,7 @@ export function indicesOf(orbit, view) {
   if (orbit.attrs.at) return orbit.attrs.at;
   const at = {};
   for (const axis of view.axes) {
-    const value = axis.name === "frequency" ? orbit.attrs.frequency : orbit.attrs.parameters?.[axis.name];
+    const value = axis.name === "frequency" ? orbit.attrs.frequency : orbit.attrs.parameters?.[axis.parameter ?? axis.name];
     if (value === undefined || value === null) continue;
     at[axis.name] = axis.values.reduce((best, v, i) => (Math.abs(v - value) < Math.abs(axis.values[best] - value) ? i : best), 0);
   }

@@ -1,10 +1,11 @@
 // The plane of initial states at a parameter value: where its starts lead, as far as that is computed. A slice
 // is computed while one watches; a click integrates that start.
 
-import { el, freshId, labelledSelect, show } from "./dom.js";
-import { extent, Frame } from "./frame.js";
+import { el, labelledSelect, numberField, shortened, show } from "./dom.js";
+import { Frame } from "./frame.js";
 import { number } from "./facts.js";
 import { axisOf, indicesOf } from "./orbit.js";
+import { idAt, imageOf, mapOf } from "./plane-map.js";
 import { brokenLines } from "./wrapping.js";
 
 const MOST_KEPT = 12;
@@ -70,6 +71,9 @@ export class Plane {
     this.stop = el("button", { type: "button", text: "Cancel", hidden: true, on: { click: () => this.job?.cancel() } });
     this.progress = el("progress", { max: 1, value: 0, hidden: true, "aria-label": "Slice" });
     this.bounds = el("div", { class: "bounds" });
+    this.startFields = el("span", { class: "starts" });
+    const begin = el("button", { type: "button", text: "Integrate this start", on: { click: () => this.begin(this.cross ?? this.middle) } });
+    body.append(el("div", { class: "controls" }, this.startFields, begin));
     const more = el("details", {}, el("summary", { text: "Bounds, and the other states" }), this.bounds);
     body.append(el("div", { class: "controls" }, this.compute, this.resolution.element, this.stop), this.progress, more);
   }
@@ -103,6 +107,7 @@ export class Plane {
     if (place === this.place) return;
     this.place = place;
     this.job?.cancel();
+    this.cross = null;
     this.forgetStart();
     const kept = this.kept.get(place);
     this.take(kept?.map ?? null);
@@ -153,22 +158,40 @@ export class Plane {
     return fixed;
   }
 
+  get middle() {
+    const [x0, x1, y0, y1] = this.limits;
+    return [(x0 + x1) / 2, (y0 + y1) / 2];
+  }
+
+  /** Fields of the start that is integrated next: where the cross is. */
+  fillStart() {
+    const place = this.cross ?? this.middle;
+    const fields = this.pair.map((name, k) => numberField(`Start ${this.named(name)}`, place[k], (value) => {
+      const other = this.cross ?? this.middle;
+      this.putCross(k ? [other[0], value] : [value, other[1]]);
+    }));
+    this.startFields.replaceChildren(...fields);
+  }
+
+  putCross(place) {
+    this.cross = place;
+    this.read(place);
+    this.startFields.querySelectorAll("input").forEach((input, k) => {
+      if (input.valueAsNumber !== place[k]) input.value = shortened(place[k]);
+    });
+    this.frame.refresh();
+  }
+
   fillBounds() {
-    const field = (text, value, change) => {
-      const id = freshId("number");
-      const input = el("input", { id, type: "number", step: "any", value: Number(value.toPrecision(6)), on: {
-        change: () => Number.isFinite(input.valueAsNumber) && change(input.valueAsNumber),
-      } });
-      return el("span", { class: "field" }, el("label", { for: id, text }), input);
-    };
+    this.fillStart();
     const bound = (k) => (value) => {
       const limits = [...this.limits];
       limits[k] = value;
       if (limits[0] < limits[1] && limits[2] < limits[3]) this.frame.fit(...(this.limits = limits), 0);
     };
     const words = ["from", "to"];
-    const fields = this.limits.map((value, k) => field(`${this.named(this.pair[k >> 1])} ${words[k % 2]}`, value, bound(k)));
-    for (const [name, value] of Object.entries(this.fixed)) fields.push(field(this.named(name), value, (given) => (this.fixed[name] = given)));
+    const fields = this.limits.map((value, k) => numberField(`${this.named(this.pair[k >> 1])} ${words[k % 2]}`, value, bound(k)));
+    for (const [name, value] of Object.entries(this.fixed)) fields.push(numberField(this.named(name), value, (given) => (this.fixed[name] = given)));
     this.bounds.replaceChildren(...fields);
   }
 
@@ -274,12 +297,9 @@ export class Plane {
 
   moveCross(dx, dy) {
     if (!this.frame.limits) return;
-    const [x0, x1, y0, y1] = this.limits;
-    const [x, y] = this.cross ?? [(x0 + x1) / 2, (y0 + y1) / 2];
+    const [x0, x1, y0, y1] = this.limits, [x, y] = this.cross ?? this.middle;
     const held = (value, low, high) => Math.min(high, Math.max(low, value));
-    this.cross = [held(x + (dx * (x1 - x0)) / 100, x0, x1), held(y + (dy * (y1 - y0)) / 100, y0, y1)];
-    this.read(this.cross);
-    this.frame.refresh();
+    this.putCross([held(x + (dx * (x1 - x0)) / 100, x0, x1), held(y + (dy * (y1 - y0)) / 100, y0, y1)]);
   }
 
   read(place) {
@@ -309,8 +329,7 @@ export class Plane {
   /** Integrate the start at a place of the plane. */
   async begin(place) {
     if (!place || !this.orbit) return;
-    this.cross = place;
-    this.read(place);
+    this.putCross(place);
     this.forgetStart();
     const start = { ...this.fixed, [this.pair[0]]: place[0], [this.pair[1]]: place[1] };
     this.told.textContent = "Integrating this start ...";
@@ -404,54 +423,6 @@ export class Plane {
     if (resolution < wanted) this.told.textContent = `${resolution} × ${resolution} of ${wanted} × ${wanted} starts`;
     this.frame.repaint();
   }
-}
-
-/** What a plane holds: a grid of labels or single starts, and the box that they fill. */
-function mapOf({ attrs, arrays }, box = null) {
-  const { u, v, label, starts, start_label: ids } = arrays;
-  const common = { states: attrs.states, fixed: attrs.fixed ?? {}, labels: attrs.labels ?? [], source: attrs.source };
-  if (attrs.source && label?.length) return { ...common, u, v, label, box: box ?? [...edges(u), ...edges(v)] };
-  if (!ids?.length) return null;
-  const [su, sv] = [0, 1].map((k) => Array.from(ids, (_, i) => starts[2 * i + k]));
-  return { ...common, u: su, v: sv, dots: Array.from(ids), box: [...widened(su), ...widened(sv)] };
-}
-
-/** Id at a place of a grid of labels; null beyond it. */
-function idAt({ u, v, label, box: [x0, x1, y0, y1] }, x, y) {
-  const i = Math.floor(((x - x0) / (x1 - x0)) * u.length), j = Math.floor(((y - y0) / (y1 - y0)) * v.length);
-  return i < 0 || j < 0 || i >= u.length || j >= v.length ? null : label[j * u.length + i];
-}
-
-function widened(values) {
-  const [low, high] = extent(values), room = 0.08 * (high - low) || 0.5;
-  return [low - room, high + room];
-}
-
-/** Outer bounds of cells whose centres these are. */
-function edges(values) {
-  const n = values.length, first = values[0], last = values[n - 1];
-  const half = n > 1 ? (last - first) / (n - 1) / 2 : 0.5;
-  return [first - half, last + half];
-}
-
-/** Labels as colours, one pixel each; where there is none yet, what is `below` shines through. */
-function imageOf({ u, v, label, labels }, below = null) {
-  const [nu, nv] = [u.length, v.length];
-  const canvas = document.createElement("canvas");
-  [canvas.width, canvas.height] = [nu, nv];
-  const ctx = canvas.getContext("2d");
-  ctx.imageSmoothingEnabled = false;
-  if (below) ctx.drawImage(below, 0, 0, nu, nv);
-  const image = ctx.getImageData(0, 0, nu, nv);
-  const colours = new Map(labels.map((entry) => [entry.id, [1, 3, 5].map((k) => parseInt(entry.colour.slice(k, k + 2), 16))]));
-  for (let j = 0; j < nv; j++) {
-    for (let i = 0; i < nu; i++) {
-      const colour = colours.get(label[j * nu + i]);
-      if (colour) image.data.set([...colour, 255], 4 * ((nv - 1 - j) * nu + i));
-    }
-  }
-  ctx.putImageData(image, 0, 0);
-  return canvas;
 }
 
 function sourceSentence({ source, fixed, u, v, dots }) {

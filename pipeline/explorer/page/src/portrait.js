@@ -186,9 +186,13 @@ export class Portraits {
     const names = [...view.model.states, ...(view.model.quantities ?? [])];
     if (names.length < 3) return;
     const options = names.map((entry) => [entry.name, entry.label || entry.name]);
-    const change = () => this.replace(across.select.value ? [across.select.value, upwards.select.value] : null, clock);
+    const change = () => {
+      upwards.element.hidden = !across.select.value;
+      this.replace(across.select.value ? [across.select.value, upwards.select.value] : null, clock);
+    };
     const across = labelledSelect("Another: across", [["", "none"], ...options], "", change);
     const upwards = labelledSelect("upwards", options, names[1].name, change);
+    upwards.element.hidden = true;
     body.append(el("div", { class: "controls" }, across.element, upwards.element));
   }
 

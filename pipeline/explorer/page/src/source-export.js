@@ -175,8 +175,13 @@ export class ExportSource {
     return tableOf(this, kind, query);
   }
 
-  async zoom() {
-    throw new SourceError(`A copy computes nothing. Where the run is, give: magpend zoom ${this.described.name} --help`);
+  /** A copy writes no specification; it says what does. */
+  async zoom({ x, axes, at = {} }) {
+    const name = axes?.[0] ?? this.described.axes[0].name, digits = (value) => String(Number(value.toPrecision(7)));
+    const pins = this.described.axes.filter((axis) => axis.name !== name && axis.values.length > 1)
+      .map((axis) => ` --at ${axis.name}=${axis.values[at[axis.name] ?? 0]}`);
+    const command = `magpend zoom ${this.described.name} --axis ${name}=${digits(x[0])}:${digits(x[1])}${pins.join("")} --out closer.toml`;
+    throw new SourceError(`A copy computes nothing. Where the run is, this command writes the specification: ${command}`);
   }
 }
 

@@ -1,8 +1,8 @@
 """A real browser before a real explorer: chromium by playwright, a small run, its page served on loopback.
 
-The run is computed once; `browser` starts chromium once for each file of tests (playwright's event loop counts as
-running in its thread while it is there, so that it must end before other tests begin). Where there is no chromium
-or no playwright the tests say so and are skipped.
+The run is computed once; `browser` starts chromium once for each file of tests: playwright's event loop
+counts as running in its thread while it is there, so that it must end before other tests begin. Where there
+is no chromium or no playwright the tests say so and are skipped.
 """
 
 from __future__ import annotations
@@ -85,7 +85,9 @@ class Opened:
 
         self.page.on("console", console)
         self.page.on("pageerror", lambda error: self.complaints.append(f"script: {error}"))
-        self.page.on("requestfailed", lambda asked: self.complaints.append(f"request: {asked.url} {asked.failure}"))
+        self.page.on(
+            "requestfailed", lambda asked: self.complaints.append(f"request: {asked.url} {asked.failure}")
+        )
         self.page.on("request", request)
 
 

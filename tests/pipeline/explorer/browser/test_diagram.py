@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -485,3 +486,27 @@ def test_diagram__ten_million_points(visit: Callable[..., Any], tmp_path: Path) 
         assert np.linalg.norm(chosen - target) <= nearest(places, target)[0] + 1e-6
         assert opened.complaints == []
         assert opened.outside == []
+
+
+def test_diagram__zoom_here_gives_the_window_as_a_specification_and_runs_it(
+    page: Any, looked_at: Path
+) -> None:
+    one = page.page
+    one.evaluate("magpend.diagram.moveTo([2.22, 2.28, ...magpend.diagram.window.slice(2)])")
+    settled(one)
+    menu = one.locator(".toolbar summary", has_text="Zoom here")
+    menu.click()
+    with one.expect_download() as waiting:
+        one.get_by_role("button", name="Download its specification").click()
+    spec = tomllib.loads(Path(waiting.value.path()).read_text("utf-8"))
+    axis = spec["axes"]["frequency_hz"]
+    assert (axis["start"], axis["stop"]) == pytest.approx((2.22, 2.28))
+    before = set(looked_at.parent.iterdir())
+    menu.click()
+    one.get_by_role("button", name="Run it here").click()
+    until(one, "document.querySelector('.progress-line')?.textContent.includes('Computed')")
+    (new,) = {path for path in looked_at.parent.iterdir() if path.is_dir()} - before
+    assert new.name in one.locator(".progress-line").inner_text()
+    computed = open_run(new)["frequency"].values
+    assert (computed.min(), computed.max()) == pytest.approx((2.22, 2.28))
+    assert page.complaints == []

@@ -1,0 +1,222 @@
+"""The panels in a real browser: what they show is in the cube, what they compute ends as it says."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pipeline.layout.letters import letter
+from pipeline.runs.derive import stored
+from pipeline.store.reading import open_run
+from pipeline.store.run import Run
+from tests.pipeline.explorer.browser.conftest import HOSTILE, WAIT_MS
+from tests.pipeline.explorer.browser.test_diagram import click_on, drawn, places_of
+
+SOURCES = Path(__file__).parents[4] / "pipeline" / "explorer" / "page" / "src"
+
+QUIET = {"reduced_motion": "reduce"}  # no drawing moves unasked, so that time stands at the section
+
+
+@pytest.fixture(scope="module")
+def cube(looked_at: Path) -> xr.Dataset:
+    return open_run(looked_at).load()
+
+
+@pytest.fixture(scope="module")
+def owners(looked_at: Path, cube: xr.Dataset) -> np.ndarray:
+    """Attractor of each cell, in C order."""
+    found = stored(Run.open(looked_at), "attractors")
+    assert found is not None
+    return found["attractor_id"].transpose(*cube["status"].dims).values.ravel()
+
+
+@pytest.fixture
+def page(visit: Callable[..., Any], explorer: str) -> Any:
+    return drawn(visit(explorer, **QUIET))
+
+
+def cells_of(cube: xr.Dataset) -> list[dict[str, float]]:
+    """Start and frequency of every cell, in C order."""
+    status = cube["status"]
+    mesh = np.meshgrid(*(cube[d].values for d in status.dims), indexing="ij")
+    columns = {d: grid.ravel() for d, grid in zip(status.dims, mesh, strict=True)}
+    return [{d: float(column[i]) for d, column in columns.items()} for i in range(status.size)]
+
+
+def choose(opened: Any, cell: int, point: int = 0) -> None:
+    """Select a point of a cell as the address does, and wait for its orbit."""
+    opened.page.evaluate("(selected) => magpend.state.set({ selected })", {"cell": cell, "point": point})
+    opened.page.locator(".panel-facts dd").first.wait_for()
+
+
+def fact(opened: Any, name: str) -> str:
+    """What stands beside a name in the card of facts."""
+    return str(
+        opened.page.locator(".panel-facts dt", has_text=name)
+        .locator("xpath=following-sibling::dd[1]")
+        .text_content()
+    )
+
+
+def numbers(text: str) -> list[float]:
+    return [float(found.replace("−", "-")) for found in re.findall(r"= (−?[\d.]+(?:e−?\d+)?)", text)]
+
+
+def note_of(opened: Any, panel: str, pattern: str) -> str:
+    """Wait until a panel says something, and return what it says."""
+    place = opened.page.locator(f".panel-{panel} .note", has_text=re.compile(pattern))
+    place.first.wait_for(timeout=WAIT_MS)
+    return str(place.first.text_content())
+
+
+def test_click__shows_the_orbit_of_the_cube(page, cube, owners):
+    periodic = np.flatnonzero((cube["orbit_period"].values.ravel() == 1) & (owners >= 0))
+    cell = int(periodic[0])
+    section = cube["section"].transpose(*cube["status"].dims, "period_index", "state").values
+    section = section.reshape(-1, *section.shape[-2:])
+    own = cells_of(cube)[cell]
+    page.page.evaluate("magpend.state.set({ y: 'psi1' })")
+    x, y = np.array([own["frequency"]]), section[cell, :1, 0]
+    click_on(page.page, places_of(page.page, x, y)[0])
+    page.page.locator(".panel-facts dd").first.wait_for()
+    selected = page.page.evaluate("magpend.state.get().selected")
+    point = section[selected["cell"], selected["point"]]
+    assert abs(point[0] - y[0]) < 1e-3  # a pixel
+    assert float(fact(page, "frequency")) == pytest.approx(own["frequency"])
+    assert fact(page, "Period") == "1 drive period"
+    assert fact(page, "Attractor").startswith(f"{letter(int(owners[selected['cell']]))}:")
+    shown = numbers(page.page.locator(".panel-series output").text_content())
+    # four significant digits, at the section's own instant; the angles of the cube are within half a turn
+    assert shown == pytest.approx(point.tolist(), rel=1e-3)
+    assert page.page.locator(".panel-multipliers .value").count() == 4
+    assert page.complaints == []
+    assert page.outside == []
+
+
+def test_live_start__ends_on_the_label_of_the_cube(page, cube, owners):
+    starts = cells_of(cube)
+    closed = {int(owners[i]): i for i in range(len(starts)) if cube["orbit_period"].values.ravel()[i] == 1}
+    assert len(closed) > 1, "the run has no two attractors to tell apart"
+    for attractor, cell in list(closed.items())[:2]:
+        choose(page, cell)
+        assert fact(page, "Attractor").startswith(f"{letter(attractor)}:")
+        for label, state in (("Start ψ₁", "psi1_0"), ("Start ψ₂", "psi2_0")):
+            field = page.page.get_by_label(label, exact=True)
+            field.fill(repr(starts[cell][state]))
+            field.press("Tab")
+        page.page.get_by_role("button", name="Integrate this start").click()
+        assert f"ends on {letter(attractor)}:" in note_of(page, "plane", "ends on")
+        assert page.page.locator(".panel-plane .readout").text_content() != ""
+    assert page.complaints == []
+
+
+def test_plane__is_walked_by_keys_and_started_in(page):
+    choose(page, 0)
+    plane = page.page.get_by_role("application", name="Plane of initial states")
+    plane.focus()
+    before = numbers(page.page.locator(".panel-plane .readout").text_content())
+    plane.press("ArrowRight")
+    plane.press("Shift+ArrowUp")
+    after = numbers(page.page.locator(".panel-plane .readout").text_content())
+    assert after[0] > before[0]
+    assert after[1] > before[1]
+    plane.press("Enter")
+    assert "ends on" in note_of(page, "plane", "ends on")
+
+
+def test_slice__is_refined_and_can_be_cancelled(page):
+    choose(page, 0)
+    page.page.get_by_label("Cells").select_option("512")
+    page.page.get_by_role("button", name="Compute this slice").click()
+    note_of(page, "plane", r"\d+ × \d+ of 512 × 512 starts")
+    assert page.page.locator(".panel-plane .legend li").count() > 0
+    page.page.get_by_role("button", name="Cancel").click()
+    assert "Cancelled" in note_of(page, "plane", "Cancelled")
+    assert page.page.get_by_role("button", name="Compute this slice").is_enabled()
+
+
+def test_follow__takes_the_orbit_along_and_back(page, cube, owners):
+    cell = int(np.flatnonzero((cube["orbit_period"].values.ravel() == 1) & (owners >= 0))[0])
+    choose(page, cell)
+    before = fact(page, "frequency")
+    field = page.page.locator(".panel-follow").get_by_label("Value")
+    field.fill("2.21")
+    field.press("Tab")
+    assert "stable" in note_of(page, "follow", "Followed to")
+    assert float(fact(page, "frequency")) == pytest.approx(2.21)
+    page.page.get_by_role("button", name="Back to the run's orbit").click()
+    assert fact(page, "frequency") == before
+    assert page.complaints == []
+
+
+def test_controls__all_have_names_and_time_obeys_keys(page):
+    choose(page, 0)
+    unnamed = page.page.evaluate(
+        """() => [...document.querySelectorAll('.panels :is(button, input, select, summary, [tabindex])')]
+        .filter((e) => !(e.getAttribute('aria-label') || e.textContent.trim() || e.labels?.length))
+        .map((e) => e.outerHTML)"""
+    )
+    assert unnamed == []
+    slider = page.page.get_by_role("slider", name="Time")
+    slider.focus()
+    slider.press("End")
+    told = page.page.locator(".panel-series output").text_content()
+    assert not told.startswith("t = 0.000 s")
+    play = page.page.get_by_role("button", name="Play")
+    play.focus()
+    play.press("Space")
+    page.page.get_by_role("button", name="Pause").wait_for()
+
+
+def test_hostile_title__stays_text(page):
+    choose(page, 0)
+    assert HOSTILE in page.page.locator("h1").text_content()
+    assert page.page.locator("img").count() == 0
+    assert "run by a title" not in page.page.title().replace(HOSTILE, "")
+    assert page.complaints == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_narrow_page__fits_and_is_touched(visit, explorer, scheme):
+    opened = drawn(visit(explorer, width=390, height=844, color_scheme=scheme, has_touch=True, **QUIET))
+    opened.page.evaluate("magpend.state.set({ panel: 'orbit', selected: { cell: 0, point: 0 } })")
+    opened.page.locator(".panel-facts dd").first.wait_for()
+    assert opened.page.evaluate("document.documentElement.scrollWidth") <= 390
+    sizes = opened.page.evaluate(
+        """() => [...document.querySelectorAll('.panels :is(button, select, summary)')]
+        .map((e) => e.getBoundingClientRect()).filter((r) => r.width > 0).map((r) => r.height)"""
+    )
+    assert min(sizes) >= 44
+    opened.page.get_by_role("button", name="Play").tap()
+    opened.page.get_by_role("button", name="Pause").wait_for()
+
+
+def test_broken_lines__draw_nothing_across_the_circle(browser):
+    source = (SOURCES / "wrapping.js").read_text("utf-8")
+    context = browser.new_context()
+    lines = context.new_page().evaluate(
+        """async (source) => {
+            const blob = new Blob([source], { type: 'text/javascript' });
+            const { brokenLines, wrappingOf } = await import(URL.createObjectURL(blob));
+            const angle = Float64Array.from({ length: 200 }, (_, i) => 0.1 * i), rate = angle.map(Math.cos);
+            const plain = { shift: 0, cut: false };
+            const turning = brokenLines(angle, rate, wrappingOf(angle, true), plain);
+            const swing = angle.map((a) => 7 + Math.sin(a));
+            return { turning, swinging: brokenLines(swing, rate, wrappingOf(swing, true), plain) };
+        }""",
+        source,
+    )
+    context.close()
+    for line in lines["turning"]:
+        x = np.array(line[::2])
+        assert np.abs(x).max() <= np.pi + 1e-12
+        assert np.abs(np.diff(x)).max() <= 0.1 + 1e-12
+    assert len(lines["turning"]) == 4  # 19.9 rad go through half a turn three times
+    assert len(lines["swinging"]) == 1
+    assert max(map(abs, lines["swinging"][0][::2])) < np.pi  # brought next to 0 by a full turn
