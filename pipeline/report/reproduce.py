@@ -110,7 +110,6 @@ def reproduce(
         As `pipeline.runs.run.run`; what was committed stays, and the same call goes on.
     """
     chosen = _chosen(study, figures)
-    folder.mkdir(parents=True, exist_ok=True)
     results = Results(study, folder, smoke=smoke, workers=workers, echo=echo)
     results.prepare({name for figure in chosen for name in figure.needs})
     with stoppable(str(folder)):
@@ -149,7 +148,7 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
         raise SpecError([f"figure {figure}: {claim.measure} lacks the option {error}."]) from None
     plain, reason = judged(found.low, found.high, claim.least, claim.most), ""
     if found.missing:
-        plain, reason = Verdict.UNDECIDED, f"Not measured: {found.missing}."
+        plain, reason = Verdict.UNDECIDED, f"Not measured: {found.missing}.{_decides(claim)}"
     elif claim.step and found.step and found.step > claim.step * (1 + 1e-6):
         plain = Verdict.UNDECIDED
         reason = f"The axis has steps of {found.step:.4g}; {claim.step:g} and less decide."
@@ -161,6 +160,14 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
         agrees = "agrees with it" if plain is Verdict.MET else "contradicts it"
         return Judgement(figure, claim, found, Verdict.CALIBRATED, plain, f"What came out {agrees}.")
     return Judgement(figure, claim, found, Verdict.CALIBRATED if claim.calibrated else plain, plain, reason)
+
+
+def _decides(claim: ClaimTable) -> str:
+    """Say what would decide a claim that was not measured."""
+    steps = f"steps of {claim.step:g} and less" if claim.step else ""
+    cells = f"{claim.n} cells and more" if claim.n else ""
+    both = " with ".join(part for part in (steps, cells) if part)
+    return f" {both[0].upper()}{both[1:]} decide." if both else ""
 
 
 def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]) -> Part:
@@ -197,7 +204,7 @@ def spelled(judgement: Judgement) -> str:
     """Say what came out, with its interval, and what would meet the claim."""
     found, claim = judgement.estimate, judgement.claim
     if found.missing:
-        return "nothing."
+        return "not measured."
     unit = f" {claim.unit}" if claim.unit else ""
     digits = _digits(found.high - found.low)
     high = "more" if math.isinf(found.high) else digits.format(found.high)
@@ -256,7 +263,11 @@ def _provenance(results: Results) -> list[Part]:
         return []
     rows = [(name, run.info.title, str(run.plan.n_cells), run.digest) for name, run in runs.items()]
     table = Grid(("run", "what", "cells", "digest of the cube"), rows, stacked=True)
-    own = [Part(f"Run {name}", list(provenance_of(run))) for name, run in runs.items()]
+    own = []
+    for name, run in runs.items():
+        spec = results.study.table.runs[name].spec
+        words = "SPEC" if spec.endswith(".toml") else spec + (" --smoke" if results.smoke else "")
+        own.append(Part(f"Run {name}", list(provenance_of(run, words))))
     return [Part("Where this comes from", [table], own)]
 
 

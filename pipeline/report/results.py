@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 from pipeline.report.study import Study
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.runs.workflows import find_spec
+from pipeline.spec.parsing import load_spec
+from pipeline.spec.problems import SpecError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -47,17 +49,44 @@ class Results:
         self._torques: dict[str, Any] = {}
 
     def prepare(self, names: set[str]) -> None:
-        """Compute what has one of the names, runs first; what is there is taken."""
+        """Compute the runs among the names; all that the names stand for is read first.
+
+        Raises
+        ------
+        SpecError
+            Naming all that is wrong with specifications, rigs and headers, before anything is computed.
+        """
+        self._check(names)
         for name in self.study.table.runs:
             if name in names:
                 self.run(name)
 
+    def _check(self, names: set[str]) -> None:
+        """Read all specifications, rigs and headers that are needed."""
+        table, problems = self.study.table, []
+        checks: list[tuple[str, Callable[[str], Any]]] = [
+            *((name, lambda name: load_spec(self.spec(name), smoke=self.smoke)) for name in table.runs),
+            *((name, self.rig) for name in table.recordings),
+            *((name, self._measurement) for name in table.torques),
+        ]
+        for name, check in checks:
+            if name in names:
+                try:
+                    check(name)
+                except SpecError as error:
+                    problems += [f"{name}: {problem}" for problem in error.problems]
+        if problems:
+            raise SpecError(problems)
+
     def spec(self, name: str) -> Path:
         """Return the specification of a run: a file of the study, or one that ships."""
         given = self.study.table.runs[name].spec
-        return (
-            self.study.file(given) if given.endswith(".toml") else shipped_workflows().get(given, Path(given))
-        )
+        return self.study.file(given) if given.endswith(".toml") else find_spec(given)
+
+    def _measurement(self, name: str) -> Any:
+        from pipeline.report.torque_curves import measured
+
+        return measured(self.study.table.torques[name].header, self.study.path.parent)
 
     def run(self, name: str) -> AnalysedRun:
         """Return a run, computed or completed first."""
@@ -107,5 +136,5 @@ class Results:
             from pipeline.report.torque_curves import fitted
 
             self._echo(f"{name}: fit of torque readings")
-            self._torques[name] = fitted(self.study.table.torques[name].header, self.study.path.parent)
+            self._torques[name] = fitted(self._measurement(name))
         return self._torques[name]

@@ -279,6 +279,8 @@ def _analyses(shown: Shown) -> Iterator[Part]:
 
 def _suits(shown: Shown, name: str) -> bool:
     """Whether an analysis can say something of a run of this kind."""
+    if shown.run.spec.recorded is not None:  # its drive ends, so that no cell can be run on
+        return False
     if name == "hysteresis":
         return shown.run.spec.continuation is not None and shown.run.spec.continuation.direction == "both"
     if name == "basins":
@@ -329,6 +331,8 @@ def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
 
 def _exponents(shown: Shown) -> Iterator[Block]:
     """Lyapunov exponents of the cube, if it has them."""
+    if shown.run.spec.recorded is not None:
+        return
     if "lyapunov" not in shown.run.spec.products:
         yield Note(
             "Lyapunov exponents were not computed in this run: add the table to the specification and run it "
@@ -342,12 +346,12 @@ def _exponents(shown: Shown) -> Iterator[Block]:
         yield from _drawn(shown, "convergence", "Convergence of the largest Lyapunov exponent")
 
 
-def provenance_of(run: AnalysedRun) -> Iterator[Block]:
+def provenance_of(run: AnalysedRun, spec: str = "SPEC") -> Iterator[Block]:
     """Command, digests and versions of a run, and its specification; no host and no path of a home."""
     info = run.info
     made = dict(info.versions)
     facts = {
-        "command": f"magpend run SPEC --out {shlex.quote(run.name)}",
+        "command": f"magpend run {spec} --out {shlex.quote(run.name)}",
         "digest of the specification": info.digest,
         "digest of the cube": run.digest,
         "made": info.provenance.get("created", ""),

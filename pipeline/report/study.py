@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
+from pipeline.products.registry import FIGURES
 from pipeline.spec.files import read_toml
-from pipeline.spec.problems import SpecError, problems_of, unknown_name
+from pipeline.spec.problems import SpecError, problems_of, unknown_name, validated
 from pipeline.spec.tables import Table
 
 STUDY = "study.toml"
@@ -180,6 +181,9 @@ def _problems(table: StudyTable) -> list[str]:
             f"figures[{i}]: {unknown_name('input', name, known)}"
             for name in sorted(figure.needs - set(known))
         ]
+        for k, picture in enumerate(figure.pictures):
+            if picture.kind == "plot":
+                problems += _plot_problems(f"figures[{i}].pictures[{k}]", picture)
         for k, claim in enumerate(figure.claims):
             at = f"figures[{i}].claims[{k}]"
             if claim.measure not in MEASURES:
@@ -187,3 +191,14 @@ def _problems(table: StudyTable) -> list[str]:
             if claim.least > claim.most:
                 problems.append(f"{at}: least = {claim.least:g} is more than most = {claim.most:g}.")
     return problems
+
+
+def _plot_problems(at: str, picture: PictureTable) -> list[str]:
+    """Sentences on the figure of a run that nobody draws, and on options that it does not have."""
+    if picture.figure not in FIGURES:
+        return [f"{at}.figure: {unknown_name('figure', picture.figure, FIGURES)}"]
+    try:
+        validated(FIGURES[picture.figure].options, picture.options, f"{at}.options")
+    except SpecError as error:
+        return error.problems
+    return []

@@ -14,17 +14,24 @@ from pipeline.spec.problems import SpecError, unknown_name
 if TYPE_CHECKING:
     from pipeline.plots.style import DataFigure
     from pipeline.rig.magnet.fitting import Outcome
+    from pipeline.rig.magnet.measurement import Measurement
 
 _DRAWS, _SEED = 2000, 2018
 
 
-def fitted(header: str, folder: Path) -> Outcome:
-    """Fit torque readings: a header by its path, seen from a folder, or the name of one that ships."""
-    from pipeline.rig.magnet.fitting import fit_measurement
+def measured(header: str, folder: Path) -> Measurement:
+    """Read torque readings: a header by its path, seen from a folder, or the name of one that ships."""
     from pipeline.rig.magnet.measurement import find_measurement, read_measurement
 
     own = folder / header
-    return fit_measurement(read_measurement(find_measurement(str(own) if own.is_file() else header)))
+    return read_measurement(find_measurement(str(own) if own.is_file() else header))
+
+
+def fitted(readings: Measurement) -> Outcome:
+    """Fit torque readings."""
+    from pipeline.rig.magnet.fitting import fit_measurement
+
+    return fit_measurement(readings)
 
 
 def drawn(outcome: Outcome, name: str) -> DataFigure:

@@ -12,6 +12,7 @@ import threading
 import time
 from types import SimpleNamespace
 
+import psutil
 import pytest
 from tornado.httpclient import HTTPRequest
 from tornado.httpserver import HTTPServer
@@ -435,6 +436,39 @@ def test_explore__serves_until_it_is_stopped(made_run, start):
     assert "stopped" in said
     assert "so far" not in said.partition("Ctrl-C ends it")[2]
     assert {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")} == before
+
+
+def test_explore__takes_a_region_that_it_runs_along(made_run, start):
+    """What was begun for a page ends with the server, though it is in a group of its own."""
+    process = start("explore", made_run, "--no-browser")
+    found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{43})\n", process.stdout.readline())
+    address = f"ws://127.0.0.1:{found[1]}/ws?token={found[2]}"
+    origin = {"Origin": f"http://127.0.0.1:{found[1]}"}
+    region = {"id": 1, "do": "run", "x": [2.1, 2.9], "y": None, "at": {"q": 0}}
+
+    async def begin():
+        connection = await websocket_connect(HTTPRequest(address, headers=origin))
+        await connection.write_message(json.dumps(region))
+        while True:
+            answer = await connection.read_message()
+            told = json.loads(answer) if isinstance(answer, str) else {}
+            if told.get("id") == 1:
+                assert told["kind"] == "progress", told
+            children = [p for p in psutil.Process(process.pid).children() if "run" in p.cmdline()]
+            if children:
+                os.kill(process.pid, signal.SIGINT)
+                while await connection.read_message() is not None:
+                    pass
+                connection.close()
+                return children
+
+    children = asyncio.run(asyncio.wait_for(begin(), 90))
+    assert process.wait(40) == 130
+    gone, alive = psutil.wait_procs(children, timeout=10)
+    for child in alive:
+        child.kill()
+    assert not alive
+    assert gone
 
 
 def _other_address():

@@ -152,6 +152,8 @@ def claim(**given):
 def test_judge__what_decides(known, given, verdict, fails):
     found = judge(known, "1", claim(**given))
     assert (found.verdict, found.fails) == (verdict, fails)
+    if "contains" in given.get("options", {}):
+        assert found.reason.endswith("Steps of 0.02 and less decide.")
     assert found.reason or verdict in (Verdict.MET, Verdict.NOT_MET)
 
 

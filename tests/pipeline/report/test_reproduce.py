@@ -160,6 +160,25 @@ def test_load_study__all_that_is_wrong(study):
         load_study(study(STUDY.replace("most = 0.5", "most = 0.5\nleast = 2.0")))
 
 
+def test_reproduce__all_is_read_before_anything_is_computed(study, main, tmp_path):
+    more = '[torques.t]\nheader = "disks"\n[recordings.r]\nrig = "none.toml"\n[runs.other]\nspec = "fig31"\n'
+    text = STUDY.replace("[[figures]]", f"{more}[[figures]]", 1) + FALSE.replace(
+        '["sweep"]', '["other", "r", "t"]'
+    )
+    study(text)
+    code, _, err = main("reproduce", "mine.toml", "--out", "done", "--workers", "0")
+    assert code == Exit.REFUSED
+    for words in ("other: fig31: no such file", "r: ", "none.toml", "t: disks", "did you mean discs"):
+        assert words in err
+    code, _, err = main("reproduce", "mine.toml", "--out", "done", "--smoke")
+    assert "sweep: smoke: this specification has no [smoke] table" in err
+    study(STUDY.replace('figure = "section"', 'figure = "sections"'))
+    assert "figures[1].pictures[0].figure: unknown figure 'sections'" in main("reproduce", "mine.toml")[2]
+    study(STUDY.replace("options = { at", "options = { colour = 3, at"))
+    assert "figures[1].pictures[0].options.colour" in main("reproduce", "mine.toml")[2]
+    assert not (tmp_path / "done").exists()
+
+
 def test_reproduce__what_is_refused(study, main, tmp_path):
     study(STUDY)
     for words, message in (
