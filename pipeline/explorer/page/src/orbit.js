@@ -1,5 +1,7 @@
 // An orbit as the source gives it: columns by name, the section points, and what is known of it.
 
+import { visible } from "./palette.js";
+
 /**
  * Columns of an orbit, a live path or a followed orbit.
  * @param {{attrs: Object, arrays: Object, shapes: Object}} packed
@@ -66,7 +68,7 @@ export function colourOf(orbit, view, colours) {
   if (orbit.stable === false) return colours.ink;
   const attractors = view.colours?.find((entry) => entry.name === "attractor");
   const category = attractors?.categories.find((entry) => entry.id === orbit.attrs.attractor);
-  return category?.colour ?? colours.accent;
+  return category ? visible(category.colour, colours.card) : colours.accent;
 }
 
 /** Indices of all axes at the parameter values of an orbit. */
