@@ -215,9 +215,7 @@ class Life(RuleBasedStateMachine):
         """Whatever happened: the same command ends with the bytes of a run that nothing happened to."""
         try:
             self.run.go_on()
-        except (
-            RefusedError
-        ) as refusal:  # nothing says any more whose files these are
+        except RefusedError as refusal:  # nothing says any more whose files these are
             assert "or remove it" in str(refusal)
             shutil.rmtree(self.run.path)
             self.run.go_on()
