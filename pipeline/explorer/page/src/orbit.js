@@ -63,12 +63,21 @@ export function withUnit({ label, name, unit }) {
   return unit && unit !== "1" ? `${text} [${unit}]` : text;
 }
 
+const seen = new Map();
+
+/** A colour as it is told from a card's; remembered, for drawings that move ask for it in every frame. */
+function seenOn(colour, paper) {
+  const key = `${colour} ${paper}`;
+  if (!seen.has(key)) seen.set(key, visible(colour, paper));
+  return seen.get(key);
+}
+
 /** Colour of an orbit: its attractor's where it attracts; where it does not, the ink's, which no attractor has. */
 export function colourOf(orbit, view, colours) {
   if (orbit.stable === false) return colours.ink;
   const attractors = view.colours?.find((entry) => entry.name === "attractor");
   const category = attractors?.categories.find((entry) => entry.id === orbit.attrs.attractor);
-  return category ? visible(category.colour, colours.card) : colours.accent;
+  return category ? seenOn(category.colour, colours.card) : colours.accent;
 }
 
 /** Indices of all axes at the parameter values of an orbit. */
