@@ -111,6 +111,30 @@ def test_click__shows_the_orbit_of_the_cube(page, cube, owners):
     assert page.outside == []
 
 
+def test_click__on_a_point_that_comes_once_shows_that_very_point(page, cube):
+    section = cube["section"].transpose(*cube["status"].dims, "period_index", "state").values
+    section = section.reshape(-1, *section.shape[-2:])
+    frequency = np.array([cell["frequency"] for cell in cells_of(cube)])
+    lonely, most = (0, 0), 0.0
+    for i in np.flatnonzero(cube["orbit_period"].values.ravel() != 1):
+        here = np.sort(section[frequency == frequency[i], :, 0].ravel())
+        for k, value in enumerate(section[i, :, 0]):
+            gap = np.partition(np.abs(here - value), 1)[1]
+            if gap > most:
+                lonely, most = (int(i), k), gap
+    cell, point = lonely
+    x, y = frequency[[cell]], section[cell, [point], 0]
+    page.page.evaluate("magpend.state.set({ y: 'psi1' })")
+    click_on(page.page, places_of(page.page, x, y)[0])
+    page.page.locator(f".panels[data-shown='{cell}-{point}']").wait_for()
+    shown = numbers(page.page.locator(".panel-series output").text_content())
+    assert shown[1:] == pytest.approx(section[cell, point].tolist(), rel=1e-3)
+    page.page.locator(".panel-facts summary", has_text="Starts that lead here").click()
+    own = cells_of(cube)[cell]
+    first = numbers(page.page.locator(".panel-facts details li").first.text_content())
+    assert first[:2] == pytest.approx([own["psi1_0"], own["psi2_0"]], abs=1e-3)
+
+
 def test_live_start__ends_on_the_label_of_the_cube(page, cube, owners):
     starts = cells_of(cube)
     closed = {int(owners[i]): i for i in range(len(starts)) if cube["orbit_period"].values.ravel()[i] == 1}
