@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from magpend_core import rates
 from magpend_core.models import load_model, model_names
 from pipeline.explorer import diagram as diagrams
+from pipeline.explorer import tables
 from pipeline.explorer.answers import ANSWERS, Query
 from pipeline.explorer.arrays import unpack_arrays
 from pipeline.explorer.colours import NONE
@@ -572,6 +573,18 @@ def test_table__has_the_same_rows_in_both_formats(sweep, kind, tmp_path):
             heading = next(h for h in rows[0] if h == name or h.startswith(f"{name} ["))
             read = [float(row[heading] or "nan") for row in rows]
             np.testing.assert_array_equal(read, ds[name].values)
+
+
+def test_table__a_word_is_no_formula(monkeypatch):
+    """Names come from models and titles; a spreadsheet would run one that begins like a formula."""
+    monkeypatch.setattr(tables, "_ROWS_AT_ONCE", 2)
+    ds = xr.Dataset({
+        "name": ("row", np.array(["=1+1", "+x", "@y", "B: left", ""])),
+        "value": ("row", np.array([-1.0, np.nan, 0.1, 2.0, 1e-300])),
+    })  # fmt: skip
+    assert tables._csv(ds).decode().splitlines() == [
+        "name,value", "'=1+1,-1.0", "'+x,", "'@y,0.1", "B: left,2.0", ",1e-300"
+    ]  # fmt: skip
 
 
 def test_table__of_branches_and_its_refusals(walk):
