@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -229,6 +230,31 @@ def beside_window(results: Results, of: Sequence[str], options: Options) -> Esti
     return Estimate(float(cells.mean()), low, high, text, found.step, cells.size)
 
 
+def change_of_period(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Value of the axis at which the period of most cells changes, from below to above.
+
+    Options: ``below`` and ``above``, the periods on its two sides; ``low`` and ``high``. The interval reaches
+    from the last value with the one to the next with the other: next to a bifurcation, where motions close
+    slowly, most cells may have neither. It spans all such places if there are several.
+    """
+    ds, axis = _cells(results, of[0])
+    here = _within(ds, axis, options)
+    values, n = here[axis].values, here.sizes["cell"]
+    step = _step(ds[axis].values)
+    if values.size < 2:
+        return absent(f"the axis has fewer than two values {_asked(options)}", step)
+    below, above = (2 * _matches(here, {"period": options[side]}).sum(1) > n for side in ("below", "above"))
+    decided = np.flatnonzero(below | above)
+    places = [(i, k) for i, k in pairwise(decided) if below[i] and above[k]]
+    if not places:
+        change = f"from {options['below']} to {options['above']}"
+        return absent(f"most of {n} cells nowhere change {change} {_asked(options)}", step)
+    low, high = float(values[places[0][0]]), float(values[places[-1][1]])
+    text = f"period {options['below']} of most of {n} cells up to {low:g}, {options['above']} from {high:g}"
+    text += f"; {len(places)} such places" if len(places) > 1 else ""
+    return Estimate(0.5 * (low + high), low, high, text, step, n)
+
+
 def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Estimate:
     """Share of the cells that end on the rarest of some motions at one value: above 0, all coexist.
 
@@ -355,6 +381,7 @@ MEASURES: dict[str, Measure] = {
     "largest_share": largest_share,
     "window_width": window_width,
     "beside_window": beside_window,
+    "change_of_period": change_of_period,
     "rarest_motion": rarest_motion,
     "largest_exponent": largest_exponent,
     "agreement": agreement,
