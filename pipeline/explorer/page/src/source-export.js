@@ -134,6 +134,7 @@ export class ExportSource {
     if (k === undefined || k === NONE) throw new SourceError("This cell has no points, so it has no orbit.");
     const stored = await this.packed(`orbits-${blocks.findLastIndex((first) => first <= k)}`);
     const { arrays, shapes } = partOf(stored, `${k}.`), attrs = { ...stored.attrs[k] };
+    if (attrs.failed) throw new SourceError(`The orbit of cell ${attrs.cell} could not be integrated: ${attrs.failed}`);
     const how = index.arrays.how[cell], same = how === SAME_ATTRACTOR || how === ALIKE;
     attrs.note = this.noteOf(attrs, cell, how);
     const sections = await this.sections(same ? cell : attrs.cell);
