@@ -181,8 +181,8 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
     copied.sentences += [missing] if missing else []
     if 0 < n < chosen.groups:
         copied.sentences.append(
-            f"Of {chosen.groups:,} orbits, one for each attractor (or period and motion) at its parameters, this "
-            f"copy has {n:,}; elsewhere the nearest is shown."
+            f"Of {chosen.groups:,} orbits, one for each attractor (or period and motion) at its parameters, "
+            f"this copy has {n:,}; elsewhere the nearest is shown."
         )
     return n
 
