@@ -26,6 +26,12 @@ def export(
     force: Annotated[
         bool, typer.Option("--force", help="Replace the file, or a folder that export has made.")
     ] = False,
+    quantity: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME", help="A quantity of the model that can be on the vertical axis, besides states."
+        ),
+    ] = None,
     orbits: Annotated[
         int, typer.Option(min=0, help="Most orbits that are integrated to go along. Default: 2000.")
     ] = 2000,
@@ -48,14 +54,19 @@ def export(
         raise SpecError(["--page and --folder: give one of them."])
     if page is not None and page.suffix.lower() not in (".html", ".htm"):
         raise SpecError([f"--page {page}: the suffix must be .html."])
-    run = Run.open(directory)
+    run, wanted = Run.open(directory), quantity or []
     with console.progress("exporting"):
         if folder is not None:
-            written = export_folder(run, folder, force=force, most_orbits=orbits)
+            written = export_folder(run, folder, force=force, quantities=wanted, most_orbits=orbits)
         else:
             target = page or Path(f"{Path(run.name).resolve().name}.html")
             written = export_page(
-                run, target, force=force, most_orbits=orbits, most_bytes=round(megabytes * 1e6)
+                run,
+                target,
+                force=force,
+                quantities=wanted,
+                most_orbits=orbits,
+                most_bytes=round(megabytes * 1e6),
             )
     for sentence in written.sentences:
         console.note(f"note: {sentence}")

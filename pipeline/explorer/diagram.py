@@ -108,8 +108,7 @@ def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
     table = _Table(run, upwards, sizes, kept)
     for selection in selections(ds[upwards.variable]):
         table.read(ds, selection)
-    lead = run.plan.dims.index(x) if axis.swept else None
-    return table.points(axis.values, lead, _cell_numbers(run, place))
+    return table.points(axis.values, _cell_numbers(run, place))
 
 
 def _numbered(run: ExploredRun) -> xr.Dataset:
@@ -155,12 +154,13 @@ class _Table:
             )
             self.codes[scheme.name][where] = np.where(found.values < 0, NONE, found.values)
 
-    def points(self, x: np.ndarray, lead: int | None, cells: np.ndarray) -> Points:
-        """What was read, with the horizontal axis first, and only what is there to be drawn."""
+    def points(self, x: np.ndarray, cells: np.ndarray) -> Points:
+        """What was read, along the horizontal axis, and only what is there to be drawn."""
+        n = self.status.size
 
         def ordered(array: np.ndarray) -> np.ndarray:
-            moved = array if lead is None else np.moveaxis(array, lead, 0)
-            return moved.reshape(-1, *array.shape[len(self.dims) :])
+            # dims of starts come last, and of the other axes one place is left: x is the first that is long
+            return array.reshape(n, *array.shape[len(self.dims) :])
 
         values = ordered(self.values)
         there = np.isfinite(values)

@@ -5,7 +5,7 @@ A copy computes nothing: its orbits were integrated when it was made, and it say
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,6 +59,7 @@ def export_page(
     out: Path,
     *,
     force: bool = False,
+    quantities: Sequence[str] = (),
     most_orbits: int = MOST_ORBITS,
     most_bytes: int = MOST_BYTES,
 ) -> Exported:
@@ -72,6 +73,8 @@ def export_page(
         File to write.
     force
         Whether a file at its place makes way.
+    quantities
+        Those of the model that can be on the vertical axis, besides states and kept extremes.
     most_orbits
         Orbits that are integrated for it, one for each attractor at each parameter point.
     most_bytes
@@ -80,13 +83,15 @@ def export_page(
 
     Raises
     ------
+    SpecError
+        If the model has no such quantity.
     RefusedError
         If something is at its place, nothing can be written there, or the run does not fit at all.
     DamagedError
         If what is read of the run is not what was written.
     """
     check_place(out, force)
-    copied = gather(ExploredRun.of(source))
+    copied = gather(ExploredRun.of(source), quantities)
     columns, layers = read_columns(copied)
     copied.objects["cells"] = packed(layers)
     add_planes(copied, PLANES_SHARE * most_bytes * 3 / 4)

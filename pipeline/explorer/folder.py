@@ -4,30 +4,40 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pipeline.explorer.copied_orbits import Room
-from pipeline.explorer.copy_html import folder_html
+from pipeline.explorer.copy_html import folder_html, static_text
 from pipeline.explorer.explored import ExploredRun
-from pipeline.explorer.export import Exported, add_all_orbits, finished, read_columns
-from pipeline.explorer.gather import Copied, add_planes, gather, place_of
-from pipeline.explorer.verticals import verticals
-from pipeline.store.consolidate import write_cube
+from pipeline.explorer.export import MOST_ORBITS, Exported, add_all_orbits, finished, read_columns
+from pipeline.explorer.gather import Column, Copied, add_planes, gather, place_of
+from pipeline.explorer.verticals import vertical
+from pipeline.store.consolidate import Layer, write_cube
 from pipeline.store.errors import RefusedError
-from pipeline.store.files import entry_of
+from pipeline.store.files import CUBE, entry_of
 from pipeline.store.local import remove_tree, sync_folder, temporary_beside, unwritable
 from pipeline.store.run import Run
 
-INDEX, LIST, DATA = "index.html", "objects.json", "data"
+INDEX, LIST, DATA, LICENCES = "index.html", "objects.json", "data", "LICENSES.txt"
+
+QUANTITY = "quantity_"
+"""What the names of quantities in the cube begin with."""
 
 MOST_BYTES = 500_000_000
 """What orbits, and planes, may take of a folder each."""
 
 
-def export_folder(source: Run, out: Path, *, force: bool = False, most_orbits: int = 2000) -> Exported:
+def export_folder(
+    source: Run,
+    out: Path,
+    *,
+    force: bool = False,
+    quantities: Sequence[str] = (),
+    most_orbits: int = MOST_ORBITS,
+) -> Exported:
     """Write a run as a folder that any static host can serve.
 
     In it are the page, the cube with its metadata in one file and its chunks cut by columns, and
@@ -41,11 +51,15 @@ def export_folder(source: Run, out: Path, *, force: bool = False, most_orbits: i
         Folder to make.
     force
         Whether a folder that an export has made there makes way; nothing else does.
+    quantities
+        Those of the model that can be on the vertical axis, besides states and kept extremes.
     most_orbits
         Orbits that are integrated for it, one for each attractor at each parameter point.
 
     Raises
     ------
+    SpecError
+        If the model has no such quantity.
     RefusedError
         If something is at its place, or nothing can be written there.
     DamagedError
@@ -55,7 +69,7 @@ def export_folder(source: Run, out: Path, *, force: bool = False, most_orbits: i
     temporary = temporary_beside(out)
     try:
         temporary.mkdir()
-        exported = _write(ExploredRun.of(source), temporary, most_orbits)
+        exported = _write(ExploredRun.of(source), temporary, quantities, most_orbits)
         if out.exists():
             before = temporary_beside(out)
             out.rename(before)
@@ -86,23 +100,28 @@ def check_folder(out: Path, force: bool) -> None:
         return
     if not force:
         raise RefusedError(f"{out}: exists already and is not overwritten; give another name, or --force.")
-    own = {INDEX, LIST, DATA, "cube.zarr"}
+    own = {INDEX, LIST, DATA, LICENCES, CUBE}
     if out.is_symlink() or not out.is_dir() or {p.name for p in out.iterdir()} - own:
         raise RefusedError(
             f"{out}: is not a folder that magpend export has made, so --force leaves it; remove it."
         )
 
 
-def _write(run: ExploredRun, folder: Path, most_orbits: int) -> Exported:
-    copied = gather(run)
-    columns, layers = read_columns(copied)
+def _write(run: ExploredRun, folder: Path, quantities: Sequence[str], most_orbits: int) -> Exported:
+    copied = gather(run, quantities)
+    columns, codes = read_columns(copied)
     add_planes(copied, MOST_BYTES)
-    orbits = add_all_orbits(copied, columns, layers, Room(most_orbits, MOST_BYTES, brief=False))
-    for vertical in verticals(run):
-        variable, own = place_of(run, vertical)
-        copied.about["columns"][vertical.name] = {"variable": variable, "own": own}
+    orbits = add_all_orbits(copied, columns, codes, Room(most_orbits, MOST_BYTES, brief=False))
+    layers = _layers_of(copied, codes)
+    for name in columns:
+        if name in quantities:
+            layers[f"{QUANTITY}{name}"] = _quantity(run, name, columns[name])
+            copied.about["columns"][name] = {"variable": f"{QUANTITY}{name}", "own": [None]}
+        else:
+            variable, own = place_of(run, vertical(run, name))
+            copied.about["columns"][name] = {"variable": variable, "own": own}
     along = next((a.name for a in run.axes if a.swept), None)
-    entries = write_cube(run, folder, along, _layers_of(copied, layers))
+    entries = write_cube(run, folder, along, layers)
     (folder / DATA).mkdir()
     for name, content in finished(copied).items():
         key = f"{DATA}/{name}.bin"
@@ -113,16 +132,28 @@ def _write(run: ExploredRun, folder: Path, most_orbits: int) -> Exported:
     digest = hashlib.sha256(listed).hexdigest()
     html = folder_html(run.info.title, f"magpend {copied.view['version']}", digest).encode()
     (folder / INDEX).write_bytes(html)
-    size = sum(entry["size"] for entry in entries.values()) + len(listed) + len(html)
+    # code of others is in the page's script
+    licences = static_text(LICENCES).encode()
+    (folder / LICENCES).write_bytes(licences)
+    size = sum(entry["size"] for entry in entries.values()) + len(listed) + len(html) + len(licences)
     return Exported(folder, size, orbits, copied.sentences)
 
 
-def _layers_of(copied: Copied, layers: dict[str, np.ndarray]) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
+def _quantity(run: ExploredRun, name: str, column: Column) -> Layer:
+    """A quantity at the sections that are drawn, as an array of the cube; NaN where there are none."""
+    values = np.full((run.plan.n_cells, run.n_keep), np.nan)
+    values[np.arange(run.n_keep) < column.count[:, None]] = column.y
+    quantity = run.model.quantity(name)
+    attrs = {"long_name": f"{quantity.meaning}, at the sections that are drawn", "units": quantity.unit}
+    return Layer(values.reshape(*run.plan.shape, run.n_keep), attrs, ("period_index",))
+
+
+def _layers_of(copied: Copied, layers: dict[str, np.ndarray]) -> dict[str, Layer]:
     """Codes of colours in the shape of the cube, each with what its codes mean."""
     shape = copied.run.plan.shape
     titles = {f"colour_{c['name']}": c for c in copied.view["colours"]}
     return {
-        name: (
+        name: Layer(
             values.reshape(shape),
             {
                 "long_name": titles[name]["title"],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -24,6 +24,7 @@ from pipeline.explorer.verticals import Vertical
 from pipeline.explorer.view import describe_view
 from pipeline.plots.points import DRAWN
 from pipeline.products.reporting import track
+from pipeline.spec.problems import SpecError, unknown_name
 
 MOST_PLACES = 4000
 """Answers of a kind that a copy holds, one for each place of the axes."""
@@ -70,15 +71,24 @@ class Copied:
         return sum(map(len, self.objects.values()))
 
 
-def gather(run: ExploredRun) -> Copied:
+def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
     """Return what both kinds of copies have of a run; the columns are still to come.
+
+    Parameters
+    ----------
+    run
+        The run.
+    quantities
+        Those of the model that can be on the vertical axis, besides states and kept extremes.
 
     Raises
     ------
+    SpecError
+        If the model has no such quantity.
     DamagedError
         If what is read of the run is not what was written.
     """
-    view = describe_view(run, live=False)
+    view, left = _view(run, quantities)
     about: dict[str, Any] = {
         "dims": [{"name": d, "size": n} for d, n in zip(run.plan.dims, run.plan.shape, strict=True)],
         "drawn": [int(s) for s in DRAWN],
@@ -91,6 +101,10 @@ def gather(run: ExploredRun) -> Copied:
         cells = view["cells"]
         copied.sentences.append(
             f"The run was not complete: {cells['pending']:,} of {cells['total']:,} cells were not computed."
+        )
+    if left:
+        copied.sentences.append(
+            f"{left} quantities of the model are not among the vertical axes here (--quantity adds them)."
         )
     lines = [(a.name, place) for a in run.axes for place in places(run, but=a.name)]
     heights = [str(v["name"]) for v in view["verticals"]]
@@ -107,6 +121,18 @@ def gather(run: ExploredRun) -> Copied:
     everywhere = ((place_key(run, at), partial(attractors, run, at)) for at in places(run))
     _answers(copied, "attractors", everywhere, alike=not known["attractors"])
     return copied
+
+
+def _view(run: ExploredRun, quantities: Sequence[str]) -> tuple[dict[str, Any], int]:
+    """What stands in the run, with those quantities alone on the vertical axis; and how many are not."""
+    known = [q.name for q in run.model.quantities]
+    if problems := [unknown_name("--quantity", name, known) for name in quantities if name not in known]:
+        raise SpecError(problems)
+    view = describe_view(run, live=False)
+    away = set(known) - set(quantities)
+    shown = [v for v in view["verticals"] if v["name"] not in away]
+    left = len(view["verticals"]) - len(shown)
+    return {**view, "verticals": shown}, left
 
 
 def places(run: ExploredRun, but: str = "") -> Iterator[Place]:

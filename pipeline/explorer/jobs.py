@@ -134,6 +134,11 @@ class Desk:
             if self._current is not None:
                 self._current.cancel()
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a job is at work or waits."""
+        return self._thread is not None
+
     def join(self, timeout: float) -> None:
         """Wait until nothing is at work."""
         thread = self._thread

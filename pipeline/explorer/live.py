@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +25,7 @@ from pipeline.explorer.catalog import Catalog, Known
 from pipeline.explorer.jobs import Answer, Desk, Job
 from pipeline.explorer.legend import Legend
 from pipeline.explorer.messages import CancelRequest, Request, RequestError, read_request
+from pipeline.explorer.regions import PATIENCE_S
 from pipeline.explorer.series import orbit_series
 from pipeline.explorer.settling import Flight, Place
 from pipeline.layout.cells import CellMap, parameter_axes
@@ -45,6 +47,9 @@ SAME_VALUE = 1e-12
 """Relative difference at which a value is that of the cube."""
 
 MOST_THREADS = 8
+
+CLOSING_S = PATIENCE_S + 2.0
+"""Time that all jobs have to end when the run is closed [s]."""
 
 
 def live_problem(run: Run) -> str | None:
@@ -83,11 +88,29 @@ class LiveRun:
         self._catalogs: OrderedDict[tuple[float, ...], Catalog] = OrderedDict()
         self._attractors: xr.Dataset | None = None
         self._cube: xr.Dataset | None = None
+        self._sessions: set[LiveSession] = set()
         self._warming = Warming(self)
 
     def close(self) -> None:
-        """Give up the threads; jobs are cancelled by their sessions."""
+        """End all sessions and what they have begun, runs of a region among it; waits until it has ended."""
+        with self._lock:
+            sessions = list(self._sessions)
+        for session in sessions:
+            session.close()
+        until = time.monotonic() + CLOSING_S
+        for session in sessions:
+            session.join(max(0.0, until - time.monotonic()))
         self.pool.shutdown(wait=False, cancel_futures=True)
+
+    def enter(self, session: LiveSession) -> None:
+        """Take a session in, which is ended with the run."""
+        with self._lock:
+            self._sessions.add(session)
+
+    def leave(self, session: LiveSession) -> None:
+        """Forget a session once it is closed and its jobs have ended."""
+        with self._lock:
+            self._sessions = {s for s in self._sessions if s is not session and not s.is_over}
 
     def warm(self, tell: Callable[[int, int], None] | None = None) -> None:
         """Compile and read in the background what jobs need; `tell` hears how much of it is done."""
@@ -318,6 +341,7 @@ class LiveSession:
         self.live = live
         self._emit, self._closed = emit, threading.Event()
         self._desks = {kind: Desk(self._emit_open, work) for kind, work in doing.works(live).items()}
+        live.enter(self)
         live.warm(self._tell_warming)
 
     def _tell_warming(self, done: int, total: int) -> None:
@@ -350,6 +374,13 @@ class LiveSession:
         self._closed.set()
         for desk in self._desks.values():
             desk.close()
+        if self.is_over:  # else it is still waited for when the run is closed
+            self.live.leave(self)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it is closed and no job is at work."""
+        return self._closed.is_set() and not any(desk.is_busy for desk in self._desks.values())
 
     def join(self, timeout: float = 30.0) -> None:
         """Wait until no job is at work."""

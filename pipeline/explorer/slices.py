@@ -23,8 +23,8 @@ from pipeline.explorer.settling import Place, settle_cells
 if TYPE_CHECKING:
     from pipeline.explorer.live import LiveRun
 
-BATCH = 128
-"""Starts that a thread takes at once."""
+FIRST_BATCH, BATCH = 64, 256
+"""Starts that a thread takes at once: of the coarsest grid, and of the others."""
 
 SHOW_EVERY_S = 0.5
 """How often an unfinished grid is shown [s]."""
@@ -135,13 +135,13 @@ class _Slice:
         """Compute what a grid lacks; shows it now and then."""
         rows, columns = self._grid.missing(n)
         total, done, shown = len(rows), 0, time.perf_counter()
-        parts = [slice(i, i + BATCH) for i in range(0, total, BATCH)]
-        if n == LEAST_RESOLUTION and parts:  # alone, so that the others find the attractors that it meets
-            self._take(
-                parts[0], rows, columns, self._settle(self._grid.starts(rows[parts[0]], columns[parts[0]]))
-            )
-            done = len(rows[parts[0]])
-            parts = parts[1:]
+        size = FIRST_BATCH if n == LEAST_RESOLUTION else BATCH
+        parts = [slice(i, i + size) for i in range(0, total, size)]
+        if n == LEAST_RESOLUTION:  # alone, so that the others find the attractors that it meets
+            part = parts.pop(0)
+            starts = self._grid.starts(rows[part], columns[part])
+            self._take(part, rows, columns, self._settle(starts))
+            done = len(starts)
         at_work: dict[Future[np.ndarray], slice] = {}
         try:
             while parts or at_work:

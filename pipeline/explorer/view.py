@@ -18,6 +18,9 @@ from pipeline.explorer.series import fixed_points
 from pipeline.explorer.verticals import verticals
 from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim
 from pipeline.layout.words import period_of, section_name
+from pipeline.products.registry import ANALYSES
+from pipeline.runs.derive import AnalysedRun, prepared
+from pipeline.spec.problems import SpecError
 from pipeline.store.run import Run
 
 FORMAT = 1
@@ -179,7 +182,9 @@ def _drawing(run: ExploredRun) -> dict[str, Any] | None:
 
 def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
     if axis.name == FREQUENCY_DIM:
-        label, meaning, unit = "drive frequency", "drive frequency", "Hz"
+        driven = not run.model.autonomous
+        label, unit = "drive frequency" if driven else "strobe frequency", "Hz"
+        meaning = label
         if run.spec.recorded is not None:
             label = meaning = "mean frequency of the recorded drive"
     else:
@@ -217,10 +222,20 @@ def _has(run: ExploredRun) -> dict[str, bool]:
 
 
 def commands(run: ExploredRun, directory: str) -> dict[str, str]:
-    """Return the command that gets each analysis that the page shows and the run has not."""
-    walks = run.plan.path is not None
+    """Return the command that gets each analysis that the page shows and the run has not, if it can."""
+    wanted = [name for name in ("attractors", "branches", "basins") if run.kept(name) is None]
     return {
-        name: f"magpend analyse {name} {shlex.quote(directory)}"
-        for name in ("attractors", "branches", "basins")
-        if run.spec.recorded is None and run.kept(name) is None and not (name == "basins" and walks)
+        name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if _can_have(run, name)
     }
+
+
+def _can_have(run: ExploredRun, name: str) -> bool:
+    """Whether a run has what an analysis takes with its default options."""
+    if run.spec.recorded is not None:
+        return False
+    analysis = ANALYSES[name]
+    try:
+        prepared(AnalysedRun.of(run), analysis, analysis.options())
+    except SpecError:
+        return False
+    return True

@@ -11,6 +11,7 @@ import contextlib
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,25 @@ LEVEL = 6
 PRIVATE = ("host",)
 """Attributes of an opened cube that do not go to strangers."""
 
-Layers = Mapping[str, tuple[np.ndarray, Mapping[str, Any]]]
-"""Arrays over the cells, by name, with their attributes."""
+
+@dataclass(frozen=True)
+class Layer:
+    """A further array over the cells.
+
+    Attributes
+    ----------
+    values : ndarray
+    attrs : mapping
+    own_dims : tuple of str
+        Dims after those of the cells.
+    """
+
+    values: np.ndarray
+    attrs: Mapping[str, Any]
+    own_dims: tuple[str, ...] = ()
+
+
+Layers = Mapping[str, Layer]
 
 
 def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dict[str, dict[str, Any]]:
@@ -127,9 +145,11 @@ def _write_group(run: Run, store: LocalStore, columns: _Columns, layers: Layers)
         values = coordinate.values
         array = _create(group, str(name), coordinate.dims, values, values.shape, None, coordinate.attrs)
         array[...] = values.astype(object) if values.dtype.kind == "U" else values
-    for name, (values, attributes) in layers.items():
-        chunks = columns.chunks(values.dtype.itemsize)
-        _create(group, name, columns.dims, values, chunks, 0, attributes)[...] = values
+    for name, layer in layers.items():
+        values, dims = layer.values, (*columns.dims, *layer.own_dims)
+        chunks = columns.chunks(values.dtype.itemsize, layer.own_dims)
+        fill = np.nan if values.dtype.kind == "f" else 0
+        _create(group, name, dims, values, chunks, fill, layer.attrs)[...] = values
     total = float(sum(ds[v.name].nbytes for v in run.plan.variables))
     done = 0.0
     for variable in run.plan.variables:

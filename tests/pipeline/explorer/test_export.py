@@ -11,16 +11,17 @@ import re
 
 import numpy as np
 import pytest
-from pipeline.explorer.explored import ExploredRun
 
 from pipeline.explorer import folder as folder_module
 from pipeline.explorer.arrays import unpack_arrays
 from pipeline.explorer.columns import fit, levels, thinned
 from pipeline.explorer.copied_orbits import ALIKE, NEAREST, NONE, SAME_ATTRACTOR, choose
-from pipeline.explorer.export import export_page
+from pipeline.explorer.explored import ExploredRun
+from pipeline.explorer.export import RESERVE, export_page
 from pipeline.explorer.folder import export_folder
-from pipeline.explorer.gather import Column
+from pipeline.explorer.gather import Column, column
 from pipeline.explorer.packing import packed
+from pipeline.spec.problems import SpecError
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.run import Run
 
@@ -101,20 +102,23 @@ def test_export_page__of_an_incomplete_run_says_so(run, tmp_path):
 
 def test_export_page__leaves_out_what_does_not_fit_and_says_what(run, tmp_path):
     whole = export_page(run, tmp_path / "whole.html", most_orbits=0)
-    assert not any("left out" in s for s in whole.sentences)
-    for share in (0.999, 0.99):
-        # random numbers do not shrink: first they are rounded, then sections go
-        room = round(whole.size * share)
-        name = tmp_path / f"{share}.html"
-        columns = sum(len(v) for k, v in _objects(tmp_path / "whole.html").items() if k.startswith("column"))
-        most = whole.size - round(4 / 3 * columns * (0.2 if share == 0.999 else 0.7)) + 10_000
-        written = export_page(run, name, most_orbits=0, most_bytes=max(most, room - whole.size))
+    assert not any("left out" in s or "rounded" in s for s in whole.sentences)
+    objects = _objects(tmp_path / "whole.html")
+    columns = 4 / 3 * sum(len(v) for k, v in objects.items() if k.startswith("column"))
+    # random numbers do not shrink: half the room holds them in half the bits, a fifth not all of them
+    for share, rounded, thinned_too in ((0.7, True, False), (0.3, True, True)):
+        most = round(whole.size - (1 - share) * columns) + RESERVE
+        written = export_page(run, tmp_path / "less.html", most_orbits=0, most_bytes=most, force=True)
         assert written.size <= most
-        objects = _objects(name)
+        assert any("right to 6e-8" in s for s in written.sentences) == rounded
+        objects = _objects(tmp_path / "less.html")
         _, about = _about(objects)
         arrays, _ = _data(objects[about["columns"]["psi1"]])
         assert arrays["y"].dtype == np.float32
-        assert any("right to 6e-8" in s for s in written.sentences)
+        total = int((run.cube()["status"].values == 2).sum()) * 3
+        assert (len(arrays["y"]) < total) == thinned_too
+        told = f"this copy has {len(arrays['y']):,} of {total:,} points"
+        assert (told in about["notice"]) == thinned_too
 
 
 def test_export_page__refuses_what_does_not_fit_at_all(run, tmp_path):
@@ -198,8 +202,9 @@ def test_export_folder__lists_every_object_and_pins_the_list(run, tmp_path):
     written = export_folder(run, tmp_path / "site", most_orbits=0)
     site = tmp_path / "site"
     files = {p.relative_to(site).as_posix(): p.read_bytes() for p in site.rglob("*") if p.is_file()}
+    assert written.size == sum(map(len, files.values()))
     page, listed = files.pop("index.html"), files.pop("objects.json")
-    assert written.size == sum(map(len, [*files.values(), page, listed]))
+    assert b"zarrita" in files.pop("LICENSES.txt")
     assert f'data-objects="{hashlib.sha256(listed).hexdigest()}"' in page.decode()
     assert {k: (v["size"], v["sha256"]) for k, v in json.loads(listed).items()} == {
         k: (len(content), hashlib.sha256(content).hexdigest()) for k, content in files.items()
@@ -295,6 +300,23 @@ def test_export__of_a_damaged_run_is_refused(run, tmp_path):
         with pytest.raises(DamagedError, match="section"):
             write(run, tmp_path / name, most_orbits=0)
         assert not (tmp_path / name).exists()
+
+
+def test_export__a_quantity_on_the_vertical_axis(run, tmp_path):
+    name = run.model.quantities[0].name
+    explored = ExploredRun.of(run)
+    wanted, _ = column(explored, "frequency", name)
+    written = export_page(run, tmp_path / "copy.html", most_orbits=0, quantities=[name])
+    assert any(
+        f"{len(run.model.quantities) - 1} quantities of the model are not" in s for s in written.sentences
+    )
+    objects = _objects(tmp_path / "copy.html")
+    view, about = _about(objects)
+    assert [v["name"] for v in view["verticals"]] == [*run.model.state_names, name]
+    arrays, _ = _data(objects[about["columns"][name]])
+    np.testing.assert_array_equal(arrays["y"], wanted.y)
+    with pytest.raises(SpecError, match="--quantity"):
+        export_page(run, tmp_path / "other.html", most_orbits=0, quantities=["enthusiasm"])
 
 
 def test_export__command(main, run, tmp_path):

@@ -165,6 +165,16 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
     assert [p["value"] is None for p in found["model"]["parameters"] if p["name"] == "A"] == [True]
 
 
+def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made_run):
+    assert describe_view(ExploredRun.of(sweep), False)["commands"] == {
+        "branches": "magpend analyse branches run"
+    }
+    assert "basins" not in describe_view(ExploredRun.of(walk), False)["commands"]  # a walk has no basins
+    assert {"attractors", "basins"} <= describe_view(ExploredRun.of(made_run.directory), False)[
+        "commands"
+    ].keys()
+
+
 def test_describe_view__reads_what_is_computed_later(walk):
     explored = ExploredRun.of(walk)
     assert not describe_view(explored, False)["has"]["basins"]

@@ -27,7 +27,9 @@ def test_write_cube__has_the_cubes_numbers_and_pending_cells(made, tmp_path):
         made.commit(index)
     run = Run.open(made.info.directory)
     layer = np.arange(made.plan.n_cells, dtype=np.uint16).reshape(made.plan.shape)
-    consolidate.write_cube(run, tmp_path / "out", "frequency", {"colour": (layer, {"title": "of cells"})})
+    consolidate.write_cube(
+        run, tmp_path / "out", "frequency", {"colour": consolidate.Layer(layer, {"title": "of cells"})}
+    )
     written, cube = _open(tmp_path / "out"), run.cube()
     assert set(written.variables) == {*cube.variables, "colour"}
     for name in cube.variables:

@@ -1,15 +1,19 @@
-// Tables of a view's data that the browser writes itself: CSV. NetCDF needs magpend.
+// Tables of a view's data that the browser writes itself: CSV, in the columns of pipeline/explorer/tables.py.
+// NetCDF needs magpend.
 
 /** A field: what has commas, quotes or line ends is quoted; nothing stands for what has no value. */
 function field(value) {
   if (value === null || value === undefined || Number.isNaN(value)) return "";
-  const text = String(value);
+  let text = String(value);
+  // a word that a spreadsheet would take for a formula stays a word
+  if (typeof value === "string" && /^[=+\-@\t]/.test(text)) text = `'${text}`;
   return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }
 
-/** Lines of CSV as a Blob; `rows` gives arrays of values. */
-function csv(names, rows) {
-  const parts = [`${names.map(field).join(",")}\n`];
+/** Lines of CSV as a Blob: what is told of all, names, rows; `rows` gives arrays of values. */
+function csv(told, names, rows) {
+  const heads = Object.entries(told).map(([name, value]) => `# ${name}: ${String(value).split(/\s+/).join(" ")}\n`);
+  const parts = [...heads, `${names.map(field).join(",")}\n`];
   let lines = [];
   for (const row of rows) {
     lines.push(row.map(field).join(","));
@@ -23,62 +27,103 @@ function csv(names, rows) {
   return new Blob(parts, { type: "text/csv;charset=utf-8" });
 }
 
+/** A name with its unit, as the head of a column. */
+function heading({ name, unit }) {
+  return unit && unit !== "1" ? `${name} [${unit}]` : name;
+}
+
 /** Words of codes by number. */
 function labelsOf(categories) {
   return new Map(categories.map(({ id, label }) => [id, label]));
 }
 
+/** Values of the axes that are not shown. */
+function placeOf(view, x, at) {
+  const others = view.axes.filter((axis) => axis.name !== x && axis.values.length > 1);
+  return Object.fromEntries(others.map((axis) => [`at_${axis.name}`, axis.values[at?.[axis.name] ?? 0]]));
+}
+
 function* diagramRows({ arrays }, colours) {
-  const { x, cell, at, first, y } = arrays;
+  const { x, cell, at, first, y, status } = arrays;
   const words = colours.map((colour) => labelsOf(colour.categories));
   for (let i = 0; i < cell.length; i++) {
-    const codes = colours.map((colour, k) => words[k].get(arrays[`colour_${colour.name}`][i]) ?? null);
-    for (let k = first[i]; k < first[i + 1]; k++) yield [x[at[i]], cell[i], y[k], ...codes];
+    const codes = colours.map((colour, k) => words[k].get(arrays[`colour_${colour.name}`][i]) ?? "");
+    for (let k = first[i]; k < first[i + 1]; k++) yield [cell[i], x[at[i]], y[k], status[i], ...codes];
   }
 }
 
 function* curveRows({ curves }) {
-  for (const curve of curves) {
-    for (let i = 0; i < curve.x.length; i++) yield [curve.name, curve.x[i], curve.y[i], curve.low?.[i], curve.high?.[i], curve.unit];
+  for (const { title, group, unit, x, y, low, high } of curves) {
+    for (let i = 0; i < x.length; i++) yield [title, group, unit, x[i], y[i], (low ?? y)[i], (high ?? y)[i]];
   }
 }
 
 function* branchRows({ branches, points }) {
-  for (const branch of branches) {
-    for (const { stable, x, y } of branch.segments) {
-      for (let i = 0; i < x.length; i++) yield [branch.id, branch.period, stable ? "stable" : "unstable", x[i], y[i], null];
+  for (const { id, period, segments } of branches) {
+    for (const [k, { stable, x, y }] of segments.entries()) {
+      for (let i = 0; i < x.length; i++) yield [id, period, stable ? "stable" : "unstable", k, x[i], y[i]];
     }
   }
-  for (const point of points) {
-    for (const y of [point.y].flat()) yield [point.branch, null, null, point.x, y, point.kind];
-  }
+  for (const { branch, period, kind, x, y } of points) for (const height of y) yield [branch, period, kind, -1, x, height];
 }
 
-function* orbitRows({ arrays }, names) {
-  const tables = [["states", names.states], ["quantities", names.quantities]];
+function* orbitRows({ arrays }, nStates, nQuantities) {
+  const row = (values, i, n) => Array.from(values?.subarray(i * n, (i + 1) * n) ?? []);
   for (let i = 0; i < arrays.time.length; i++) {
-    const row = [arrays.time[i]];
-    for (const [name, columns] of tables) {
-      for (let k = 0; k < columns.length; k++) row.push(arrays[name]?.[i * columns.length + k]);
-    }
-    yield row;
+    yield [arrays.time[i], ...row(arrays.states, i, nStates), ...row(arrays.quantities, i, nQuantities)];
   }
 }
 
 function* planeRows({ attrs, arrays }) {
-  const { u, v, label } = arrays, words = labelsOf(attrs.labels);
-  for (let j = 0; j < v.length; j++) {
-    for (let i = 0; i < u.length; i++) yield [u[i], v[j], words.get(label[j * u.length + i]) ?? null];
+  const { u, v, label, starts, start_label: startLabel } = arrays, words = labelsOf(attrs.labels);
+  if (attrs.source === null) {
+    for (let i = 0; i < startLabel.length; i++) yield [starts[2 * i], starts[2 * i + 1], startLabel[i], words.get(startLabel[i]) ?? ""];
+    return;
   }
-}
-
-function* attractorRows({ attractors }, states) {
-  for (const one of attractors) {
-    for (const point of one.section) {
-      yield [one.id, one.kind, one.period, one.motion, one.share, one.low, one.high, ...states.map((_, k) => point[k])];
+  for (let j = 0; j < v.length; j++) {
+    for (let i = 0; i < u.length; i++) {
+      const code = label[j * u.length + i];
+      yield [u[i], v[j], code, words.get(code) ?? ""];
     }
   }
 }
+
+function* attractorRows({ attractors }) {
+  for (const one of attractors) {
+    const plain = [one.id, one.name, one.kind, one.period, one.motion, one.share, one.low, one.high];
+    for (const [k, point] of one.section.entries()) yield [...plain, k, ...point];
+  }
+}
+
+/** Head and rows of each kind of table. */
+const TABLES = {
+  diagram: async (source, view, { x, y, at }) => {
+    const colours = view.colours.filter(({ name }) => name !== "status" && name !== "seed");
+    const axis = view.axes.find(({ name }) => name === x), vertical = view.verticals.find(({ name }) => name === y);
+    const names = ["cell", heading(axis), heading(vertical), "status", ...colours.map(({ name }) => name)];
+    return [placeOf(view, x, at), names, diagramRows(await source.diagram({ x, y, at }), colours)];
+  },
+  curves: async (source, view, { x, at }) =>
+    [placeOf(view, x, at), ["curve", "group", "unit", x, "value", "low", "high"], curveRows(await source.curves({ x, at }))],
+  branches: async (source, view, { x, y, at }) =>
+    [placeOf(view, x, at), ["branch", "period", "what", "segment", x, y], branchRows(await source.branches({ x, y, at }))],
+  orbit: async (source, view, { cell, point }) => {
+    const { states, quantities } = view.model, answer = await source.orbit({ cell, point }), { attrs } = answer;
+    const told = { cell, point, frequency: attrs.frequency, status: attrs.status, period: attrs.period, motion: attrs.motion, attractor: attrs.attractor, note: attrs.note };
+    const known = Object.fromEntries(Object.entries(told).filter(([, value]) => value !== null && value !== undefined));
+    return [known, ["time [s]", ...states.map(heading), ...quantities.map(heading)], orbitRows(answer, states.length, quantities.length)];
+  },
+  plane: async (source, view, { at }) => {
+    const answer = await source.plane({ at });
+    const units = answer.attrs.states.map((name) => heading(view.model.states.find((state) => state.name === name)));
+    const fixed = Object.fromEntries(Object.entries(answer.attrs.fixed ?? {}).map(([name, value]) => [`fixed_${name}`, value]));
+    return [{ ...placeOf(view, null, at), ...fixed }, [...units, "label", "name"], planeRows(answer)];
+  },
+  attractors: async (source, view, { at }) => {
+    const names = ["id", "name", "kind", "period", "motion", "share", "low", "high", "point"];
+    return [placeOf(view, null, at), [...names, ...view.model.states.map(({ name }) => name)], attractorRows(await source.attractors({ at }))];
+  },
+};
 
 /**
  * A view's data as CSV.
@@ -88,22 +133,6 @@ function* attractorRows({ attractors }, states) {
  * @returns {Promise<Blob>}
  */
 export async function tableOf(source, kind, query) {
-  const view = await source.view();
-  const states = view.model.states.map((state) => state.name);
-  switch (kind) {
-    case "diagram": return csv([query.x, "cell", query.y, ...view.colours.map((one) => one.name)], diagramRows(await source.diagram(query), view.colours));
-    case "curves": return csv(["name", query.x, "value", "low", "high", "unit"], curveRows(await source.curves(query)));
-    case "branches": return csv(["branch", "period", "stability", query.x, query.y, "bifurcation"], branchRows(await source.branches(query)));
-    case "orbit": {
-      const quantities = view.model.quantities.map((one) => one.name);
-      return csv(["time", ...states, ...quantities], orbitRows(await source.orbit(query), { states, quantities }));
-    }
-    case "plane": {
-      const answer = await source.plane(query);
-      if (!answer.attrs.source) throw new Error("There is nothing of this plane to write.");
-      return csv([...answer.attrs.states, "label"], planeRows(answer));
-    }
-    case "attractors": return csv(["attractor", "kind", "period", "motion", "share", "low", "high", ...states], attractorRows(await source.attractors(query), states));
-    default: throw new Error(`${kind}: no such table`);
-  }
+  const [told, names, rows] = await TABLES[kind](source, await source.view(), query);
+  return csv({ ...told, title: `${kind} of a run` }, names, rows);
 }

@@ -49,8 +49,10 @@ export class Machine {
   }
 
   scrub() {
+    // read first: to pause puts the slider back to where the clock is
+    const wanted = (this.slider.value / 1000) * this.clock.duration;
     this.clock.pause();
-    this.clock.seek((this.slider.value / 1000) * this.clock.duration);
+    this.clock.seek(wanted);
   }
 
   /** Show an orbit; `keep` leaves time and speed as they are, for one that is followed. */

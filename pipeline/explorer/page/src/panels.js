@@ -103,6 +103,7 @@ class Panels {
     this.display(orbit, false);
     this.plane.show(orbit);
     this.follow?.show(orbit, selected);
+    this.grid.dataset.shown = `${selected.cell}-${selected.point}`;
   }
 
   /** Show an orbit that has been followed to another value. */

@@ -12,6 +12,7 @@ const LIST = "objects.json";
 const MOST_AT_ONCE = 2_000_000;
 
 const UNVERIFIED = "The objects of this copy are not compared with their checksums: the browser does that over https or on localhost only.";
+const BY_CLICK = "Browsers let no file read others, so this folder does not open by a double click: put it on a web server (here: python3 -m http.server), or export one file instead.";
 const VERIFIED = "Every object is compared with its sha256 when it is read.";
 
 async function sha256(bytes) {
@@ -32,6 +33,7 @@ class Objects {
     try {
       answer = await fetch(name.split("/").map(encodeURIComponent).join("/"));
     } catch {
+      if (location.protocol === "file:") throw new SourceError(BY_CLICK);
       throw new SourceError(`${name} cannot be read: the host does not answer.`, true);
     }
     if (!answer.ok) throw new SourceError(`${name} cannot be read: the host answers with ${answer.status}. Was all of the folder uploaded?`);
