@@ -1,5 +1,7 @@
 """The explorer's server: answers one page on loopback from one run, which it only reads.
 
+What takes long to import is imported once the address is known, while a browser starts.
+
 Reading goes on in a few threads, so that the page stays at hand; what waits is bounded. `security` says who
 is answered.
 """
@@ -16,21 +18,20 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tornado import httpserver, web
 
 from pipeline.explorer import page_html
-from pipeline.explorer.answers import ANSWERS, Answer, Query, first_answers
-from pipeline.explorer.explored import ExploredRun, ExplorerError
-from pipeline.explorer.live import LiveRun, live_problem
 from pipeline.explorer.security import Guard, Rate, headers_of, new_token
-from pipeline.explorer.socket import socket_routes
 from pipeline.spec.problems import SpecError
 from pipeline.store.errors import StoreError
 from pipeline.store.run import Run
 
 LOG = logging.getLogger(__name__)
+
+if TYPE_CHECKING:
+    from pipeline.explorer.answers import Answer
 
 HOST = "127.0.0.1"
 
@@ -82,6 +83,9 @@ class Service:
     """
 
     def __init__(self, run: Run, guard: Guard) -> None:
+        from pipeline.explorer.explored import ExploredRun
+        from pipeline.explorer.live import LiveRun, live_problem
+
         self.run = ExploredRun.of(run)
         self.guard, self.rate = guard, Rate(PER_SECOND, BURST)
         self.static = static_files()
@@ -100,6 +104,8 @@ class Service:
 
         Called in the loop that answers: those who wait for something to be compiled wait there.
         """
+        from pipeline.explorer.answers import first_answers
+
         self.pool.submit(first_answers, self.run, self.live)
         if self.live is None:
             return
@@ -114,7 +120,7 @@ class Service:
         live.warm(tell)
 
     async def work(self, function: Callable[[], Any], *, integrates: bool = False) -> Any:
-        """Call a function in a thread; raises `ExplorerError` if too many wait.
+        """Call a function in a thread; raises `TooManyError` if too many wait.
 
         One that integrates waits until what it needs is compiled, once, and not in these threads.
         """
@@ -135,7 +141,7 @@ class Service:
             self.live.close()
 
 
-class TooManyError(ExplorerError):
+class TooManyError(ValueError):
     """More is asked for than the server does at once."""
 
 
@@ -155,6 +161,10 @@ class Handler(web.RequestHandler):
         if service is not None:
             for name, value in headers_of(service.guard.port).items():
                 self.set_header(name, value)
+
+    def compute_etag(self) -> str | None:
+        """None: nothing is to be stored, and a digest of a large diagram would hold up everybody."""
+        return None
 
     def prepare(self) -> None:
         """Refuse before anything is done."""
@@ -236,6 +246,8 @@ class ApiHandler(Handler):
         await self._reply(self.request.body)
 
     async def _reply(self, body: bytes) -> None:
+        from pipeline.explorer.answers import Query
+
         query = Query(
             {k: v[-1].decode("utf-8", "replace") for k, v in self.request.query_arguments.items()}, body
         )
@@ -279,6 +291,8 @@ class NothingHandler(Handler):
 
 def application(service: Service) -> web.Application:
     """Return what answers requests for a run."""
+    from pipeline.explorer.answers import ANSWERS
+
     shared = {"service": service}
     routes: list[Any] = [
         (r"/", PageHandler, shared),
@@ -296,6 +310,8 @@ def _live_routes(service: Service) -> list[Any]:
     """The websocket of live computing, where the run allows any."""
     if service.live is None:
         return []
+
+    from pipeline.explorer.socket import socket_routes
 
     def authorised(handler: web.RequestHandler) -> bool:
         headers, guard = handler.request.headers, service.guard
@@ -346,7 +362,7 @@ def serve(
     echo
         Prints a line.
     opened
-        Called with the address once the server answers, such as to open a browser.
+        Called with the address once it can be asked, such as to open a browser.
 
     Raises
     ------
@@ -358,25 +374,23 @@ def serve(
     run = Run.open(source)
     taken = listening(port)
     guard = Guard(new_token(), taken.getsockname()[1])
-    service = Service(run, guard)
-    try:
-        asyncio.run(_answer(service, taken, echo, opened))
-    finally:
-        service.close()
-        taken.close()
-
-
-async def _answer(
-    service: Service,
-    taken: socket.socket,
-    echo: Callable[[str], None],
-    opened: Callable[[str], None] | None,
-) -> None:
-    server = httpserver.HTTPServer(application(service), **LIMITS)
-    server.add_socket(taken)
-    service.warm()
-    address = f"http://{HOST}:{service.guard.port}/?token={service.guard.token}"
+    address = f"http://{HOST}:{guard.port}/?token={guard.token}"
     echo(address)
     if opened is not None:
         opened(address)
+    # a browser takes a moment to start, and so does what answers it: who asks meanwhile waits in the queue
+    try:
+        service = Service(run, guard)
+        try:
+            asyncio.run(_answer(service, taken))
+        finally:
+            service.close()
+    finally:
+        taken.close()
+
+
+async def _answer(service: Service, taken: socket.socket) -> None:
+    server = httpserver.HTTPServer(application(service), **LIMITS)
+    server.add_socket(taken)
+    service.warm()
     await asyncio.Event().wait()

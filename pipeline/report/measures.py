@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -229,6 +230,53 @@ def beside_window(results: Results, of: Sequence[str], options: Options) -> Esti
     return Estimate(float(cells.mean()), low, high, text, found.step, cells.size)
 
 
+def change_of_period(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Value of the axis at which the period of most cells changes, from below to above.
+
+    Options: ``below`` and ``above``, the periods on its two sides; ``low`` and ``high``. The interval reaches
+    from the last value with the one to the next with the other: next to a bifurcation, where motions close
+    slowly, most cells may have neither. It spans all such places if there are several.
+    """
+    ds, axis = _cells(results, of[0])
+    here = _within(ds, axis, options)
+    values, n = here[axis].values, here.sizes["cell"]
+    step = _step(ds[axis].values)
+    if values.size < 2:
+        return absent(f"the axis has fewer than two values {_asked(options)}", step)
+    below, above = (2 * _matches(here, {"period": options[side]}).sum(1) > n for side in ("below", "above"))
+    decided = np.flatnonzero(below | above)
+    places = [(i, k) for i, k in pairwise(decided) if below[i] and above[k]]
+    if not places:
+        change = f"from {options['below']} to {options['above']}"
+        return absent(f"most of {n} cells nowhere change {change} {_asked(options)}", step)
+    low, high = float(values[places[0][0]]), float(values[places[-1][1]])
+    text = f"period {options['below']} of most of {n} cells up to {low:g}, {options['above']} from {high:g}"
+    text += f"; {len(places)} such places" if len(places) > 1 else ""
+    return Estimate(0.5 * (low + high), low, high, text, step, n)
+
+
+def located_bifurcation(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Where bifurcations of a kind lie, found by following the orbits on which cells of a run end.
+
+    Options: ``type``, as `magpend analyse branches` names it; ``low`` and ``high``; ``max_period``, the
+    longest of orbits followed. The interval spans all that are found; each is located by itself, whatever the
+    step of the run's axis.
+    """
+    from pipeline.analysis.branches.table import table_of
+    from pipeline.layout.vocabulary import parameter_name
+
+    given = {name: options[name] for name in ("low", "high", "max_period")}
+    found = results.run(of[0]).derive("branches", **given, generations=1)
+    rows = [row for row in table_of(found) if row["type"] == options["type"]]
+    if not rows:
+        return absent(f"no {options['type'].replace('_', ' ')} was met {_asked(options)}")
+    name = parameter_name(str(found.attrs["parameter"]))
+    low = min(row[name] - row["bracket"] for row in rows)
+    high = max(row[name] + row["bracket"] for row in rows)
+    text = ", ".join(f"{row.get('side', '')} {row[name]:.7g}".strip() for row in rows)
+    return Estimate(0.5 * (low + high), low, high, f"located: {text}")
+
+
 def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Estimate:
     """Share of the cells that end on the rarest of some motions at one value: above 0, all coexist.
 
@@ -355,6 +403,8 @@ MEASURES: dict[str, Measure] = {
     "largest_share": largest_share,
     "window_width": window_width,
     "beside_window": beside_window,
+    "change_of_period": change_of_period,
+    "located_bifurcation": located_bifurcation,
     "rarest_motion": rarest_motion,
     "largest_exponent": largest_exponent,
     "agreement": agreement,

@@ -10,8 +10,10 @@ import signal
 import socket
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import psutil
 import pytest
 from tornado.httpclient import HTTPRequest
@@ -20,11 +22,17 @@ from tornado.simple_httpclient import SimpleAsyncHTTPClient
 from tornado.websocket import websocket_connect
 
 from pipeline.explorer import browser, page_html, server
+from pipeline.explorer.answers import ANSWERS
 from pipeline.explorer.arrays import unpack_arrays
 from pipeline.explorer.security import Guard, Rate, content_policy, new_token
 from pipeline.explorer.server import Service, application, listening
+from pipeline.layout.identity import identity_of
+from pipeline.layout.plan import make_plan
+from pipeline.spec.parsing import load_spec
 from pipeline.spec.problems import SpecError
+from pipeline.store.commits import write_task
 from pipeline.store.run import Run
+from pipeline.store.setup import create
 
 # as in test_view.py, which computes it for most of what is read here
 TITLE = "</title><script>alert(1)</script>"
@@ -99,17 +107,51 @@ class Client:
         self.service.pool.shutdown(wait=True)
 
 
-@pytest.fixture
-def made_run(made):
-    """A finished run of made-up numbers, with a title that would be a script if it were no text."""
-    for task in range(made.plan.n_tasks):
-        made.commit(task)
-    return made.info.directory
+SWEEP = """
+kind = "sweep"
+title = "small sweep"
+[axes]
+frequency_hz = { start = 2.0, stop = 3.0, num = 5 }
+q = { values = [1.5, 1.6] }
+[initial_conditions]
+kind = "grid"
+psi1_deg = { start = -30, stop = 30, num = 3 }
+psi2_deg = { start = -20, stop = 20, num = 4 }
+[integration]
+n_transient = 2
+n_keep = 3
+[execution]
+trajectories_per_task = 60
+"""
+
+
+def finished(folder):
+    """A finished run of made-up numbers: what is asked here is who is answered."""
+    (folder / "spec.toml").write_text(SWEEP, "utf-8")
+    spec = load_spec(folder / "spec.toml")
+    plan = make_plan(spec)
+    info = create(folder / "run", spec, plan, identity_of(spec, plan, "test-kernel"), SWEEP)
+    rng = np.random.default_rng(1)
+    for task in range(plan.n_tasks):
+        shape = tuple(s.stop - s.start for s in plan.task(task))
+        values = {
+            v.name: rng.uniform(1, 5, (*shape, *(plan.sizes[d] for d in v.own_dims))).astype(v.dtype)
+            for v in plan.variables
+        }
+        values["status"][...] = 2
+        write_task(info, plan, task, values, {"bounded": plan.cells_in(task)})
+    return info.directory
 
 
 @pytest.fixture
-def client(made_run):
-    found = Client(Run.open(made_run))
+def made_run(tmp_path):
+    return finished(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    found = Client(Run.open(finished(tmp_path_factory.mktemp("served"))))
+    found.service.rate = Rate(1e6, 1_000_000)
     yield found
     found.close()
 
@@ -121,7 +163,7 @@ def sentence(answer):
 # ---- what is answered
 
 
-def test_api__answers_with_the_token(client, made_run):
+def test_api__answers_with_the_token(client):
     view = client.ask("/api/view")
     assert view.code == 200
     found = json.loads(view.body)
@@ -274,23 +316,23 @@ def test_zoom__takes_a_region_and_bounded_bodies(client):
 
 
 def test_api__is_bounded_in_rate_and_in_length(client, monkeypatch):
-    client.service.rate = Rate(0.001, 3)
+    monkeypatch.setattr(client.service, "rate", Rate(0.001, 3))
     codes = [client.ask("/static/explorer.css").code for _ in range(5)]
     assert codes == [200, 200, 200, 429, 429]
-    client.service.rate = Rate(1000.0, 1000)
+    monkeypatch.setattr(client.service, "rate", Rate(1000.0, 1000))
     answer = client.ask(f"/api/view?x={'a' * server.MOST_ADDRESS}")
     assert answer.code == 414
-    client.service.waiting = server.THREADS + server.MOST_WAITING
-    assert client.ask("/api/view").code == 429
-    client.service.waiting = 0
+    with monkeypatch.context() as patched:
+        patched.setattr(client.service, "waiting", server.THREADS + server.MOST_WAITING)
+        assert client.ask("/api/view").code == 429
     assert client.ask("/api/view").code == 200
 
 
-def test_api__what_integrates_waits_for_what_it_needs(client):
+def test_api__what_integrates_waits_for_what_it_needs(client, monkeypatch):
     """Others are answered meanwhile: they do not wait in the threads that read."""
 
     async def hold():
-        client.service.compiled = asyncio.Event()
+        monkeypatch.setattr(client.service, "compiled", asyncio.Event())
 
     async def release():
         client.service.compiled.set()
@@ -317,14 +359,18 @@ def test_api__what_integrates_waits_for_what_it_needs(client):
     assert found == [400] * len(orbits)
 
 
-def test_api__damage_is_said_and_nothing_is_shown(client, made_run):
+def test_api__damage_is_said_and_nothing_is_shown(made_run):
     section = made_run / "cube.zarr" / "section"
     for file in section.rglob("*"):
         if file.is_file() and file.name != "zarr.json":
             content = bytearray(file.read_bytes())
             content[len(content) // 2] ^= 1
             file.write_bytes(bytes(content))
-    answer = client.ask("/api/diagram?x=frequency&y=psi1&at.q=0")
+    client = Client(Run.open(made_run))
+    try:
+        answer = client.ask("/api/diagram?x=frequency&y=psi1&at.q=0")
+    finally:
+        client.close()
     assert answer.code == 500
     assert "magpend verify" in sentence(answer)
 
@@ -333,7 +379,7 @@ def test_api__an_unexpected_error_tells_nothing_of_the_inside(client, monkeypatc
     def fails(*arguments):
         raise RuntimeError("/home/somebody/secret")
 
-    answer = server.ANSWERS["view"]
+    answer = ANSWERS["view"]
     monkeypatch.setattr(type(answer), "give", property(lambda self: fails), raising=False)
     found = client.ask("/api/view")
     assert found.code == 500
@@ -393,29 +439,30 @@ def test_listening__is_on_loopback_and_says_what_is_taken():
         one.close()
 
 
-def test_redirect_file__is_for_this_user_alone(monkeypatch):
-    """A browser is started with the name of a file: the address with its token is no argument."""
-    path = browser.redirect_file("http://127.0.0.1:1/?token=a&b=\"'<")
-    assert path.stat().st_mode & 0o077 == 0
-    assert path.parent.stat().st_mode & 0o077 == 0
-    text = path.read_text("utf-8")
-    assert "token=a&amp;b=&quot;" in text
-    opened = []
-    done = threading.Event()
+def test_browser__is_told_a_file_for_this_user_alone(monkeypatch):
+    """The address with its token is no argument of a process, and nothing is left behind."""
+    opened, done = [], threading.Event()
     monkeypatch.setattr(browser.webbrowser, "open", lambda address: (opened.append(address), done.set()))
-    browser.open_browser("http://127.0.0.1:1/?token=secret")
-    assert done.wait(10)
-    assert opened[0].startswith("file://")
-    assert "secret" not in opened[0]
+    with browser.browser() as open_address:
+        open_address("http://127.0.0.1:1/?token=secret&b=\"'<")
+        assert done.wait(10)
+        assert opened[0].startswith("file://")
+        assert "secret" not in opened[0]
+        path = Path(opened[0].removeprefix("file://"))
+        assert path.stat().st_mode & 0o077 == 0
+        assert path.parent.stat().st_mode & 0o077 == 0
+        assert "token=secret&amp;b=&quot;" in path.read_text("utf-8")
+    assert not path.parent.exists()
 
 
 # ---- the command
 
 
-def test_explore__serves_until_it_is_stopped(made_run, start):
+def test_explore__serves_until_it_is_stopped(made_run, start, environment, monkeypatch):
     """It prints the address, answers, changes nothing in the run, and ends with Ctrl-C as other commands."""
     before = {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")}
-    process = start("explore", made_run, "--no-browser")
+    monkeypatch.setitem(environment, "BROWSER", "true")  # a browser that ends at once
+    process = start("explore", made_run)
     address = process.stdout.readline().strip()
     found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{43})", address)
     assert found, address
@@ -434,6 +481,7 @@ def test_explore__serves_until_it_is_stopped(made_run, start):
     assert process.wait(20) == 130
     said = process.stderr.read()
     assert "stopped" in said
+    assert list(Path(environment["TMPDIR"]).glob("magpend-explore-*")) == []
     assert "so far" not in said.partition("Ctrl-C ends it")[2]
     assert {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")} == before
 

@@ -73,6 +73,22 @@ def test_window_width__beyond_the_axis(known):
     assert MEASURES["window_width"](known, ["run"], {"period": 1, "contains": 3.5}).missing
 
 
+def test_change_of_period__between_neighbouring_values(known):
+    options = {"below": 2, "above": 1, "low": 2.3, "high": 2.7}
+    known.cubes["run"]["orbit_period"][50, :9] = 2  # fewer than half, beyond the change
+    found = MEASURES["change_of_period"](known, ["run"], options)
+    assert (found.low, found.high) == (pytest.approx(2.49), pytest.approx(2.5))
+    known.cubes["run"]["orbit_period"][50] = 0  # next to a bifurcation motions close slowly
+    found = MEASURES["change_of_period"](known, ["run"], options)
+    assert (found.low, found.high) == (pytest.approx(2.49), pytest.approx(2.51))
+    known.cubes["run"]["orbit_period"][60:64] = 2
+    found = MEASURES["change_of_period"](known, ["run"], options)
+    assert (found.low, found.high) == (pytest.approx(2.49), pytest.approx(2.64))
+    assert "2 such places" in found.text
+    assert "nowhere change" in MEASURES["change_of_period"](known, ["run"], options | {"below": 4}).missing
+    assert MEASURES["change_of_period"](known, ["run"], options | {"high": 2.3}).missing
+
+
 def test_beside_window__counts_both_sides(known):
     options = {"period": 1, "contains": 2.8, "other": [2, 4], "within": 0.02}
     found = MEASURES["beside_window"](known, ["run"], options)

@@ -59,7 +59,8 @@ function build(source, root, view, messages) {
   const toolbar = new Toolbar(state, view, source.formats ?? ["csv"], doing);
   toolbar.curves = curves;
   curves.onLoaded = () => toolbar.showToggles();
-  for (const text of notesOf(source, view)) messages.note(text);
+  if (source.notice) messages.note(source.notice);
+  else if (view.cells.pending) messages.note(pendingOf(view), () => location.reload());
   const left = el("div", { class: "main-column" }, toolbar.element, legend.element, diagram.element, curves.element, messages.facts);
   const right = el("div", { class: "side-column" });
   const layout = el("div", { class: "layout" }, left, right);
@@ -89,14 +90,9 @@ function factsOf(view, count, data, attrs) {
   return parts.join(" · ");
 }
 
-function notesOf(source, view) {
-  const notes = [], { total, pending } = view.cells;
-  if (source.notice) notes.push(source.notice);
-  if (pending && !source.notice) {
-    const share = told((100 * (total - pending)) / total);
-    notes.push(`This run is not complete: ${pending.toLocaleString("en")} of ${total.toLocaleString("en")} cells are pending (${share} % done). Go on with magpend run, then reload this page.`);
-  }
-  return notes;
+function pendingOf(view) {
+  const { total, pending } = view.cells, share = told((100 * (total - pending)) / total);
+  return `This run is not complete: ${pending.toLocaleString("en")} of ${total.toLocaleString("en")} cells are pending (${share} % done). magpend run goes on with it.`;
 }
 
 /** What the buttons do. */

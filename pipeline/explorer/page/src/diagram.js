@@ -110,9 +110,9 @@ export class Diagram {
 
   emptiness() {
     const { total, pending } = this.view.cells;
-    if (pending === total) return "No cell of this run is computed yet. Go on with magpend run, then reload this page.";
+    if (pending === total) return "No cell of this run is computed yet. magpend run goes on with it.";
     return pending
-      ? "No finished cell has points here. Some cells are still pending: go on with magpend run, then reload this page."
+      ? "No finished cell has points here. Some cells are still pending."
       : "No cell here has points: they diverged, failed, or rest. The report and magpend status say which.";
   }
 

@@ -57,7 +57,8 @@ export class Follow {
     this.job?.cancel();
     [this.orbit, this.origin, this.from, this.wanted] = [orbit, orbit, selected, null];
     this.back.disabled = true;
-    this.tell("Drag: the orbit follows by continuation.");
+    this.tell(orbit.attrs.period ? "Drag: the orbit follows by continuation." : "This motion is not periodic: no orbit of it can be followed.");
+    for (const control of [this.slider, this.input]) control.disabled = !orbit.attrs.period;
     this.arrange();
   }
 

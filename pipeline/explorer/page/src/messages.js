@@ -26,9 +26,10 @@ export class Messages {
     this.banner.append(el("button", { type: "button", text: "Close", on: { click: () => this.problem(null) } }));
   }
 
-  /** Add a sentence that stays, such as that a run is not complete. */
-  note(text) {
-    if (text) this.notes.append(el("p", { class: "note-line", text }));
+  /** Add a sentence that stays, such as that a run is not complete; `again` looks whether it still holds. */
+  note(text, again = null) {
+    const button = again && el("button", { type: "button", text: "Look again", on: { click: again } });
+    this.notes.append(el("div", { class: "note-line" }, el("p", { text }), button));
   }
 
   /** Show how far something is; `cancel` ends it. Null takes it away. */

@@ -1,5 +1,7 @@
 // An orbit as the source gives it: columns by name, the section points, and what is known of it.
 
+import { visible } from "./palette.js";
+
 /**
  * Columns of an orbit, a live path or a followed orbit.
  * @param {{attrs: Object, arrays: Object, shapes: Object}} packed
@@ -61,12 +63,21 @@ export function withUnit({ label, name, unit }) {
   return unit && unit !== "1" ? `${text} [${unit}]` : text;
 }
 
+const seen = new Map();
+
+/** A colour as it is told from a card's; remembered, for drawings that move ask for it in every frame. */
+function seenOn(colour, paper) {
+  const key = `${colour} ${paper}`;
+  if (!seen.has(key)) seen.set(key, visible(colour, paper));
+  return seen.get(key);
+}
+
 /** Colour of an orbit: its attractor's where it attracts; where it does not, the ink's, which no attractor has. */
 export function colourOf(orbit, view, colours) {
   if (orbit.stable === false) return colours.ink;
   const attractors = view.colours?.find((entry) => entry.name === "attractor");
   const category = attractors?.categories.find((entry) => entry.id === orbit.attrs.attractor);
-  return category?.colour ?? colours.accent;
+  return category ? seenOn(category.colour, colours.card) : colours.accent;
 }
 
 /** Indices of all axes at the parameter values of an orbit. */

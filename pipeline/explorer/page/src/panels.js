@@ -13,6 +13,9 @@ import { Series } from "./series.js";
 import { showFacts } from "./facts.js";
 import { themeChanged } from "./theme.js";
 
+/** How long a connection may be away before that is said [ms]. */
+const PATIENCE_MS = 2000;
+
 class Panels {
   constructor(state, source, element, view) {
     Object.assign(this, { state, source, element, view, live: source.live ?? null, orbit: null, own: null });
@@ -20,10 +23,23 @@ class Panels {
     this.asked = 0;
     this.hint = el("p", { class: "hint", role: "status" });
     this.grid = el("div", { class: "panels" });
-    element.replaceChildren(this.hint, this.grid);
+    this.liveNote = el("p", { class: "hint", role: "status", hidden: true });
+    element.replaceChildren(this.hint, this.liveNote, this.grid);
     this.build();
     this.forget = [state.on(["selected"], () => this.select()), state.on(["dark"], themeChanged)];
+    if (this.live) this.forget.push(this.live.on((status) => this.showLive(status)));
     this.select();
+  }
+
+  /** Say what stands in the way of computing: a connection that is sought, code that is compiled. */
+  showLive({ connected, warming }) {
+    clearTimeout(this.lateNote);
+    const say = (text) => {
+      this.liveNote.textContent = text;
+      show(this.liveNote, Boolean(text));
+    };
+    if (connected) say(warming ? `Compiling what live computing needs: ${warming.done} of ${warming.total} done.` : "");
+    else this.lateNote = setTimeout(() => say("Not connected to magpend: nothing can be computed until it answers again."), PATIENCE_MS);
   }
 
   build() {
@@ -143,6 +159,7 @@ class Panels {
 
   destroy() {
     this.asked = -1;
+    clearTimeout(this.lateNote);
     this.startJob?.cancel();
     this.clock.pause();
     for (const end of this.forget) end?.();

@@ -510,3 +510,47 @@ def test_diagram__zoom_here_gives_the_window_as_a_specification_and_runs_it(
     computed = open_run(new)["frequency"].values
     assert (computed.min(), computed.max()) == pytest.approx((2.22, 2.28))
     assert page.complaints == []
+
+
+def test_diagram__of_a_run_that_is_not_complete_says_so(visit: Callable[..., Any], made: Any) -> None:
+    total = made.plan.n_cells
+    with served(made.info.directory) as address:
+        opened = drawn(visit(address))
+        page, note, inside = (
+            opened.page,
+            opened.page.locator(".note-line"),
+            opened.page.locator(".diagram-note"),
+        )
+        assert f"{total} of {total} cells are pending" in note.inner_text()
+        assert "No cell of this run is computed yet" in inside.inner_text()
+        made.commit(0)
+        note.get_by_role("button", name="Look again").click()
+        page.wait_for_selector(".diagram-note", state="hidden")
+        drawn(opened)
+        assert f"{total - made.plan.cells_in(0)} of {total} cells are pending" in note.inner_text()
+        for index in range(1, made.plan.n_tasks):
+            made.commit(index)
+        note.get_by_role("button", name="Look again").click()
+        note.wait_for(state="detached")
+        assert opened.complaints == []
+
+
+def test_diagram__other_axes_are_chosen(visit: Callable[..., Any], made: Any) -> None:
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    cube = open_run(made.info.directory).load()
+    with served(made.info.directory) as address:
+        page = drawn(visit(address)).page
+        shown, at = state_of(page)["x"], state_of(page)["at"]
+        (other,) = at
+        page.select_option(f"select[name='at.{other}']", "1")
+        drawn_of = "[...magpend.diagram.data.cell].join()"
+        part = cube.assign(
+            number=(cube["status"].dims, np.arange(cube["status"].size).reshape(cube["status"].shape))
+        )
+        cells = part["number"].isel({other: 1}).transpose(shown, ...).values.ravel()
+        until(page, f"{drawn_of} === '{','.join(map(str, cells))}'")
+        page.select_option("select[name=x]", other)
+        until(page, f"magpend.diagram.data.attrs.x === '{other}'")
+        assert state_of(page)["at"] == {shown: 0}
+        assert page.evaluate("[...magpend.diagram.data.x]") == sorted(cube[other].values.tolist())

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from pipeline.layout.letters import letter
 from pipeline.runs.derive import stored
 from pipeline.store.reading import open_run
 from pipeline.store.run import Run
-from tests.pipeline.explorer.browser.conftest import HOSTILE, WAIT_MS
+from tests.pipeline.explorer.browser.conftest import HOSTILE, WAIT_MS, served
 from tests.pipeline.explorer.browser.test_diagram import click_on, drawn, places_of
 
 SOURCES = Path(__file__).parents[4] / "pipeline" / "explorer" / "page" / "src"
@@ -183,6 +184,30 @@ def test_controls__all_have_names_and_time_obeys_keys(page):
     play.focus()
     play.press("Space")
     page.page.get_by_role("button", name="Pause").wait_for()
+
+
+def test_save__gives_the_picture_and_the_data_of_a_panel(page, cube):
+    choose(page, 4)
+    card = page.page.locator(".panel-portraits")
+    card.locator("details.save summary").click()
+    with page.page.expect_download() as drawn_file:
+        card.get_by_role("button", name="save as SVG").click()
+    svg = ElementTree.fromstring(Path(drawn_file.value.path()).read_bytes())
+    assert sum("path" in part.tag for part in svg.iter()) > 10
+    with page.page.expect_download() as table:
+        card.get_by_role("button", name="save as CSV").click()
+    lines = [line for line in Path(table.value.path()).read_text("utf-8").splitlines() if line[0] != "#"]
+    assert "psi1_dot [rad/s]" in lines[0].split(",")
+    assert len(lines) > 100
+
+
+def test_connection__that_is_lost_is_said_and_sought(visit, looked_at):
+    with served(looked_at) as address:
+        opened = drawn(visit(address, **QUIET))
+        choose(opened, 0)
+    opened.page.get_by_text("Not connected to magpend").wait_for()
+    opened.page.get_by_role("button", name="Integrate this start").click()
+    note_of(opened, "plane", "connection to magpend was lost")
 
 
 def test_hostile_title__stays_text(page):
