@@ -16,6 +16,7 @@ import multiprocessing
 import os
 import pickle
 import stat
+import threading
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -33,6 +34,9 @@ LOG = logging.getLogger("magpend.cache")
 
 _DIGEST = hashlib.sha256
 _LENGTH = _DIGEST().digest_size
+
+_PICKING = threading.Lock()
+"""One thread at a time changes numba's settings: another would be given the folder of neither."""
 
 
 @cache
@@ -123,12 +127,13 @@ class KeptCode(FunctionCache):
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
         # numba picks its folder from settings, which are put back for other users of numba
         settings: Any = numba.config
-        before = settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES
-        settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = str(folder), ""
-        try:
-            super().__init__(function)  # type: ignore[no-untyped-call]
-        finally:
-            settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = before
+        with _PICKING:
+            before = settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES
+            settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = str(folder), ""
+            try:
+                super().__init__(function)  # type: ignore[no-untyped-call]
+            finally:
+                settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = before
         stamp = self._impl.locator.get_source_stamp()
         self._cache_file = _Entries(self._cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
 

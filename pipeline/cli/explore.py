@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Annotated
 
 import typer
@@ -25,7 +26,7 @@ def explore(
     tunnel the port: ssh -L PORT:127.0.0.1:PORT
     """
     from pipeline.cli import console
-    from pipeline.explorer.browser import open_browser
+    from pipeline.explorer.browser import browser
     from pipeline.explorer.server import serve
 
     def serving(address: str) -> None:
@@ -33,4 +34,5 @@ def explore(
         console.result(address)
         console.note("the page is at this address, for this machine alone; Ctrl-C ends it")
 
-    serve(directory, port, echo=serving, opened=None if no_browser else open_browser)
+    with contextlib.nullcontext() if no_browser else browser() as opened:
+        serve(directory, port, echo=serving, opened=opened)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import atexit
+import contextlib
 import os
 import shutil
 import tempfile
 import threading
 import webbrowser
+from collections.abc import Callable, Iterator
 from html import escape
 from pathlib import Path
 
@@ -24,10 +25,8 @@ _REDIRECT = """<!doctype html>
 """
 
 
-def redirect_file(address: str) -> Path:
-    """Write a file, for this user alone, that leads a browser to an address; it goes with the process."""
-    folder = Path(tempfile.mkdtemp(prefix="magpend-explore-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+def redirect_file(folder: Path, address: str) -> Path:
+    """Write a file, for this user alone, that leads a browser to an address."""
     path = folder / "open.html"
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(handle, "w", encoding="utf-8") as file:
@@ -35,7 +34,19 @@ def redirect_file(address: str) -> Path:
     return path
 
 
-def open_browser(address: str) -> None:
-    """Open an address in the person's browser, if there is one; the server does not wait for it."""
-    path = redirect_file(address)
-    threading.Thread(target=webbrowser.open, args=(path.as_uri(),), daemon=True, name="browser").start()
+@contextlib.contextmanager
+def browser() -> Iterator[Callable[[str], None]]:
+    """Yield what opens an address in the person's browser, if there is one; nobody waits for it.
+
+    The file by which that is done is there for as long as the block takes.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="magpend-explore-"))
+
+    def open_address(address: str) -> None:
+        path = redirect_file(folder, address)
+        threading.Thread(target=webbrowser.open, args=(path.as_uri(),), daemon=True, name="browser").start()
+
+    try:
+        yield open_address
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -155,13 +155,13 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
     room
         What they may take.
     """
-    chosen = choosing(room.orbits)
-    try:
-        each = _bytes_each(copied, chosen, count, room)
-    except ExplorerError as error:
-        copied.about["orbits"] = {"blocks": [], "missing": str(error)}
-        copied.sentences.append(f"This copy has no orbits: {error}")
+    if copied.run.spec.recorded is not None:
+        missing = "This copy has no orbits: the drive of the run is a recording, which does not repeat."
+        copied.about["orbits"] = {"blocks": [], "missing": missing}
+        copied.sentences.append(missing)
         return 0
+    chosen = choosing(room.orbits)
+    each = _bytes_each(copied, chosen, count, room)
     if each * len(chosen.cells) > room.n_bytes:
         chosen = choosing(int(room.n_bytes / each))
     n = len(chosen.cells)
@@ -181,8 +181,8 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
     copied.sentences += [missing] if missing else []
     if 0 < n < chosen.groups:
         copied.sentences.append(
-            f"Of the orbits of {chosen.groups:,} attractors at their parameters this copy has {n:,}; "
-            "elsewhere the nearest is shown."
+            f"Of {chosen.groups:,} orbits, one for each attractor (or period and motion) at its parameters, "
+            f"this copy has {n:,}; elsewhere the nearest is shown."
         )
     return n
 
@@ -201,7 +201,10 @@ def _orbit(
     run: ExploredRun, cell: int, count: np.ndarray, room: Room
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The orbit from a cell's last section, in the digits and at the instants that there is room for."""
-    arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
+    try:
+        arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
+    except (ExplorerError, ArithmeticError) as error:  # of one cell: the page says so where it is asked for
+        return {}, {"cell": cell, "failed": str(error)}
     del arrays["section"]  # the columns have it, of every cell
     if room.brief:
         arrays = brief(arrays, closed=attrs["period"] is not None)

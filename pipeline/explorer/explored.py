@@ -121,7 +121,7 @@ class ExploredRun(Run):
             return found
 
     def large(self, key: str, make: Callable[[], T]) -> T:
-        """As `remembered`, but for what is large: the last few alone are kept."""
+        """As `remembered`, but for what is large: made one at a time, and the last few alone are kept."""
         with self._lock:
             last: list[str] = self._opened.setdefault("large", [])
             if key in last:
@@ -129,7 +129,9 @@ class ExploredRun(Run):
             last.append(key)
             while len(last) > MOST_LARGE:
                 self._opened.pop(last.pop(0), None)
-        return self.remembered(key, make)
+            alone = self._opened.setdefault("large alone", threading.Lock())
+        with alone:
+            return self.remembered(key, make)
 
     @property
     def path(self) -> str | None:

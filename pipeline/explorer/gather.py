@@ -104,7 +104,8 @@ def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
         )
     if left:
         copied.sentences.append(
-            f"{left} quantities of the model are not among the vertical axes here (--quantity adds them)."
+            f"{left} quantities of the model are not among the vertical axes here; "
+            "magpend export --quantity NAME adds one."
         )
     lines = [(a.name, place) for a in run.axes for place in places(run, but=a.name)]
     heights = [str(v["name"]) for v in view["verticals"]]

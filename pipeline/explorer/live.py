@@ -19,6 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import xarray as xr
 
+from magpend_core.equilibria import newton_steps
 from magpend_core.models.parameters import ParameterError
 from magpend_core.orbits import section_map
 from pipeline.explorer.catalog import Catalog, Known
@@ -305,6 +306,8 @@ class Warming:
         flight = Flight(place, live.integration, start[None], lambda: None)
         section, _ = flight.advance(np.array([0]), 1)
         flight.closed(section, live.integration)
+        if live.model.autonomous:  # where it rests is told at its end
+            newton_steps(live.model.system, start[None], place.parameters.pack())
 
     def _series(self) -> None:
         live = self._live

@@ -147,7 +147,7 @@ def read_request(text: str | bytes) -> Request:
     try:
         return _READER.validate_json(text)
     except ValidationError as error:
-        raise RequestError(sentence_of(error), _number_in(text)) from None
+        raise RequestError(sentence_of(error), number_in(text)) from None
 
 
 def sentence_of(error: ValidationError) -> str:
@@ -161,8 +161,8 @@ def sentence_of(error: ValidationError) -> str:
     return f"{place}: {reason}." if place else f"the message cannot be read: {reason}."
 
 
-def _number_in(text: str | bytes) -> int | None:
-    """The ``id`` of a message that is wrong in something else."""
+def number_in(text: str | bytes) -> int | None:
+    """The ``id`` of a message that is not read further; None if it has none."""
     try:
         number = json.loads(text)["id"]
     except (ValueError, KeyError, TypeError, RecursionError):

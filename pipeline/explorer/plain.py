@@ -5,11 +5,6 @@ from __future__ import annotations
 import re
 import unicodedata
 
-_GREEK = frozenset((
-    "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu",
-    "nu", "xi", "omicron", "pi", "rho", "sigma", "tau", "upsilon", "phi", "chi", "psi", "omega",
-))  # fmt: skip
-
 _SUBSCRIPTS = str.maketrans("0123456789+-aehijklmnoprstuvx", "₀₁₂₃₄₅₆₇₈₉₊₋ₐₑₕᵢⱼₖₗₘₙₒₚᵣₛₜᵤᵥₓ")
 
 _ACCENTS = {"dot": "\u0307", "ddot": "\u0308", "hat": "\u0302", "bar": "\u0304", "tilde": "\u0303"}
@@ -20,13 +15,15 @@ _SUBSCRIPT = re.compile(r"_(?:\{([^{}]*)\}|(.))")
 
 
 def _letter(name: str) -> str:
+    """A Greek letter by its name in LaTeX; anything else stays a word."""
     known = name.lower().removeprefix("var")
-    if known not in _GREEK:
-        return name
     case = "SMALL" if name[0].islower() else "CAPITAL"
     # Unicode spells lambda differently
-    found = unicodedata.lookup(f"GREEK {case} LETTER {'LAMDA' if known == 'lambda' else known.upper()}")
-    return found
+    spelled = {"lambda": "lamda"}.get(known, known).upper()
+    try:
+        return unicodedata.lookup(f"GREEK {case} LETTER {spelled}")
+    except KeyError:
+        return name
 
 
 def plain(symbol: str, name: str) -> str:

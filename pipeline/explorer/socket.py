@@ -16,7 +16,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from pipeline.explorer.jobs import Answer
 from pipeline.explorer.live import LiveRun, LiveSession
-from pipeline.explorer.messages import MOST_BYTES
+from pipeline.explorer.messages import MOST_BYTES, number_in
 
 LOG = logging.getLogger(__name__)
 
@@ -87,7 +87,8 @@ class LiveSocket(WebSocketHandler):
         self._heard = now
         if self._allowance < 0.0:
             self._allowance = 0.0
-            self._send({"id": None, "kind": "error", "error": "too many messages; send fewer."})
+            told = "too many messages; send fewer."
+            self._send({"id": number_in(message), "kind": "error", "error": told})
         elif self._session is not None:
             self._session.receive(message)
 

@@ -29,6 +29,8 @@ FORMATS = {"csv": "text/csv; charset=utf-8", "nc": "application/x-netcdf"}
 MOST_ROWS = 2_000_000
 """Rows of a table as CSV; what is larger is for NetCDF, or for Python."""
 
+_ROWS_AT_ONCE = 65_536
+
 Asked = Mapping[str, Any]
 
 
@@ -231,16 +233,21 @@ def _heading(ds: xr.Dataset, name: str) -> str:
 
 def _rows(columns: list[np.ndarray]) -> Iterator[tuple[Any, ...]]:
     """Rows of plain values; floats as short as they read back, NaN as nothing."""
-    plain = [
-        ["" if v != v else v for v in c.tolist()] if c.dtype.kind == "f" else c.tolist() for c in columns
-    ]
-    # a word that a spreadsheet would take for a formula stays a word
-    safe = [[_word(v) for v in c] if c and isinstance(c[0], str) else c for c in plain]
-    yield from zip(*safe, strict=True)
+    n = len(columns[0]) if columns else 0
+    for first in range(0, n, _ROWS_AT_ONCE):  # as objects, numbers take ten times their room
+        yield from zip(*(_plain(c[first : first + _ROWS_AT_ONCE]) for c in columns), strict=True)
 
 
-def _word(text: Any) -> Any:
-    formula = isinstance(text, str) and text[:1] in ("=", "+", "-", "@", "\t")
+def _plain(column: np.ndarray) -> list[Any]:
+    values = column.tolist()
+    if column.dtype.kind == "f":
+        return ["" if v != v else v for v in values]
+    return [_word(v) for v in values] if column.dtype.kind == "U" else values
+
+
+def _word(text: str) -> str:
+    """A word that a spreadsheet would take for a formula stays a word."""
+    formula = text[:1] in ("=", "+", "-", "@", "\t")
     return f"'{text}" if formula else text
 
 

@@ -255,6 +255,28 @@ def change_of_period(results: Results, of: Sequence[str], options: Options) -> E
     return Estimate(0.5 * (low + high), low, high, text, step, n)
 
 
+def located_bifurcation(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Where bifurcations of a kind lie, found by following the orbits on which cells of a run end.
+
+    Options: ``type``, as `magpend analyse branches` names it; ``low`` and ``high``; ``max_period``, the
+    longest of orbits followed. The interval spans all that are found; each is located by itself, whatever the
+    step of the run's axis.
+    """
+    from pipeline.analysis.branches.table import table_of
+    from pipeline.layout.vocabulary import parameter_name
+
+    given = {name: options[name] for name in ("low", "high", "max_period")}
+    found = results.run(of[0]).derive("branches", **given, generations=1)
+    rows = [row for row in table_of(found) if row["type"] == options["type"]]
+    if not rows:
+        return absent(f"no {options['type'].replace('_', ' ')} was met {_asked(options)}")
+    name = parameter_name(str(found.attrs["parameter"]))
+    low = min(row[name] - row["bracket"] for row in rows)
+    high = max(row[name] + row["bracket"] for row in rows)
+    text = ", ".join(f"{row.get('side', '')} {row[name]:.7g}".strip() for row in rows)
+    return Estimate(0.5 * (low + high), low, high, f"located: {text}")
+
+
 def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Estimate:
     """Share of the cells that end on the rarest of some motions at one value: above 0, all coexist.
 
@@ -382,6 +404,7 @@ MEASURES: dict[str, Measure] = {
     "window_width": window_width,
     "beside_window": beside_window,
     "change_of_period": change_of_period,
+    "located_bifurcation": located_bifurcation,
     "rarest_motion": rarest_motion,
     "largest_exponent": largest_exponent,
     "agreement": agreement,

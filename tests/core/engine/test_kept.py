@@ -4,14 +4,16 @@ import logging
 import os
 import subprocess
 import sys
+import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from magpend_core.engine import jit
+from magpend_core.engine import jit, kept
 from magpend_core.engine.jit import kernel
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
@@ -207,7 +209,7 @@ def test_cache_folder__stays_when_the_process_goes_elsewhere(run_python, tmp_pat
 
 SCRIPT = """
 import sys
-from magpend_core.engine import jit
+from magpend_core.engine import jit, kept
 def summed(x, y):
     return x + y
 dispatcher = jit.kernel(summed)
@@ -232,6 +234,22 @@ def test_keep__two_processes_that_write_at_once(tmp_path):
         printed = [process.communicate(timeout=120)[0].split() for process in processes]
         assert printed == [["3.0"] * 3 + [hits]] * 2
     assert len(entries(tmp_path / "cache")) == 2
+
+
+def test_keep__threads_at_once_find_their_folder(cache, monkeypatch, tmp_path):
+    """Whoever computes in threads binds kernels there: each has its place in the cache, none elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    waits, begin = cycle([0.0, 0.004, 0.001]), kept.FunctionCache.__init__
+
+    def after_a_while(self, function):
+        time.sleep(next(waits))
+        begin(self, function)
+
+    monkeypatch.setattr(kept.FunctionCache, "__init__", after_a_while)
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda _: kernel(cubed), range(32)))
+    assert {Path(one._cache.cache_path).is_relative_to(cache) for one in made} == {True}
+    assert [path.name for path in tmp_path.iterdir()] == [cache.name]
 
 
 def test_keep__no_warning_reaches_people_who_turn_them_into_errors(cache):

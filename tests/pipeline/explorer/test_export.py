@@ -12,6 +12,7 @@ import re
 import numpy as np
 import pytest
 
+from pipeline.explorer import copied_orbits
 from pipeline.explorer import folder as folder_module
 from pipeline.explorer.arrays import unpack_arrays
 from pipeline.explorer.columns import fit, levels, thinned
@@ -196,6 +197,21 @@ def test_choose__an_orbit_for_each_attractor_else_the_nearest(run):
     assert set(choose(explored, layers, count, 1000).how[1:]) == {ALIKE}
     none = choose(explored, layers, count, 0)
     assert (len(none.cells), set(none.orbit)) == (0, {NONE})
+
+
+def test_export_page__an_orbit_that_fails_is_told_where_it_is_asked_for(run, tmp_path, monkeypatch):
+    asked = []
+
+    def orbit(_, cell, point):
+        asked.append(cell)
+        raise ArithmeticError("the trajectory ends early")
+
+    monkeypatch.setattr(copied_orbits, "orbit", orbit)
+    written = export_page(run, tmp_path / "copy.html", most_orbits=3)
+    assert written.orbits == 3
+    _, attrs = _data(_objects(tmp_path / "copy.html")["orbits-0"])
+    assert {entry["failed"] for entry in attrs.values()} == {"the trajectory ends early"}
+    assert {entry["cell"] for entry in attrs.values()} <= set(asked)
 
 
 def test_export_folder__lists_every_object_and_pins_the_list(run, tmp_path):

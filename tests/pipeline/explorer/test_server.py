@@ -10,6 +10,7 @@ import signal
 import socket
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -438,29 +439,30 @@ def test_listening__is_on_loopback_and_says_what_is_taken():
         one.close()
 
 
-def test_redirect_file__is_for_this_user_alone(monkeypatch):
-    """A browser is started with the name of a file: the address with its token is no argument."""
-    path = browser.redirect_file("http://127.0.0.1:1/?token=a&b=\"'<")
-    assert path.stat().st_mode & 0o077 == 0
-    assert path.parent.stat().st_mode & 0o077 == 0
-    text = path.read_text("utf-8")
-    assert "token=a&amp;b=&quot;" in text
-    opened = []
-    done = threading.Event()
+def test_browser__is_told_a_file_for_this_user_alone(monkeypatch):
+    """The address with its token is no argument of a process, and nothing is left behind."""
+    opened, done = [], threading.Event()
     monkeypatch.setattr(browser.webbrowser, "open", lambda address: (opened.append(address), done.set()))
-    browser.open_browser("http://127.0.0.1:1/?token=secret")
-    assert done.wait(10)
-    assert opened[0].startswith("file://")
-    assert "secret" not in opened[0]
+    with browser.browser() as open_address:
+        open_address("http://127.0.0.1:1/?token=secret&b=\"'<")
+        assert done.wait(10)
+        assert opened[0].startswith("file://")
+        assert "secret" not in opened[0]
+        path = Path(opened[0].removeprefix("file://"))
+        assert path.stat().st_mode & 0o077 == 0
+        assert path.parent.stat().st_mode & 0o077 == 0
+        assert "token=secret&amp;b=&quot;" in path.read_text("utf-8")
+    assert not path.parent.exists()
 
 
 # ---- the command
 
 
-def test_explore__serves_until_it_is_stopped(made_run, start):
+def test_explore__serves_until_it_is_stopped(made_run, start, environment, monkeypatch):
     """It prints the address, answers, changes nothing in the run, and ends with Ctrl-C as other commands."""
     before = {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")}
-    process = start("explore", made_run, "--no-browser")
+    monkeypatch.setitem(environment, "BROWSER", "true")  # a browser that ends at once
+    process = start("explore", made_run)
     address = process.stdout.readline().strip()
     found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{43})", address)
     assert found, address
@@ -479,6 +481,7 @@ def test_explore__serves_until_it_is_stopped(made_run, start):
     assert process.wait(20) == 130
     said = process.stderr.read()
     assert "stopped" in said
+    assert list(Path(environment["TMPDIR"]).glob("magpend-explore-*")) == []
     assert "so far" not in said.partition("Ctrl-C ends it")[2]
     assert {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")} == before
 

@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from magpend_core import rates
 from magpend_core.models import load_model, model_names
 from pipeline.explorer import diagram as diagrams
+from pipeline.explorer import tables
 from pipeline.explorer.answers import ANSWERS, Query
 from pipeline.explorer.arrays import unpack_arrays
 from pipeline.explorer.colours import NONE
@@ -26,11 +27,15 @@ from pipeline.explorer.planes import plane
 from pipeline.explorer.series import SAMPLES
 from pipeline.explorer.tables import table
 from pipeline.explorer.view import describe_view
+from pipeline.layout.identity import identity_of
+from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import DIVERGED, PERIODIC
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
+from pipeline.spec.parsing import load_spec
 from pipeline.store.errors import DamagedError
 from pipeline.store.run import Run
+from pipeline.store.setup import create
 
 # the same model and section as in test_live.py: nothing more is compiled
 SWEEP = """
@@ -468,6 +473,29 @@ def test_orbit__of_a_pending_cell_is_refused(made_run):
         orbit(ExploredRun.of(made_run.directory), 0, 0)
 
 
+def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
+    """Under a recorded drive there are diagrams, and no orbits, quantities or analyses."""
+    rows = [f"{0.45 * k},{0.45 * k + 0.2}" for k in range(12)]
+    (tmp_path / "drive.csv").write_text("\n".join(["rising_s,falling_s", *rows, "5.4,"]), "utf-8")
+    text = (
+        'kind = "sweep"\n[drive]\nfile = "drive.csv"\n[axes]\nq = { values = [0.6, 1.6] }\n'
+        '[initial_conditions]\nkind = "list"\npoints = [[0.1, 0.0, 0.0, 0.0]]\n'
+        "[integration]\nn_transient = 5\nn_keep = 3\n"
+    )
+    (tmp_path / "spec.toml").write_text(text, "utf-8")
+    spec = load_spec(tmp_path / "spec.toml")
+    plan = make_plan(spec)
+    create(tmp_path / "run", spec, plan, identity_of(spec, plan, "test-kernel"), text)
+    explored = ExploredRun.of(tmp_path / "run")
+    view = describe_view(explored, False)
+    assert view["commands"] == {}
+    assert [v["name"] for v in view["verticals"]] == list(explored.model.state_names)
+    arrays, _ = unpack_arrays(diagram(explored, "q", view["verticals"][0]["name"], {}))
+    assert len(arrays["cell"]) == 2
+    with pytest.raises(ExplorerError, match="recording"):
+        orbit(explored, 0, 0)
+
+
 # ---- what lies over and beside
 
 
@@ -574,6 +602,18 @@ def test_table__has_the_same_rows_in_both_formats(sweep, kind, tmp_path):
             np.testing.assert_array_equal(read, ds[name].values)
 
 
+def test_table__a_word_is_no_formula(monkeypatch):
+    """Names come from models and titles; a spreadsheet would run one that begins like a formula."""
+    monkeypatch.setattr(tables, "_ROWS_AT_ONCE", 2)
+    ds = xr.Dataset({
+        "name": ("row", np.array(["=1+1", "+x", "@y", "B: left", ""])),
+        "value": ("row", np.array([-1.0, np.nan, 0.1, 2.0, 1e-300])),
+    })  # fmt: skip
+    assert tables._csv(ds).decode().splitlines() == [
+        "name,value", "'=1+1,-1.0", "'+x,", "'@y,0.1", "B: left,2.0", ",1e-300"
+    ]  # fmt: skip
+
+
 def test_table__of_branches_and_its_refusals(walk):
     explored = ExploredRun.of(walk)
     asked = {"x": "A", "y": "x", "at": {}}
@@ -600,8 +640,6 @@ def test_zoom__is_a_specification_of_the_region(sweep, tmp_path):
     reply = ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, body), None)
     path = tmp_path / "zoom.toml"
     path.write_bytes(reply.content)
-    from pipeline.spec.parsing import load_spec
-
     spec = load_spec(path)
     assert spec.axes["A"].array()[[0, -1]].tolist() == [0.21, 0.24]
     with pytest.raises(ExplorerError, match="x"):

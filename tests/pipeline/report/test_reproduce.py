@@ -217,9 +217,14 @@ def test_shipped_study__smoke(main, tmp_path):
     for row in rows:
         if set(row["of"]) & of_runs and row["measure"] != "share_above":
             assert row["verdict"] in ("undecided", "calibrated on this, so no test"), row
-            assert "decide" in row["reason"] or "Not measured" in row["reason"], row
+            located = row["measure"] == "located_bifurcation"  # by following orbits, not on an axis
+            assert located or "decide" in row["reason"] or "Not measured" in row["reason"], row
     met = {row["measure"] for row in rows if row["verdict"] == "met"}
     assert {"share_above", "recorded_duty_cycle", "curves_described", "torque_gain"} <= met
+    # docs/branches.md has the doublings at 2.4986083 and 2.5056646 Hz
+    (doubling,) = [row for row in rows if row["measure"] == "located_bifurcation"]
+    assert 2.4986082 < doubling["low"] <= doubling["high"] < 2.5056648
+    assert "contradicts" in doubling["reason"]
     # the discs' field is no bump: docs/magnet.md has the widths grow from 3.5 to 4.3 degrees
     (width,) = [row for row in rows if row["measure"] == "width_spread"]
     assert width["verdict"] == "not met"

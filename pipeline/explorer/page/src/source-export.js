@@ -6,6 +6,8 @@ import { tableOf } from "./formats.js";
 import { SourceError } from "./source.js";
 
 const NONE = 0xffffffff;
+/** What an orbit is to a cell, as pipeline/explorer/copied_orbits.py says it. */
+const SAME_ATTRACTOR = 1, ALIKE = 2;
 
 /** A source over objects by name; the kinds of copies say where these are, and where the columns. */
 export class ExportSource {
@@ -132,7 +134,8 @@ export class ExportSource {
     if (k === undefined || k === NONE) throw new SourceError("This cell has no points, so it has no orbit.");
     const stored = await this.packed(`orbits-${blocks.findLastIndex((first) => first <= k)}`);
     const { arrays, shapes } = partOf(stored, `${k}.`), attrs = { ...stored.attrs[k] };
-    const how = index.arrays.how[cell], same = how <= 2;
+    if (attrs.failed) throw new SourceError(`The orbit of cell ${attrs.cell} could not be integrated: ${attrs.failed}`);
+    const how = index.arrays.how[cell], same = how === SAME_ATTRACTOR || how === ALIKE;
     attrs.note = this.noteOf(attrs, cell, how);
     const sections = await this.sections(same ? cell : attrs.cell);
     arrays.section = sections.values;
@@ -140,6 +143,8 @@ export class ExportSource {
     if (same && attrs.cell !== cell) {
       const { status } = await this.layers(this.single(cell));
       Object.assign(attrs, { status: this.about.status[status[0]] ?? attrs.status, start: null });
+      // of a cell that is alike its own start alone is known, which is not this cell's
+      if (how === ALIKE) attrs.seeds = [];
     }
     Object.assign(attrs, { stored: attrs.cell, cell, point });
     return { attrs, arrays, shapes };
@@ -148,7 +153,7 @@ export class ExportSource {
   /** What the shown orbit is to the cell that was asked for. */
   noteOf(attrs, cell, how) {
     if (attrs.cell === cell) return "This orbit of the very cell was integrated when the copy was made.";
-    const of = { 1: "of the attractor that this cell settled on", 2: "of a cell with the same period and motion" }[how];
+    const of = { [SAME_ATTRACTOR]: "of the attractor that this cell settled on", [ALIKE]: "of a cell with the same period and motion" }[how];
     if (of) return `Shown is the orbit ${of}, integrated from cell ${attrs.cell} when the copy was made; the section points are cell ${cell}'s own.`;
     const place = this.cells.at(attrs.cell);
     const where = this.described.axes.map((axis) => `${axis.label} ${axis.values[place[axis.name]]} ${axis.unit}`.trim());
