@@ -28,7 +28,7 @@ export class Multipliers {
     this.chosen = -1;
     const known = this.values.length > 0;
     this.frame.element.hidden = this.list.hidden = !known;
-    this.note.textContent = known ? "" : "No multipliers: this orbit is not closed, or its attractor has not been analysed.";
+    this.note.textContent = known ? "" : absence(orbit.attrs);
     const items = this.values.map((value, k) => el("li", {}, el("button", {
       type: "button", class: "value", text: told(value),
       on: { focus: () => this.choose(k), pointerenter: () => this.choose(k), blur: () => this.choose(-1) },
@@ -102,6 +102,12 @@ export class Multipliers {
     ctx.textBaseline = "middle";
     ctx.fillText(text, left, top + 9);
   }
+}
+
+/** Why there are no multipliers. */
+function absence({ period, note }) {
+  if (!period) return "None: this motion is not periodic.";
+  return note ? "They are not known yet." : "They are not known: the orbit was not found to the last digits, or its attractor has not been analysed.";
 }
 
 /** A multiplier in words: its parts and its size. */

@@ -16,6 +16,9 @@ import { themeChanged } from "./theme.js";
 /** How long a connection may be away before that is said [ms]. */
 const PATIENCE_MS = 2000;
 
+/** How often an orbit is asked for again that lacks its multipliers [ms], and how many times. */
+const AGAIN_MS = 1500, MOST_ASKED = 60;
+
 class Panels {
   constructor(state, source, element, view) {
     Object.assign(this, { state, source, element, view, live: source.live ?? null, orbit: null, own: null });
@@ -119,7 +122,23 @@ class Panels {
     this.display(orbit, false);
     this.plane.show(orbit);
     this.follow?.show(orbit, selected);
+    this.complete(selected, MOST_ASKED);
     this.grid.dataset.shown = `${selected.cell}-${selected.point}`;
+  }
+
+  /** Ask again for an orbit whose multipliers the server was still compiling for. */
+  complete(selected, left) {
+    const { own, asked } = this;
+    if (!this.live || !own.attrs.period || own.attrs.multipliers || !own.attrs.note || left === 0) return;
+    setTimeout(async () => {
+      if (asked !== this.asked || own !== this.own) return;
+      const packed = await this.source.orbit(selected).catch(() => null);
+      if (!packed || asked !== this.asked || own !== this.own) return;
+      const wasShown = this.orbit === own;
+      this.own = new Orbit(packed, this.view.model);
+      if (wasShown) this.display(this.own, true);
+      this.complete(selected, left - 1);
+    }, AGAIN_MS);
   }
 
   /** Show an orbit that has been followed to another value. */
