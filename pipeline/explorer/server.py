@@ -106,7 +106,7 @@ class Service:
         """
         from pipeline.explorer.answers import first_answers
 
-        self.pool.submit(first_answers, self.run, self.live)
+        first = self.pool.submit(first_answers, self.run, self.live)
         if self.live is None:
             return
         live, loop = self.live, asyncio.get_running_loop()
@@ -117,7 +117,8 @@ class Service:
                 with contextlib.suppress(RuntimeError):  # the loop has ended
                     loop.call_soon_threadsafe(waiting.set)
 
-        live.warm(tell)
+        # what is compiled would hold up the first picture
+        first.add_done_callback(lambda done: None if done.cancelled() else live.warm(tell))
 
     async def work(self, function: Callable[[], Any], *, integrates: bool = False) -> Any:
         """Call a function in a thread; raises `TooManyError` if too many wait.
