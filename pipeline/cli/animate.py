@@ -91,7 +91,10 @@ def animate(
     from pipeline.store.local import unwritable
     from pipeline.store.run import Run
 
-    start = _start(context, model, frequency_hz, preset, settings, transient, directory is None)
+    words = list(context.args)
+    if directory is not None and directory.startswith("--"):  # no directory, but the first name of a state
+        words, directory = [directory, *words], None
+    start = _start(words, model, frequency_hz, preset, settings, transient, directory is None)
     points = read_pairs("--at", at or [], "frequency=2.2")
     clock = {"seconds": seconds, "fps": fps, "speed": speed, "size": size, "portrait": portrait}
     options: dict[str, Any] = {k: v for k, v in clock.items() if v is not None}
@@ -118,14 +121,14 @@ def animate(
 
 
 def _start(
-    context: typer.Context, model: str | None, frequency_hz: float | None, preset: str | None,
+    words: list[str], model: str | None, frequency_hz: float | None, preset: str | None,
     settings: list[str] | None, transient: int, alone: bool,
 ) -> Start | None:  # fmt: skip
     """Return what is given of a start; None of a run if nothing is."""
     from pipeline.runs.filming import Start
     from pipeline.spec.problems import SpecError
 
-    states = {name: values[0] for name, values in read_named(context.args, 1).items()}
+    states = {name: values[0] for name, values in read_named(words, 1).items()}
     given = {"--model": model, "--frequency": frequency_hz, "--preset": preset, "--set": settings}
     if not alone and any(given.values()):
         raise SpecError(

@@ -193,7 +193,7 @@ class _Plan:
         air = 0.12
         if not self.drawn:
             pitch = self.width / self.n_pairs
-            top = self.foot + self.below
+            top = 0.5 * self.foot + self.below
             high = self.height - top - self.above
             return [(i * pitch + self.left, top, pitch - self.left - air, high) for i in range(self.n_pairs)]
         half = min(0.52 * self.width, 1.25 * self.drawing)

@@ -111,7 +111,10 @@ def _palette(film: Animation) -> Image.Image:
     # paper stays white: among all pixels its colour would be a mean of it and of what is nearly white
     found = Image.fromarray(inked[None]).quantize(PALETTE_COLOURS - 1, Image.Quantize.MEDIANCUT)
     palette = Image.new("P", (1, 1))
-    palette.putpalette([255, 255, 255, *(found.getpalette() or [])[: 3 * (PALETTE_COLOURS - 1)]])
+    colours = np.array((found.getpalette() or [])[: 3 * (PALETTE_COLOURS - 1)]).reshape(-1, 3)
+    # nor may one be so near to white that the search, which is rough, takes it for the nearest
+    kept = colours[(colours < 248).any(axis=1)]
+    palette.putpalette([255, 255, 255, *kept.ravel().tolist()])
     return palette
 
 

@@ -102,7 +102,7 @@ def _point(
     """Make what shows a point that moves."""
     colours = np.empty((max(trail.length, 1), 4))
     colours[:, :3], colours[:, 3] = to_rgb(colour), np.linspace(0.0, 1.0, len(colours)) ** 1.5
-    comet = LineCollection([], linewidths=thick, animated=True, capstyle="round")
+    comet = LineCollection([], linewidths=thick, animated=True, capstyle="butt")
     ax.add_collection(comet, autolim=False)
     way = None
     if not trail.closed:

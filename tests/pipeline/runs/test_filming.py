@@ -146,6 +146,8 @@ def test_animate__files_open_with_their_frames_and_loop(main, run, tmp_path):
         with Image.open(tmp_path / f"film.{suffix}") as film:
             said = int(err.split(" frames")[0].split()[-1])
             assert (film.n_frames, film.width, film.info["loop"]) == (said, 300, 0)
+            paper = np.asarray(film.convert("RGB"))[:3]
+            assert (paper >= (255 if suffix == "gif" else 250)).all()
             shown = []
             for k in range(film.n_frames):
                 film.seek(k)
@@ -167,6 +169,21 @@ def test_animate__files_open_with_their_frames_and_loop(main, run, tmp_path):
         assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
     else:
         assert code == Exit.REFUSED
+
+
+def test_animate__a_start_without_a_run(main, run, tmp_path):
+    """States come first, or after the directory: neither is taken for the other."""
+    small = ["--seconds", "1", "--fps", "4", "--size", "200"]
+    words = ["--th", "0.4", "--w", "-0.2", "--model", "driven-pendulum", "--frequency", str(HZ)]
+    code, out, err = main("animate", *words, *small)
+    assert code == 0, err
+    assert out.splitlines()[0] == "animation: animation.gif"
+    with xr.open_dataset(tmp_path / "animation.nc", engine="scipy") as stored:
+        assert stored.orbit.values[0, 0].tolist() == [0.4, -0.2]
+    words = ["animate", str(run), "--at", "frequency=0.16", "--x", "0.3", "--out", "film.gif"]
+    assert main(*words, *small)[0] == 0
+    with xr.open_dataset(tmp_path / "film.nc", engine="scipy") as stored:
+        assert stored.orbit.values[0, 0].tolist() == [0.3, 0.0]
 
 
 def test_animate__mp4_without_ffmpeg_is_refused(main, tmp_path, monkeypatch):
