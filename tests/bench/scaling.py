@@ -7,22 +7,28 @@ Run it alone on a machine that does nothing else::
 *Strong scaling*: the same sweep with one worker and with two, from the first result to the last. *Weak
 scaling*: two workers with twice the cells against one with the cells once.
 
-*Ceiling*: a real scheduler, a real client and the window of `magpend run`, with simulated workers: threads
-of dask `Worker` objects inside this very process, whose tasks sleep for a known time. Scheduler, client and
-the workers' bookkeeping share one interpreter here, so real workers leave the coordinator more room than
-this. Printed are the share of time in which the threads were busy, and the processor time per task: it
-bounds the tasks per second, and so the workers that tasks of a given length keep busy.
+*Ceiling*: a real scheduler, a real client and the window of `magpend run` in this process, and simulated
+workers in another: threads of dask `Worker` objects whose tasks sleep for a known time. All of them share an
+interpreter there, which a cluster's workers do not. Printed are the share of time in which the threads were
+busy, from the first start to the last end, and between the ramps, which is from when each has had a task to
+when the last task starts; and the coordinator's processor time per task, which bounds the tasks per second,
+and so the workers that tasks of a given length keep busy.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
+import subprocess
+import sys
 import tempfile
 import time
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from distributed import Client, LocalCluster, Worker
 
 from pipeline.compute.limits import Limits
 from pipeline.compute.order import Order
@@ -79,35 +85,56 @@ def scaling(seconds: float, folder: Path) -> dict[str, float]:
 
 
 def asleep(seconds: float, index: int) -> dict[str, Any]:
-    """A task of known length."""
+    """A task of known length; tells when it slept."""
+    begin = time.time()
     time.sleep(seconds)
-    return {"task": index}
+    return {"task": index, "begin": begin, "end": time.time()}
+
+
+async def serve(address: str, objects: int, threads: int) -> None:
+    """Be so many workers until the scheduler ends."""
+    workers = [Worker(address, nthreads=threads, host="127.0.0.1", dashboard=False) for _ in range(objects)]
+    await asyncio.gather(*workers)
+    await asyncio.gather(*(worker.finished() for worker in workers))
+
+
+def busy(slept: list[dict[str, Any]], workers: int) -> tuple[float, float]:
+    """Shares of time in which workers were busy: in all, and without ramps."""
+    begins, ends = sorted(x["begin"] for x in slept), [x["end"] for x in slept]
+    low, high = begins[workers - 1], begins[-1]
+    inside = sum(max(0.0, min(x["end"], high) - max(x["begin"], low)) for x in slept)
+    in_all = sum(x["end"] - x["begin"] for x in slept) / (workers * (max(ends) - begins[0]))
+    return in_all, inside / (workers * (high - low)) if high > low else in_all
 
 
 def ceiling(workers: int, task_seconds: float, rounds: int) -> dict[str, float]:
     """Return how busy simulated workers are, and what a task costs."""
-    from distributed import Client, LocalCluster
-
-    per_object = min(THREADS, workers)
+    threads = min(THREADS, workers)
     settings = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
     with (
-        LocalCluster(
-            n_workers=workers // per_object, threads_per_worker=per_object, processes=False,
-            scheduler_kwargs=settings, silence_logs=50,
-        ) as cluster,
+        LocalCluster(n_workers=0, host="127.0.0.1", scheduler_kwargs=settings, silence_logs=50) as cluster,
         Client(cluster, set_as_default=False) as client,
-    ):  # fmt: skip
-        n = rounds * workers
-        started, used = time.perf_counter(), time.process_time()
-        task = partial(asleep, task_seconds)
-        window = Window(client, task, Order(range(n)), seconds=lambda index: task_seconds)
-        done = sum(1 for _ in window.results())
-        took, used = time.perf_counter() - started, time.process_time() - used
-    assert done == n
+    ):
+        command = [sys.executable, __file__, "--serve", cluster.scheduler_address, str(workers // threads)]
+        simulated = subprocess.Popen([*command, str(threads)], stderr=subprocess.DEVNULL)
+        try:
+            client.wait_for_workers(workers // threads, timeout=60)
+            n = rounds * workers
+            used = time.process_time()
+            task = partial(asleep, task_seconds)
+            window = Window(client, task, Order(range(n)), seconds=lambda index: task_seconds)
+            slept = list(window.results())
+            used = time.process_time() - used
+        finally:
+            simulated.terminate()
+            simulated.wait()
+    assert len(slept) == n
+    in_all, between = busy(slept, workers)
     cpu_s = used / n
     return {
         "tasks": n,
-        "busy": n * task_seconds / (took * workers),
+        "busy": in_all,
+        "busy between the ramps": between,
         "processor time per task [ms]": 1e3 * cpu_s,
         "tasks per second at most": 1 / cpu_s,
         "shortest task for 95 % busy [s]": 0.95 * workers * cpu_s,
@@ -122,7 +149,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=1000)
     parser.add_argument("--task-seconds", type=float, default=20.0)
     parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--serve", nargs=3, help=argparse.SUPPRESS, metavar=("ADDRESS", "OBJECTS", "THREADS"))
     given = parser.parse_args(arguments)
+    if given.serve:
+        address, *numbers = given.serve
+        asyncio.run(serve(address, *map(int, numbers)))
+        return
     with tempfile.TemporaryDirectory() as folder:
         tables = {"scaling": scaling(given.seconds, Path(folder))} if given.seconds else {}
     tables["ceiling"] = ceiling(given.workers, given.task_seconds, given.rounds)
