@@ -181,4 +181,5 @@ def test_scaling__ceiling(bench, capsys):
     printed = capsys.readouterr().out
     assert "processor time per task" in printed
     lines = [line.split() for line in printed.splitlines() if "busy" in line and "task" not in line]
-    assert all(0 < float(line[-1]) <= 1 for line in lines) and len(lines) == 2
+    assert len(lines) == 2
+    assert all(0 < float(line[-1]) <= 1 for line in lines)
