@@ -37,13 +37,13 @@ from numba.core import event
 
 from magpend_core.engine.digests import PACKAGE, functions_digest
 from magpend_core.engine.kept import keep
-from magpend_core.engine.parts import PartCompiler, RawCompiler
+from magpend_core.engine.parts import FusingCompiler, PartCompiler, RawCompiler
 
-# `contract` lets a product and a sum become one fused operation and nothing else: wider flags would
-# turn isnan(nan) into False. The default error model would add a branch to every division.
+# No fast math: which products are fused is said by `fused`, and wider flags would turn isnan(nan) into
+# False. The default error model would add a branch to every division.
 F = TypeVar("F", bound=Callable[..., Any])
 
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "pipeline_class": FusingCompiler}
 
 # A function that allocates nothing needs no reference counts, and each is an atomic operation: passing
 # a tuple of a dozen arrays to a callee costs a microsecond.
@@ -102,7 +102,7 @@ def part(function: F, dissolves: bool, short: bool = False) -> F:
         Whether the engine is small enough to be optimised as a whole.
     """
     compiler = RawCompiler if short else PartCompiler
-    options = {"no_cpython_wrapper": True, "pipeline_class": compiler, **UNCOUNTED, **WITHOUT_C}
+    options = {**UNCOUNTED, **WITHOUT_C, "no_cpython_wrapper": True, "pipeline_class": compiler}
     return njit(forceinline=dissolves, **options)(function)
 
 

@@ -209,8 +209,7 @@ def run_stage(w: Any, base: int, s: int) -> None:
     h = load(w, base + ROWS.step)
     for i in range(N):
         row = base + i * WIDTH
-        # a sum of two bare products could be fused in two ways, and an optimiser that peels the loop
-        # would choose another than one that does not
+        # named: written out, the first sum has a product on either side, in a loop on one
         total = STAGES[s, 0] * load(w, row + ROWS.slopes)
         for j in range(1, s):
             total = multiply_add(STAGES[s, j], load(w, row + ROWS.slopes + j * N * WIDTH), total)

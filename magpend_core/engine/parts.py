@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.typed_passes import NopythonTypeInference
+
+from magpend_core.engine.fused import FusedLibrary
 
 
 class _NoMachineCode:
@@ -28,7 +29,7 @@ class _NoMachineCode:
         """Do nothing: without machine code there is nothing that an environment could be told to."""
 
 
-class _PartLibrary(JITCodeLibrary):
+class _PartLibrary(FusedLibrary):
     """Intermediate code to be linked into other code."""
 
     @property
@@ -54,46 +55,61 @@ class _RawLibrary(_PartLibrary):
         """Leave that to the entry point's."""
 
 
-@register_pass(mutates_CFG=False, analysis_only=False)
-class _UsePartLibrary(FunctionPass):
-    _name = "magpend_part_library"
+class _GiveLibrary(FunctionPass):
+    """Gives a function its library before numba does."""
+
+    library: type[FusedLibrary]
 
     def __init__(self) -> None:
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Give the function its library before numba does."""
-        state.library = _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        """Make the library."""
+        state.library = self.library(state.targetctx.codegen(), state.func_id.func_qualname)
         return True
 
 
 @register_pass(mutates_CFG=False, analysis_only=False)
-class _UseRawLibrary(_UsePartLibrary):
-    _name = "magpend_raw_library"
+class _GiveFusedLibrary(_GiveLibrary):
+    _name, library = "magpend_fused_library", FusedLibrary
 
     def run_pass(self, state: Any) -> bool:
-        """Give the function its library before numba does."""
-        state.library = _RawLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        """Make the library, and let its machine code be kept."""
+        super().run_pass(state)
+        state.library.enable_object_caching()
         return True
 
 
-class PartCompiler(CompilerBase):
-    """numba's compiler of functions, up to the optimised intermediate code."""
+@register_pass(mutates_CFG=False, analysis_only=False)
+class _GivePartLibrary(_GiveLibrary):
+    _name, library = "magpend_part_library", _PartLibrary
+
+
+@register_pass(mutates_CFG=False, analysis_only=False)
+class _GiveRawLibrary(_GiveLibrary):
+    _name, library = "magpend_raw_library", _RawLibrary
+
+
+class FusingCompiler(CompilerBase):
+    """numba's compiler of functions, with products fused by our rule (see `fused`)."""
+
+    _gives: type[_GiveLibrary] = _GiveFusedLibrary
 
     def define_pipelines(self) -> list[Any]:
         """Return numba's own passes with one more."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(_UsePartLibrary, NopythonTypeInference)
+        passes.add_pass_after(self._gives, NopythonTypeInference)
         passes.finalize()
         return [passes]
 
 
-class RawCompiler(CompilerBase):
-    """numba's compiler of functions, up to the intermediate code: faster for small engines, not for large."""
+class PartCompiler(FusingCompiler):
+    """The same, up to the optimised intermediate code."""
 
-    def define_pipelines(self) -> list[Any]:
-        """Return numba's own passes with one more."""
-        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(_UseRawLibrary, NopythonTypeInference)
-        passes.finalize()
-        return [passes]
+    _gives = _GivePartLibrary
+
+
+class RawCompiler(FusingCompiler):
+    """The same, up to the intermediate code: faster for small engines, not for large."""
+
+    _gives = _GiveRawLibrary

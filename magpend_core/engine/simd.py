@@ -33,7 +33,6 @@ WIDTH = 16
 # halves and negates the exponent of a number whose bits are halved and taken from it (Lomont 2003)
 _INVERSE_ROOT = 0x5FE6EB50C7B537A9
 
-_CONTRACT = ("contract",)
 _DOUBLE = ir.DoubleType()
 _INT64 = ir.IntType(64)
 _VECTOR = ir.VectorType(_DOUBLE, WIDTH)
@@ -88,7 +87,7 @@ def _register_operator(op: Callable[..., Any], method: str) -> None:
         @lower_builtin(op, *args)
         def lower_op(context: Any, builder: Any, sig: Any, values: Any) -> Any:
             a, b = (_as(builder, v, t, lanes_type) for v, t in zip(values, sig.args, strict=True))
-            return getattr(builder, method)(a, b, flags=_CONTRACT)
+            return getattr(builder, method)(a, b)
 
 
 for _op, _method in (
@@ -177,10 +176,10 @@ def absolute(x: Any) -> Any:
 
 
 def multiply_add(a: Any, b: Any, c: Any) -> Any:
-    """``a * b + c``, rounded once where the CPU can.
+    """``a * b + c``, rounded once.
 
-    A sum of two products can be fused in two ways, and the compiler's choice depends on the CPU: this
-    says which product it is.
+    Within a function sums of products are fused by themselves (see `fused`); of two products that is the
+    one on the left, and this can say another.
     """
     return a * b + c
 
@@ -311,7 +310,7 @@ _primitive(inverse_sqrt_rough, _emit_inverse_sqrt_rough)
 _primitive(floor, _call("floor"))
 _primitive(upper, _emit_upper)
 _primitive(absolute, _call("fabs"))
-_primitive(multiply_add, _call("fmuladd"))
+_primitive(multiply_add, _call("fma"))
 _primitive(copysign, _call("copysign"))
 _primitive(where_less, _emit_where_less)
 _primitive(minimum, _emit_minimum)

@@ -1,0 +1,116 @@
+"""Which products are fused with sums: a rule of our own, in place of the compiler's choice.
+
+A fused product and sum, ``a * b + c`` rounded once, costs half as much as the two apart, so that every
+compiler wants to fuse. Left to it, what is fused depends on the CPU, on its version and on what was inlined
+where, and with that the last bits of a result. Here it depends on the function's source alone:
+
+- a sum or difference with a product in it, of the same function, is fused with it;
+- with two products it is fused with the one on the left;
+- nothing else is.
+
+The rule is applied to numba's intermediate code of a function, before LLVM sees any of it; LLVM may fuse
+nothing on its own then. A CPU without such an operation calls its C library's, for the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from llvmlite import ir
+from llvmlite.ir.instructions import InsertValue
+from numba.core import cgutils
+from numba.core.codegen import JITCodeLibrary
+
+
+class FusedLibrary(JITCodeLibrary):
+    """Machine code of functions whose products have been fused."""
+
+    def add_ir_module(self, ir_module: Any) -> None:
+        """Add a function's intermediate code."""
+        fuse_products(ir_module)
+        super().add_ir_module(ir_module)  # type: ignore[no-untyped-call]
+
+
+def fuse_products(module: ir.Module) -> None:
+    """Fuse products with sums in every function of a module, in place."""
+    for function in module.functions:
+        _fuse_in(function)
+
+
+def _fuse_in(function: ir.Function) -> None:
+    replaced: dict[ir.Instruction, ir.Instruction] = {}
+    for block in function.blocks:
+        for instruction in list(block.instructions):
+            if instruction.opname in ("fadd", "fsub") and not _is_negation(instruction):
+                fused = _fused(instruction)
+                if fused is not None:
+                    replaced[instruction] = fused
+                    # a product that nothing else needs is left for LLVM to drop
+                    block.instructions.remove(instruction)
+    if not replaced:
+        return
+    for block in function.blocks:
+        for instruction in block.instructions:
+            for operand in {x for x in instruction.operands if x in replaced}:
+                instruction.replace_usage(operand, replaced[operand])
+                if isinstance(instruction, InsertValue):  # llvmlite prints a second reference
+                    instruction.value = instruction.operands[1]
+
+
+def _fused(instruction: ir.Instruction) -> Any:
+    """Put a fused operation before a sum or difference and return it; None if it has no product in it."""
+    if getattr(instruction.type, "element", instruction.type) != ir.DoubleType():
+        return None
+    builder = ir.IRBuilder(instruction.parent)
+    builder.position_before(instruction)
+    left, right = instruction.operands
+    is_difference = instruction.opname == "fsub"
+    factors = _factors(builder, left)
+    if factors is not None:
+        rest = builder.fneg(right) if is_difference else right
+        return _multiply_add(builder, *factors, rest)
+    factors = _factors(builder, right)
+    if factors is None:
+        return None
+    a, b = factors
+    return _multiply_add(builder, builder.fneg(a) if is_difference else a, b, left)
+
+
+def _is_negation(value: Any) -> bool:
+    """Whether a value is another's negative, which numba also writes as a difference from minus zero."""
+    opname = getattr(value, "opname", None)
+    if opname != "fsub":
+        return bool(opname == "fneg")
+    left = value.operands[0]
+    zero = left.constant if isinstance(left, ir.Constant) else None
+    return isinstance(zero, float) and zero == 0.0 and math.copysign(1.0, zero) < 0.0
+
+
+def _factors(builder: ir.IRBuilder, value: Any) -> tuple[Any, Any] | None:
+    """Factors of a product, also of a scalar one that is spread over lanes; None of anything else."""
+    opname = getattr(value, "opname", None)
+    if opname == "fmul":
+        return tuple(value.operands)
+    if _is_negation(value):
+        factors = _factors(builder, value.operands[-1])
+        return None if factors is None else (builder.fneg(factors[0]), factors[1])
+    if opname == "shufflevector" and getattr(value.operands[0], "opname", None) == "insertelement":
+        factors = _factors(builder, value.operands[0].operands[1])
+        return None if factors is None else tuple(_like(builder, value, x) for x in factors)
+    return None
+
+
+def _like(builder: ir.IRBuilder, spread: Any, scalar: Any) -> Any:
+    """Spread a number over the lanes as another was spread."""
+    inserted, undefined, mask = spread.operands
+    first = builder.insert_element(inserted.operands[0], scalar, inserted.operands[2])
+    return builder.shuffle_vector(first, undefined, mask)
+
+
+def _multiply_add(builder: ir.IRBuilder, a: Any, b: Any, c: Any) -> Any:
+    kind = c.type
+    name = f"llvm.fma.v{kind.count}f64" if isinstance(kind, ir.VectorType) else "llvm.fma.f64"
+    signature = ir.FunctionType(kind, [kind] * 3)
+    function = cgutils.get_or_insert_function(builder.module, signature, name)  # type: ignore[no-untyped-call]
+    return builder.call(function, (a, b, c))
