@@ -14,6 +14,9 @@ from magpend_core.models.text.derivatives import derivatives
 from magpend_core.models.text.graph import STATED, Graph, Node, in_order, made_again, substituted
 from magpend_core.models.text.switching import Switch
 
+_NO_DIFFERENCE = 1e-300
+"""What a side makes less of than this counts as none."""
+
 MAX_JOINT = 3
 """Most surfaces on which a state slides at once, each of which the others' sides act on."""
 
@@ -153,8 +156,17 @@ def _solved(
             found.append(_joint(graph, k, partner[0], speeds, pulls, modes, zeros))
             continue
         (own,) = substituted(graph, [pulls[k][k]], zeros)
-        found.append(graph.neg(graph.div(rest, own)))
+        found.append(graph.neg(_quotient(graph, rest, own)))
     return found
+
+
+def _quotient(graph: Graph, top: Node, bottom: Node) -> Node:
+    """A quotient whose divisor is the difference that a side makes.
+
+    Where that is 0, as of friction without a coefficient, no state stays on the surface and any number will do.
+    """
+    makes_none = graph.call("absolute", bottom), graph.number(_NO_DIFFERENCE)
+    return graph.div(top, graph.where_less(*makes_none, graph.one, bottom))
 
 
 def _joint(
@@ -170,8 +182,9 @@ def _joint(
     rest_k, rest_j, kk, kj, jk, jj = substituted(
         graph, [speeds[k], speeds[j], pulls[k][k], pulls[k][j], pulls[j][k], pulls[j][j]], zeros
     )
-    alone = graph.neg(graph.div(graph.add(rest_k, graph.mul(kj, modes[j])), kk))
-    both = graph.div(
+    alone = graph.neg(_quotient(graph, graph.add(rest_k, graph.mul(kj, modes[j])), kk))
+    both = _quotient(
+        graph,
         graph.sub(graph.mul(kj, rest_j), graph.mul(jj, rest_k)),
         graph.sub(graph.mul(kk, jj), graph.mul(kj, jk)),
     )
