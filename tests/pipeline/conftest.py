@@ -96,7 +96,7 @@ def bytes_of():
 
 
 @pytest.fixture
-def made(tmp_path, write_spec):
+def made(tmp_path, write_spec, sweep_text):
     """A run directory set up from the small sweep, with made-up numbers to commit."""
     from pipeline.layout.identity import identity_of
     from pipeline.layout.plan import make_plan
@@ -104,11 +104,11 @@ def made(tmp_path, write_spec):
     from pipeline.store.commits import write_task
     from pipeline.store.setup import create
 
-    path = write_spec(SWEEP)
+    path = write_spec(sweep_text)
     spec = load_spec(path)
     plan = make_plan(spec)
     identity = identity_of(spec, plan, "test-kernel")
-    info = create(tmp_path / "run", spec, plan, identity, SWEEP)
+    info = create(tmp_path / "run", spec, plan, identity, sweep_text)
 
     def values(index: int) -> dict[str, np.ndarray]:
         shape = tuple(s.stop - s.start for s in plan.task(index))

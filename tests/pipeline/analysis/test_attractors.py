@@ -10,9 +10,7 @@ import pytest
 import xarray as xr
 
 from magpend_core import load_preset, sections
-from magpend_core.engine.jit import inline
-from magpend_core.engine.system import System
-from magpend_core.engine.vecmath import sincos
+from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.attractors import identify, match
@@ -191,69 +189,18 @@ def test_match__one_point(found):
 # ---- a driven pendulum: th'' = -th'/2 - sin(th) + g cos(2 t/3) ---------------------------------
 
 
-@inline
-def _constants(frequency, p, out):
-    out[0] = p[0]
-    out[1] = p[1]
-    out[2] = 2.0 * np.pi * frequency
-
-
-@inline
-def _forcing(t, c):
-    return c[1] * sincos(c[2] * t)[1]
-
-
-@inline
-def _rhs(y, u, c):
-    return (y[1], u - c[0] * y[1] - sincos(y[0])[0])
-
-
-@inline
-def _jacobian(y, u, c):
-    zero = 0.0 * y[0]
-    return (zero, zero + 1.0, -sincos(y[0])[1], zero - c[0])
-
-
-@inline
-def _edges(frequency, p, times, half_widths, jumps):
-    return
-
-
-@inline
-def _layers(y, dy, c):
-    return ()
-
-
-DRIVEN = System(
-    name="driven_pendulum",
-    state_names=("angle", "rate"),
-    is_angle=(True, False),
-    scales=(1.0, 1.0),
-    parameter_names=("damping", "amplitude"),
-    n_constants=3,
-    constants=_constants,
-    forcing=_forcing,
-    rhs=_rhs,
-    n_edges=0,
-    edges=_edges,
-    layers=_layers,
-    jacobian=_jacobian,
-    escape=(np.inf, 1e3),
-    has_layers=False,
-)
-
-
 def test_identify__rotating_orbits_close():
     """At g = 1.4 the pendulum turns over once per drive period, one way or the other.
 
     Baker and Gollub, Chaotic Dynamics (1990), ch. 3: damping 1/2, drive frequency 2/3, phase-locked
     rotation between the chaotic ranges of g.
     """
-    n, packed, frequency = 24, np.array([0.5, 1.4]), 2.0 / 3.0 / (2.0 * np.pi)
+    model, n, frequency = load_model("driven-pendulum"), 24, 2.0 / 3.0 / (2.0 * np.pi)
+    parameters = model.load(d=0.5, A=1.4)
     starts = np.random.default_rng(1).uniform(-2, 2, (n, 2))
     result = run_branches(
-        np.broadcast_to(packed, (n, 1, 2)), np.full((n, 1), frequency), starts,
-        n_transient=100, n_keep=24, rtol=1e-9, atol=1e-9, system=DRIVEN,
+        np.tile(parameters.pack(), (n, 1, 1)), np.full((n, 1), frequency), starts,
+        n_transient=100, n_keep=24, rtol=1e-9, atol=1e-9, system=model.system,
     )  # fmt: skip
     ds = xr.Dataset(
         {
@@ -262,9 +209,9 @@ def test_identify__rotating_orbits_close():
             "status": ("initial_condition", result.status[:, 0]),
             "orbit_period": ("initial_condition", result.orbit_period[:, 0]),
         },
-        coords={"state": ["angle", "rate"], "frequency": frequency},
+        coords={"state": list(model.state_names), "frequency": frequency},
     )
-    found = identify(ds, parameters=packed, system=DRIVEN)
+    found = identify(ds, parameters=parameters.pack(), system=model.system)
     assert found["kind"].values.tolist() == [1, 1]
     assert found["n_cells"].values.sum() == n
     period = found["orbit_period"].values

@@ -78,29 +78,24 @@ def _no_layers(y, dy, c):
     return ()
 
 
-def _system(**changes):
-    fields = {
-        "name": "branch_oscillator",
-        "state_names": ("x", "v"),
-        "is_angle": (False, False),
-        "scales": (1.0, 1.0),
-        "parameter_names": ("damping", "nonlinear", "linear", "cubic", "amplitude"),
-        "n_constants": 6,
-        "constants": _constants,
-        "forcing": _forcing,
-        "rhs": _rhs,
-        "n_edges": 0,
-        "edges": _no_edges,
-        "layers": _no_layers,
-        "jacobian": _jacobian,
-        "escape": (1e3, 1e3),
-        "has_layers": False,
-    }
-    return System(**{**fields, **changes})
-
-
 # x'' = amplitude cos(2 pi f t) - (damping + nonlinear x^2) x' - linear x - cubic x^3
-OSCILLATOR = _system()
+OSCILLATOR = System(
+    name="branch_oscillator",
+    state_names=("x", "v"),
+    is_angle=(False, False),
+    scales=(1.0, 1.0),
+    parameter_names=("damping", "nonlinear", "linear", "cubic", "amplitude"),
+    n_constants=6,
+    constants=_constants,
+    forcing=_forcing,
+    rhs=_rhs,
+    n_edges=0,
+    edges=_no_edges,
+    layers=_no_layers,
+    jacobian=_jacobian,
+    escape=(1e3, 1e3),
+    has_layers=False,
+)
 
 
 def family(frequency, parameters, free, scale, period=1, system=OSCILLATOR):
@@ -364,7 +359,7 @@ def test_explore__symmetry_breaking():
     orbits = family(1.0 / (2.0 * np.pi), parameters, "amplitude", 1.0)
     branches = explore(
         [Start(orbits, settled([0.0, 0.0], orbits.frequency_hz, parameters), 0.3)],
-        Scope(0.02, 3.0, max_period=1),
+        Scope(0.1, 2.5, max_period=1),
     )
     pitchfork = only(branches[0], "branch_point")[0]
     broken = pitchfork.child
@@ -390,10 +385,10 @@ def test_explore__symmetry_breaking():
     for tangent in (plane[0], plane[1], plane.sum(axis=0) / np.sqrt(2.0)):
         pitchfork.child = None
         pitchfork.point.tangent[:] = tangent
-        _cross([(branches[0], pitchfork)], branches[:1], Scope(0.02, 3.0, max_period=1))
+        _cross([(branches[0], pitchfork)], branches[:1], Scope(0.1, 2.5, max_period=1))
         assert pitchfork.child is not None
         ends = [orbits.values(pitchfork.child.points[i].u)[0] for i in (0, -1)]
-        assert ends == pytest.approx([3.0, 3.0])  # the symmetric branch ends at 0.02
+        assert ends == pytest.approx([2.5, 2.5])  # the symmetric branch ends at 0.1
 
 
 def test_continue_curves__fold_of_duffing(resonance):
@@ -420,40 +415,25 @@ def test_continue_curves__fold_of_duffing(resonance):
     assert [c.start for c in continue_curves(both, ((0.1, 0.4), (0.2, 0.4)))] == [0]
 
 
-@inline
-def _turning_rhs(y, u, c):
-    x, v = y
-    return v, u + c[3] - c[0] * v - c[2] * sincos(x)[0]
-
-
-@inline
-def _turning_jacobian(y, u, c):
-    zero = 0.0 * y[0]
-    return zero, zero + 1.0, -c[2] * sincos(y[0])[1], zero - c[0]
-
-
 @pytest.mark.slow
 def test_explore__rotation():
     """A pendulum that turns over once per period: closed on its circle, one turn, round a fold."""
-    system = _system(
-        name="branch_turning", is_angle=(True, False), rhs=_turning_rhs, jacobian=_turning_jacobian,
-        parameter_names=("damping", "nothing", "gravity", "torque", "amplitude"),
-    )  # fmt: skip
-    frequency, parameters = 0.32, [0.5, 0.0, 1.0, 1.0, 1.0]
+    model = load_model("driven-pendulum")
+    frequency, parameters = 0.32, {"d": 0.5, "w0": 1.0, "A": 1.0, "bias": 1.0}
 
     def rates(t, z):
-        force = parameters[4] * np.cos(2.0 * np.pi * frequency * t) + parameters[3]
-        return [z[1], force - parameters[0] * z[1] - parameters[2] * np.sin(z[0])]
+        force = parameters["A"] * np.cos(2.0 * np.pi * frequency * t) + parameters["bias"]
+        return [z[1], force - parameters["d"] * z[1] - parameters["w0"] ** 2 * np.sin(z[0])]
 
     end = solve_ivp(rates, (0.0, 80 / frequency), [0.0, 2.0], rtol=1e-8, atol=1e-8).y[:, -1]
     end[0] = np.remainder(end[0], 2.0 * np.pi)
-    orbits = family(frequency, parameters, "amplitude", 1.0, system=system)
+    orbits = family(frequency, model.load(**parameters).pack(), "A", 1.0, system=model.system)
     (branch,) = explore([Start(orbits, end, 1.0)], Scope(0.05, 1.2, max_period=1))
     folds = only(branch, "fold")
     assert len(folds) == 1
-    ds = dataset_of([branch], "amplitude", None)
+    ds = dataset_of([branch], "A", None)
     assert ds["rotation"].values.tolist() == [[1.0]]
-    parameters[4] = float(branch.values[7])
+    parameters["A"] = float(branch.values[7])
     state = orbits.state(branch.points[7].u)
     image = solve_ivp(rates, (0.0, 1 / frequency), state, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     np.testing.assert_allclose(image - state, [2.0 * np.pi, 0.0], atol=1e-9)

@@ -39,23 +39,23 @@ def test_help__is_light(environment):
         assert command in found.stdout
 
 
-def test_help__exit_codes(magpend):
+def test_help__exit_codes(main):
     for arguments in (["--help"], ["run", "--help"]):
-        text = " ".join(re.sub(r"[│╭╰╮╯─]", " ", magpend(*arguments).stdout).split())
+        text = " ".join(re.sub(r"[│╭╰╮╯─]", " ", main(*arguments)[1]).split())
         for code in Exit:
             assert f"{int(code)} {code.sentence}" in text
 
 
 @pytest.mark.parametrize("option", [[], ["--dry-run"]])
-def test_run__bad_spec_creates_nothing(magpend, write_spec, tmp_path, option):
+def test_run__bad_spec_creates_nothing(main, write_spec, tmp_path, option):
     path = write_spec(BAD)
     before = sorted(p for p in tmp_path.rglob("*") if "__pycache__" not in p.parts)
-    found = magpend("run", path, "--out", "somewhere", *option)
-    assert found.returncode == Exit.REFUSED
-    assert "axes.q.nun: unknown key; did you mean num?" in found.stderr
-    assert "integration.rtol = -1" in found.stderr
-    assert "initial_conditions: missing" in found.stderr
-    assert "Traceback" not in found.stderr
+    code, _, said = main("run", path, "--out", "somewhere", *option)
+    assert code == Exit.REFUSED
+    assert "axes.q.nun: unknown key; did you mean num?" in said
+    assert "integration.rtol = -1" in said
+    assert "initial_conditions: missing" in said
+    assert "Traceback" not in said
     assert sorted(p for p in tmp_path.rglob("*") if "__pycache__" not in p.parts) == before
 
 

@@ -182,7 +182,7 @@ def test_walk__new_products(grown, count):
 KEPT = BASE.replace("n_transient = 3\nn_keep = 4", "n_transient = 40\nn_keep = 30")
 KEPT_MORE = KEPT.replace("n_keep = 30", "n_keep = 70")
 WATCHED = (
-    "[products]\nextremes = { quantities = ['x', 'v'] }\nlyapunov = { n_periods = 4, n_blocks = 2 }\n[ex"
+    "[products]\nextremes = { quantities = ['energy', 'v'] }\nlyapunov = { n_periods = 4, n_blocks = 2 }\n[ex"
 )
 STOPS = "stop_when_closed = true\nclosure_tolerance = 1e-6\n[execution]"
 CLOSING = (
@@ -372,7 +372,7 @@ def test_incomplete__what_is_committed_is_taken(place, tmp_path, monkeypatch, by
 
 def test_kill__extended_run_has_the_same_bytes(place, start, tmp_path, bytes_of):
     mine, wide, fresh = place
-    process = start("extend", mine, wide, "--out", "new", "--workers", 2)
+    process = start("extend", mine, wide, "--out", "new", "--workers", 1)
     while process.poll() is None and not list((tmp_path / "new" / "commits").glob("0*.json")):
         time.sleep(0.002)
     os.killpg(process.pid, signal.SIGKILL)

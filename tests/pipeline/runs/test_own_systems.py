@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,6 +46,39 @@ def process(environment):
     return call
 
 
+IN_TURN = """
+import contextlib, io, json, os, sys
+from pipeline.cli.main import main
+found = []
+for folder, *words in json.loads(sys.argv[1]):
+    os.chdir(folder)
+    sys.argv, out, err, code = ["magpend", *words], io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    found.append({"returncode": code, "stdout": out.getvalue(), "stderr": err.getvalue()})
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture
+def in_turn(tmp_path, environment):
+    """Commands, each in its folder, one after another in one new process, which has imported nothing yet."""
+
+    def call(*commands):
+        words = json.dumps([[str(word) for word in command] for command in commands])
+        done = subprocess.run(
+            [sys.executable, "-c", IN_TURN, words],
+            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return [SimpleNamespace(**one) for one in json.loads(done.stdout)]
+
+    return call
+
+
 def rewritten(directory: Path, change) -> None:
     """Change run.json as a stranger can who makes its digest fit."""
     path = directory / "run.json"
@@ -60,7 +94,7 @@ def test_run__text_from_the_specification_to_the_figure(text_spec, tmp_path, pro
     """Elsewhere, in another process, with the shared file gone: the run explains itself."""
     directory, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
     elsewhere.mkdir()
-    done = process(tmp_path, "run", text_spec, "--out", directory, "--workers", 2)
+    done = process(tmp_path, "run", text_spec, "--out", directory, "--workers", 0)
     assert done.returncode == 0, done.stderr
     (tmp_path / "shared.toml").unlink()
     assert "complete" in process(elsewhere, "status", directory).stdout
@@ -94,7 +128,7 @@ def test_run__text_is_integrated_as_it_is_written(text_spec, tmp_path):
 def test_run__workers_take_text_from_the_compile_cache(text_spec, tmp_path, bytes_of):
     run(text_spec, tmp_path / "one", workers=0, echo=lambda line: None)
     before = {p for p in jit.CACHE_FOLDER.rglob("*") if p.suffix in (".nbc", ".py")}
-    run(text_spec, tmp_path / "two", workers=2, echo=lambda line: None)
+    run(text_spec, tmp_path / "two", workers=1, echo=lambda line: None)
     assert {p for p in jit.CACHE_FOLDER.rglob("*") if p.suffix in (".nbc", ".py")} == before
     assert bytes_of(tmp_path / "one") == bytes_of(tmp_path / "two")
 
@@ -102,7 +136,7 @@ def test_run__workers_take_text_from_the_compile_cache(text_spec, tmp_path, byte
 @pytest.mark.slow
 def test_run__text_killed_and_resumed(text_spec, tmp_path, start, bytes_of):
     directory = tmp_path / "run"
-    process = start("run", text_spec, "--smoke", "--out", directory, "--workers", 2)
+    process = start("run", text_spec, "--smoke", "--out", directory, "--workers", 1)
     limit = time.monotonic() + 200
     while not list((directory / "commits").glob("*.json")) if (directory / "commits").is_dir() else True:
         assert time.monotonic() < limit
@@ -191,13 +225,13 @@ def test_open_run__stranger_s_object_is_never_imported(own, text_spec, tmp_path,
 
 
 @pytest.mark.slow
-def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, process):
+def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, process, in_turn, main):
     """The module lies beside the specification alone; the run is made from elsewhere."""
     project, elsewhere = tmp_path / "project", tmp_path / "elsewhere"
     trace = own.write_module(project, "mine")
     elsewhere.mkdir()
     (project / "spec.toml").write_text(own.spec('model = "mine:MINE"'))
-    done = process(elsewhere, "run", project / "spec.toml", "--out", "run", "--workers", 2)
+    done = process(elsewhere, "run", project / "spec.toml", "--out", "run", "--workers", 1)
     assert done.returncode == 0, done.stderr
     ds = open_run(elsewhere / "run")
     cell, f = ds.isel(x_0=1, v_0=2), float(ds.frequency)
@@ -208,17 +242,19 @@ def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, pr
     assert cell.section.values == pytest.approx(found, abs=2e-5)
     named = "--import-model", "mine:MINE"
     trace.unlink()
-    assert process(elsewhere, "analyse", "attractors", "run").returncode == 2
+    assert main("analyse", "attractors", elsewhere / "run")[0] == 2
     assert not trace.exists()
     found = process(project, "analyse", "attractors", elsewhere / "run", *named, "--json")
     assert [row["orbit_period"] for row in json.loads(found.stdout)] == [1]
     module = project / "mine.py"
     module.write_text(module.read_text().replace("- y[0]", "- 1.1 * y[0]"))
-    again = process(elsewhere, "run", project / "spec.toml", "--out", "run")
+    again, kept, settling = in_turn(
+        (elsewhere, "run", project / "spec.toml", "--out", "run"),
+        (project, "analyse", "attractors", elsewhere / "run", *named, "--json"),
+        (project, "analyse", "settling", elsewhere / "run", *named),
+    )
     assert again.returncode == 2
     assert "model_digest" in again.stderr
-    found = process(project, "analyse", "attractors", elsewhere / "run", *named, "--json")
-    assert found.returncode == 0  # what was kept needs no object
-    found = process(project, "analyse", "settling", elsewhere / "run", *named)
-    assert found.returncode == 2
-    assert "restore the code" in found.stderr
+    assert kept.returncode == 0  # what was kept needs no object
+    assert settling.returncode == 2
+    assert "restore the code" in settling.stderr

@@ -117,16 +117,16 @@ def test_run__same_bytes_in_other_tasks_and_after_a_failure(recorded, tmp_path, 
     assert one.drop_attrs(deep=False).identical(other.drop_attrs(deep=False))
 
 
-def test_run__killed_and_resumed_has_the_same_bytes(recorded, tmp_path, start, magpend, bytes_of):
+def test_run__killed_and_resumed_has_the_same_bytes(recorded, tmp_path, start, bytes_of):
     path = recorded(RECORDED.replace("num = 3", "num = 9").replace("num = 4", "num = 12"))
-    assert magpend("run", path, "--out", "whole", "--workers", "1").returncode == 0
+    run(path, tmp_path / "whole", workers=0, echo=silent)
     process = start("run", path, "--out", "run", "--workers", "1")
     deadline = time.monotonic() + 200
     while time.monotonic() < deadline and not list((tmp_path / "run" / "commits").glob("**/*.json")):
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert magpend("run", path, "--out", "run", "--workers", "1").returncode == 0
+    assert run(path, tmp_path / "run", workers=0, echo=silent).complete
     assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
 
 

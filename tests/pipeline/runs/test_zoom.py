@@ -200,13 +200,13 @@ def test_write_zoom__from_a_run(write_spec, sweep_text, tmp_path):
     assert out.read_bytes() == before
 
 
-def test_zoom__command(magpend, write_spec, sweep_text, tmp_path):
+def test_zoom__command(main, write_spec, sweep_text, tmp_path):
     path = write_spec(sweep_text)
     ranges = ["--psi1-deg", -5, 35, "--num-psi1", 9, "--axis", "q=1.5:1.6:11", "--at", "frequency_hz=2.2"]
-    found = magpend("zoom", path, *ranges, "--out", "zoom.toml")
-    assert found.returncode == 0, found.stderr
-    assert found.stdout == "specification: zoom.toml\n"
-    assert "note: psi1_deg: -5 to 35 reaches beyond the old -30 to 30." in found.stderr
+    code, out, said = main("zoom", path, *ranges, "--out", "zoom.toml")
+    assert code == 0, said
+    assert out == "specification: zoom.toml\n"
+    assert "note: psi1_deg: -5 to 35 reaches beyond the old -30 to 30." in said
     new = load_spec(tmp_path / "zoom.toml")
     assert (tmp_path / "zoom.toml").read_text().startswith("# Zoom. Derived from specification spec.toml.\n")
     assert len(new.initial_conditions.psi1_deg.array()) == 9
@@ -218,8 +218,8 @@ def test_zoom__command(magpend, write_spec, sweep_text, tmp_path):
         (["--at", "qq=1"], "did you mean q"),
         ([], "nothing to change"),
     ]:
-        found = magpend("zoom", path, *arguments, "--out", "other.toml")
-        assert found.returncode == Exit.REFUSED
-        assert message in found.stderr
-        assert "Traceback" not in found.stderr
+        code, _, said = main("zoom", path, *arguments, "--out", "other.toml")
+        assert code == Exit.REFUSED
+        assert message in said
+        assert "Traceback" not in said
     assert not (tmp_path / "other.toml").exists()

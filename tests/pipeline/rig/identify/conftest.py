@@ -2,7 +2,7 @@
 
     x(t) = exp(-d t) (x0 cos(w t) + (v0 + d x0)/w sin(w t))
 
-Parameters d and w; slopes by complex steps, which are exact to rounding.
+Parameters d and w.
 """
 
 from __future__ import annotations
@@ -25,10 +25,13 @@ def motion(t, d, w, x0, v0):
 
 
 def slopes(t, values):
-    """(n, 4) of d(motion)/d(d, w, x0, v0)."""
-    h = 1e-30
-    moved = [np.array(values, dtype=complex) + 1j * h * np.eye(4)[i] for i in range(4)]
-    return np.stack([motion(t, *m).imag / h for m in moved], axis=1)
+    """(..., 4) of d(motion)/d(d, w, x0, v0), for times (...)."""
+    d, w, x0, v0 = values
+    decay, cos, sin = np.exp(-d * t), np.cos(w * t), np.sin(w * t)
+    b = (v0 + d * x0) / w
+    by_d = x0 / w * sin - t * (x0 * cos + b * sin)
+    by_w = b * (t * cos - sin / w) - x0 * t * sin
+    return decay[..., None] * np.stack([by_d, by_w, cos + d / w * sin, sin / w], axis=-1)
 
 
 @dataclass
@@ -46,13 +49,10 @@ def fit(times, measured, *, noise=1.0, prior=None) -> Fitted:
     starts = np.array([[m[0] if np.isfinite(m[0]) else 1.0, 0.0] for m in measured])
     mean, sd = prior or (theta, np.full(2, np.inf))
     for k in range(7):
-        jacobian, residuals = linearise(times, measured, theta, starts, noise)
-        rows = np.concatenate([np.nan_to_num(r) for r in residuals])
-        jac = np.vstack([jacobian, np.hstack([np.diag(1 / sd), np.zeros((2, starts.size))])])
-        rows = np.concatenate([rows, (theta - mean) / sd])
-        step = -np.linalg.lstsq(jac, rows, rcond=None)[0]
-        theta = theta + (step[:2] if k else 0.0)  # starts first: rates are far off
-        starts = starts + step[2:].reshape(starts.shape)
+        step, starts = gauss_newton(times, measured, theta, starts, noise, (mean, sd))
+        theta = theta + (step if k else 0.0)  # starts first: rates are far off
+        if k and np.abs(step).max() < 1e-10:
+            break
     jacobian, residuals = linearise(times, measured, theta, starts, noise)
     information, following = eliminate_starts(
         np.vstack([jacobian, np.hstack([np.diag(1 / sd), np.zeros((2, starts.size))])]), 2
@@ -69,18 +69,39 @@ def fit(times, measured, *, noise=1.0, prior=None) -> Fitted:
     return Fitted(theta, starts, residuals, jacobian, linear)
 
 
+def gauss_newton(times, measured, theta, starts, noise, prior):
+    """Step of the parameters, and the new starts; piece by piece, as a start moves its own piece alone."""
+    mean, sd = prior
+    own, residuals = each_piece(times, measured, theta, starts, noise)
+    q, r = np.linalg.qr(own[:, :, 2:])
+    across = q.transpose(0, 2, 1)
+    y = np.nan_to_num(residuals)[:, :, None]
+    rates = own[:, :, :2]
+    rest = (rates - q @ (across @ rates)).reshape(-1, 2)
+    normal = np.diag(1 / sd**2) + rest.T @ rest
+    step = np.linalg.solve(normal, (mean - theta) / sd**2 - rest.T @ y.ravel())
+    moves = -np.linalg.solve(r, across @ (y + rates @ step[:, None]))
+    return step, starts + moves[:, :, 0]
+
+
+def each_piece(times, measured, theta, starts, noise):
+    """Slopes (n_pieces, n, 4) by the parameters and each piece's own start, and residuals (n_pieces, n)."""
+    t, y = np.array(times), np.array(measured)
+    values = (*theta, starts[:, :1], starts[:, 1:])
+    own = -slopes(t, values) / noise
+    own[~np.isfinite(y)] = 0.0
+    return own, (y - motion(t, *values)) / noise
+
+
 def linearise(times, measured, theta, starts, noise):
-    blocks, residuals = [], []
-    for k, (t, y) in enumerate(zip(times, measured, strict=True)):
-        values = (*theta, *starts[k])
-        own = -slopes(t, values) / noise
-        own[~np.isfinite(y)] = 0.0
-        block = np.zeros((len(t), 2 + starts.size))
-        block[:, :2] = own[:, :2]
-        block[:, 2 + 2 * k : 4 + 2 * k] = own[:, 2:]
-        blocks.append(block)
-        residuals.append((y - motion(t, *values)) / noise)
-    return np.vstack(blocks), residuals
+    """The whole Jacobian, and the residuals of each piece."""
+    own, residuals = each_piece(times, measured, theta, starts, noise)
+    n_pieces, n, _ = own.shape
+    whole = np.zeros((n_pieces, n, 2 + starts.size))
+    whole[:, :, :2] = own[:, :, :2]
+    for k in range(n_pieces):
+        whole[k, :, 2 + 2 * k : 4 + 2 * k] = own[k, :, 2:]
+    return whole.reshape(n_pieces * n, -1), list(residuals)
 
 
 def record(rng, *, n_pieces=10, n=120, noise=0.01, memory=0.0, bits=None, dead_band=False):

@@ -56,17 +56,22 @@ def write_table(path, angle, locked, side, torque):
         writer.writerows(zip(np.degrees(angle), np.degrees(locked), names, torque, strict=True))
 
 
-@pytest.fixture
-def rig(tmp_path):
-    """A folder with a header and readings without noise, and what they were made from."""
+def write_rig(folder):
+    """A header and readings without noise, and what they were made from."""
     p = load_model("pendulum").load("wojna2018", **TRUE, l2=0.18, h=0.39)
     angle, locked, side = grid()
     magnets = laws.magnet_moment(angle, locked, p)
     besides = laws.weight_torque(angle, locked, p) - 0.05 * p["g"] * 0.12 * np.sin(angle)
-    write_table(tmp_path / "readings.csv", angle, locked, side, magnets + besides)
-    header = tmp_path / "rig.toml"
+    write_table(folder / "readings.csv", angle, locked, side, magnets + besides)
+    header = folder / "rig.toml"
     header.write_text(HEADER)
     return SimpleNamespace(
-        path=header, table=tmp_path / "readings.csv", angle=angle, locked=locked, side=side, magnets=magnets,
+        path=header, table=folder / "readings.csv", angle=angle, locked=locked, side=side, magnets=magnets,
         parameters=p,
     )  # fmt: skip
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """A folder with a measurement."""
+    return write_rig(tmp_path)

@@ -13,11 +13,13 @@ from pipeline.rig.magnet.figures import FIGURES, write_figures
 from pipeline.rig.magnet.fitting import fit_measurement
 from pipeline.rig.magnet.measurement import read_measurement
 
-from .conftest import TRUE
+from .conftest import TRUE, write_rig
 
 
-@pytest.fixture
-def outcome(rig):
+@pytest.fixture(scope="module")
+def outcome(tmp_path_factory):
+    """One fit for all figures, which change nothing in it."""
+    rig = write_rig(tmp_path_factory.mktemp("measurement"))
     return fit_measurement(read_measurement(rig.path))
 
 
