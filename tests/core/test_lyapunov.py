@@ -5,6 +5,7 @@ import pytest
 
 from magpend_core import Status, jacobian, lyapunov_exponents, polish_orbits, sections
 from magpend_core.lyapunov import MOST_LOSS
+from magpend_core.models.duffing.system import DUFFING
 from magpend_core.orbits import stroboscopic_map
 
 UNIT_FREQUENCY = 0.5 / np.pi  # forcing cos t
@@ -15,18 +16,18 @@ def packed(parameters, n):
     return np.tile(parameters.pack(), (n, 1))
 
 
-def of_duffing(duffing, parameters, n_cells=32, **options):
+def of_duffing(parameters, n_cells=32, **options):
     rng = np.random.default_rng(4)
     return lyapunov_exponents(
         np.tile(np.array(parameters), (n_cells, 1)), np.full(n_cells, UNIT_FREQUENCY),
-        rng.uniform(-1.0, 1.0, (n_cells, 2)), system=duffing, **options,
+        rng.uniform(-1.0, 1.0, (n_cells, 2)), system=DUFFING, **options,
     )  # fmt: skip
 
 
-def test_duffing__published_exponents(duffing):
+def test_duffing__published_exponents():
     # x'' = .3 cos t + x - x^3 - .2 x': (0.158, -0.358) +- 0.002 per unit time, recomputed
     # independently; ChaosTools.jl issue 301 has 0.15894, -0.35894
-    found = of_duffing(duffing, CHAOTIC, n_periods=1600, rtol=1e-7, atol=1e-7)
+    found = of_duffing(CHAOTIC, n_periods=1600, rtol=1e-7, atol=1e-7)
     mean = found.exponents.mean(axis=0)
     assert mean == pytest.approx([0.158, -0.358], abs=0.002)
     assert found.weighted.mean(axis=0) == pytest.approx([0.158, -0.358], abs=0.003)
@@ -35,16 +36,16 @@ def test_duffing__published_exponents(duffing):
 
 
 @pytest.mark.parametrize("parameters", [CHAOTIC, [0.15, -1.0, 1.0, 0.2], [0.2, 2.0, 0.0, 1.0]])
-def test_duffing__exponents_add_up_to_minus_the_damping(duffing, parameters):
-    found = of_duffing(duffing, parameters, 4, n_periods=64, rtol=1e-11, atol=1e-11)
+def test_duffing__exponents_add_up_to_minus_the_damping(parameters):
+    found = of_duffing(parameters, 4, n_periods=64, rtol=1e-11, atol=1e-11)
     assert found.exponents.sum(axis=1) == pytest.approx(-parameters[0], abs=1e-8)
     assert found.divergence == pytest.approx(-parameters[0], abs=1e-12)
     assert found.is_whole
 
 
-def test_linear_oscillator__exponents_are_half_the_damping(duffing):
+def test_linear_oscillator__exponents_are_half_the_damping():
     # complex pair: both exponents are -c/2; the plain average oscillates about them
-    found = of_duffing(duffing, [0.2, 2.0, 0.0, 1.0], 2)
+    found = of_duffing([0.2, 2.0, 0.0, 1.0], 2)
     assert found.weighted == pytest.approx(-0.1, abs=1e-6)
     assert found.exponents == pytest.approx(-0.1, abs=1e-3)
     assert (found.exponents[:, 0] >= found.exponents[:, 1]).all()
@@ -138,11 +139,11 @@ def test_lyapunov__blocks_average_to_the_exponents(mixed):
     assert found.stderr == pytest.approx(found.blocks.std(axis=1, ddof=1) / 2.0, abs=1e-12)
 
 
-def test_lyapunov__a_trajectory_that_fails_has_no_exponents(duffing):
+def test_lyapunov__a_trajectory_that_fails_has_no_exponents():
     # negative cubic stiffness: one of the two escapes
     found = lyapunov_exponents(
         np.tile([0.1, 1.0, -1.0, 0.1], (2, 1)), np.full(2, UNIT_FREQUENCY),
-        np.array([[0.0, 0.0], [3.0, 1.0]]), n_exponents=2, n_periods=16, system=duffing,
+        np.array([[0.0, 0.0], [3.0, 1.0]]), n_exponents=2, n_periods=16, system=DUFFING,
     )  # fmt: skip
     assert found.status.tolist() == [Status.BOUNDED, Status.DIVERGED]
     assert np.isfinite(found.exponents[0]).all()

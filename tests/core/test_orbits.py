@@ -11,6 +11,7 @@ import scipy.linalg
 
 from magpend_core import load_preset, polish_orbits, run_branches
 from magpend_core.engine.variational import with_tangents
+from magpend_core.models.duffing.system import DUFFING
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance, stroboscopic_map, wrap_angles
 
@@ -93,16 +94,19 @@ def test_stroboscopic_map__derivatives(packed, reference):
 
 def test_with_tangents__trajectory_unchanged(packed):
     """Tangents stay out of the error control: same steps, same states."""
-    start = np.array([[0.2, 0.2, 0.0, 0.0]])
     arguments = {"n_transient": 0, "n_keep": 5, "rtol": 1e-8, "atol": 1e-8}
-    plain = run_branches(packed[:1, None], [[2.2]], start, **arguments)
-    for n_vectors in (1, 4):
-        system = with_tangents(PENDULUM_FITTED, n_vectors)
-        extended = np.concatenate([start, np.eye(4)[:n_vectors].reshape(1, -1)], axis=1)
-        result = run_branches(packed[:1, None], [[2.2]], extended, system=system, **arguments)
+    oscillator = np.array([[[0.1, -1.0, 1.0, 0.3]]])
+    cases = ((PENDULUM_FITTED, packed[:1, None], [[2.2]], 4), (DUFFING, oscillator, [[0.2]], 1))
+    for base, values, frequency, n_vectors in cases:
+        n = base.n_states
+        start = np.array([[0.2, 0.2, 0.0, 0.0][:n]])
+        plain = run_branches(values, frequency, start, system=base, **arguments)
+        system = with_tangents(base, n_vectors)
+        extended = np.concatenate([start, np.eye(n)[:n_vectors].reshape(1, -1)], axis=1)
+        result = run_branches(values, frequency, extended, system=system, **arguments)
         assert result.n_steps[0, 0] == plain.n_steps[0, 0]
         # the compiler may order the same sums otherwise
-        np.testing.assert_allclose(result.section[0, 0, :, :4], plain.section[0, 0], rtol=1e-11, atol=1e-12)
+        np.testing.assert_allclose(result.section[0, 0, :, :n], plain.section[0, 0], rtol=1e-11, atol=1e-12)
 
 
 def test_with_tangents__bad_count():
@@ -117,11 +121,11 @@ def test_wrap_angles__cut():
 
 
 @pytest.mark.parametrize("period", [10.0, 100.0])
-def test_stroboscopic_map__derivative_at_rest(duffing, period):
+def test_stroboscopic_map__derivative_at_rest(period):
     # x'' + c x' + k x = 0 at x = 0: the map is exp(A T), whatever the trajectory's step may be
     c, k = 0.02, 2.0
     image, derivative = stroboscopic_map(
-        np.array([[c, k, 0.0, 0.0]]), np.array([1.0 / period]), np.zeros((1, 2)), 1, system=duffing
+        np.array([[c, k, 0.0, 0.0]]), np.array([1.0 / period]), np.zeros((1, 2)), 1, system=DUFFING
     )
     assert (image == 0.0).all()
     assert derivative[0] == pytest.approx(

@@ -13,6 +13,7 @@ from magpend_core.pointwise import drive_level
 from magpend_core.recorded import evaluate_recorded, recorded_sections, recorded_trajectory
 from magpend_core.sampling import Drive
 from magpend_core.status import Status
+from tests.core.watched import OF_THE_DRIVE, OF_THE_PENDULUM
 
 DUFFING = load_model("duffing")
 LINEAR = DUFFING.load(damping=0.3, linear=4.0, cubic=0.0, amplitude=0.7)
@@ -47,13 +48,14 @@ def states(n, rate=1.0, seed=1):
 def test_recorded_sections__of_equal_periods_are_those_of_an_ordinary_run():
     """All numbers of cells that settle, and of some that begin by turning over."""
     start = np.vstack([states(12), states(4, rate=40.0)])
-    options = {"n_transient": 8, "n_keep": 5, "quantities": ["drive_torque", "psi1"], **TIGHT}
+    options = {"n_transient": 8, "n_keep": 5, "quantities": OF_THE_PENDULUM, **TIGHT}
     plain = run_branches(packed(16)[:, None], np.full((16, 1), HZ), start, **options)
     found = recorded_sections(packed(16), even_drive(13), start, system=SYSTEM, **options)
     assert np.abs(plain.turns).max() > 0
     np.testing.assert_array_equal(found.turns, plain.turns)
     np.testing.assert_allclose(found.section, plain.section, atol=1e-8)
-    np.testing.assert_allclose(found.extremes, plain.extremes, atol=1e-7)
+    of_the_drive = np.s_[..., : len(OF_THE_DRIVE), :]
+    np.testing.assert_allclose(found.extremes[of_the_drive], plain.extremes[of_the_drive], atol=1e-7)
     for name in ("status", "orbit_period", "n_periods"):
         np.testing.assert_array_equal(getattr(found, name), getattr(plain, name), err_msg=name)
 
@@ -152,19 +154,20 @@ def test_recorded_sections__of_a_torque_are_the_exact_response():
 
 
 def test_recorded_trajectory__of_the_models_own_torque_converges_to_the_ordinary_one():
-    """Lines between samples of the square wave: the error falls with the square of their distance."""
+    """Lines between samples of the drive: the error falls with the square of their distance."""
     from magpend_core import trajectory
 
-    parameters, times = load_preset(eps_drive=10.0), np.linspace(0, 3 / HZ, 31)
-    exact = trajectory(parameters, HZ, np.array([0.3, -0.1, 0.0, 0.0]), times, **TIGHT)
+    parameters = DUFFING.load(damping=0.3, linear=-1.0, cubic=1.0, amplitude=5.0)
+    start, times = np.array([0.3, -0.1]), np.linspace(0, 3 / HZ, 31)
+    exact = trajectory(parameters, HZ, start, times, **TIGHT)
     errors = []
-    for n in (1200, 2400, 4800):
+    for n in (150, 300, 600):
         samples = np.linspace(0, 3 / HZ, n + 1)
         drive = Drive.from_torque(samples, drive_level(samples, parameters, HZ))
-        found = recorded_trajectory(parameters, drive, np.array([0.3, -0.1, 0.0, 0.0]), times, **TIGHT)
+        found = recorded_trajectory(parameters, drive, start, times, **TIGHT)
         errors.append(np.abs(found - exact).max())
     assert errors[-1] < 1e-4
-    # second order: a fourth for each halving; kinks that fall between samples make it uneven
+    # second order: a fourth for each halving
     assert errors[0] / errors[2] > 8
 
 
@@ -220,10 +223,10 @@ def test_evaluate_recorded__of_a_torque_is_the_torque():
     times = np.linspace(0, 2, 21)
     torque = np.random.default_rng(3).normal(size=21)
     drive, at = Drive.from_torque(times, torque), np.linspace(0, 2, 333)
-    series = recorded_trajectory(PRESET, drive, states(1)[0], at)
-    found = evaluate_recorded(["drive_torque", "power_in"], at, series, PRESET, drive)
+    series = recorded_trajectory(LINEAR, drive, states(1)[0, :2], at)
+    found = evaluate_recorded(["drive", "power_in"], at, series, LINEAR, drive)
     np.testing.assert_allclose(found[:, 0], np.interp(at, times, torque), atol=1e-9)
-    np.testing.assert_allclose(found[:, 1], found[:, 0] * series[:, 2], atol=1e-9)
+    np.testing.assert_allclose(found[:, 1], found[:, 0] * series[:, 1], atol=1e-9)
 
 
 @pytest.mark.parametrize(

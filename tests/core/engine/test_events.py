@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from magpend_core import Crossing, Status, lyapunov_exponents, rates, run_branches, trajectory
+from magpend_core import Crossing, Status, load_model, lyapunov_exponents, rates, run_branches, trajectory
 from magpend_core.engine.checks import SystemCheckError, check_system
 from magpend_core.engine.crossing import with_section
 from magpend_core.engine.events import cubic_dip, cubic_root, may_dip
@@ -37,23 +37,15 @@ def flow(name, states, parameters, rhs, **fields):
 
 
 @inline
-def _van_der_pol(y, u, c):
-    return y[1], c[0] * (1.0 - y[0] * y[0]) * y[1] - y[0]
-
-
-@inline
-def _rossler(y, u, c):
-    return -y[1] - y[2], y[0] + c[0] * y[1], c[1] + y[2] * (y[0] - c[2])
-
-
-@inline
 def _rotor(y, u, c):
     return y[1], c[0] - c[1] * y[1] - sincos(y[0])[0]
 
 
-VAN_DER_POL = flow("van_der_pol", ("x", "v"), ("mu",), _van_der_pol)
+# an engine for each direction and choice of quantities: of the library's, which others compile too, those
+# where v falls; where it rises it is watched
+VAN_DER_POL = load_model("van-der-pol").system
+RISING = {"quantities": ("v",)}
 CIRCLE = [0.0]  # its parameter at which it turns on circles, with angular velocity 1
-ROSSLER = flow("rossler_flow", ("x", "y", "z"), ("a", "b", "c"), _rossler)
 ROTOR = flow("rotor", ("th", "w"), ("torque", "d"), _rotor, is_angle=(True, False))
 
 
@@ -85,7 +77,7 @@ VAN_DER_POL_PERIOD = 6.6632868593231301
 def test_section__of_van_der_pol_has_the_published_period(direction):
     found = returns(
         VAN_DER_POL, [1.0], [[0.5, 0.1], [2.0, 3.0]], Crossing("v", 0.0, direction, 20.0),
-        n_transient=8, n_keep=6, rtol=1e-12,
+        n_transient=8, n_keep=6, rtol=1e-12, **(RISING if direction == "up" else {}),
     )  # fmt: skip
     assert found.status.tolist() == [[Status.PERIODIC]] * 2
     assert found.orbit_period.tolist() == [[1]] * 2
@@ -97,19 +89,23 @@ def test_section__of_van_der_pol_has_the_published_period(direction):
     assert abs(found.section[..., 1]).max() < 1e-14
 
 
-@pytest.mark.parametrize(("of", "level", "direction"), [(1, 0.0, -1), (2, 1.0, 1)])
-def test_section__of_rossler_is_that_of_another_integrator(of, level, direction):
-    # where x falls: see the orbits of ChaosBook in test_library
-    a, b, c = 0.2, 0.2, 5.7
-    start = [-3.0, -4.0, 0.1]
+def rossler(t, y, a=0.2, b=0.2, c=5.7):
+    return -y[1] - y[2], y[0] + a * y[1], b + y[2] * (y[0] - c)
 
-    def rhs(t, y):
-        return -y[1] - y[2], y[0] + a * y[1], b + y[2] * (y[0] - c)
 
-    times, states = crossings_of(rhs, start, level, of, direction, 80.0)
+def lorenz(t, y, sigma=10.0, rho=28.0, beta=8.0 / 3.0):
+    return sigma * (y[1] - y[0]), y[0] * (rho - y[2]) - y[1], y[0] * y[1] - beta * y[2]
+
+
+@pytest.mark.parametrize(
+    ("rhs", "start", "of", "level", "direction"),
+    [(rossler, [-3.0, -4.0, 0.1], 0, 0.0, -1), (lorenz, [-3.0, -4.0, 20.0], 2, 27.0, 1)],
+)
+def test_section__of_a_chaotic_flow_is_that_of_another_integrator(rhs, start, of, level, direction):
     n = 8
+    times, states = crossings_of(rhs, start, level, of, direction, 80.0 if rhs is rossler else 10.0)
     section = Crossing("xyz"[of], level, "up" if direction > 0 else "down", 50.0)
-    found = returns(ROSSLER, [a, b, c], start, section, n_keep=n, rtol=1e-13)
+    found = returns(load_model(rhs.__name__).system, rhs.__defaults__, start, section, n_keep=n, rtol=1e-13)
     # chaos doubles an error with each return or so
     assert found.section[0, 0] == pytest.approx(states[:n], abs=1e-8)
     assert np.cumsum(found.return_time[0, 0]) == pytest.approx(times[:n], abs=1e-8)
@@ -139,12 +135,13 @@ def test_section__of_an_angle_is_crossed_modulo_a_turn_and_one_way():
 
 
 def test_section__the_crossing_at_the_start_does_not_count():
-    # x = -cos t, v = sin t rises through v = 0 at the start and a period later
+    # x = cos t, v = -sin t falls through v = 0 at the start and a period later
+    section = Crossing("v", 0.0, "down")
     for v in (0.0, 1e-13, -1e-13):
-        found = returns(VAN_DER_POL, CIRCLE, [[-1.0, v]], Crossing("v"), rtol=1e-12)
+        found = returns(VAN_DER_POL, CIRCLE, [[1.0, v]], section, rtol=1e-12)
         assert found.return_time[0, 0, 0] == pytest.approx(2.0 * np.pi, abs=1e-10)
     # a start before the section is another matter
-    found = returns(VAN_DER_POL, CIRCLE, [[-np.cos(0.01), -np.sin(0.01)]], Crossing("v"), rtol=1e-12)
+    found = returns(VAN_DER_POL, CIRCLE, [[np.cos(0.01), np.sin(0.01)]], section, rtol=1e-12)
     assert found.return_time[0, 0, 0] == pytest.approx(0.01, abs=1e-12)
 
 
@@ -152,8 +149,8 @@ def test_section__no_return_ends_the_cell_and_the_walk_goes_on():
     # mu < 0: to rest; then mu = 1 at the second point
     packed = np.array([[[-1.0], [1.0]]])
     found = run_branches(
-        packed, None, [[1.0, 0.3]], n_transient=0, n_keep=2, rtol=1e-9, atol=1e-9, system=VAN_DER_POL,
-        section=Crossing("v", 0.5, "up", 60.0),
+        packed, None, [[-1.0, -0.3]], n_transient=0, n_keep=2, rtol=1e-9, atol=1e-9, system=VAN_DER_POL,
+        section=Crossing("v", -0.5, "down", 60.0),
     )  # fmt: skip
     assert found.status[0].tolist() == [Status.NO_RETURN, Status.BOUNDED]
     assert np.isnan(found.section[0, 0]).all()
@@ -166,16 +163,17 @@ def test_section__finds_a_pair_of_crossings_within_a_step():
     # the top of a circle of radius 1 reaches beyond the level by 5e-5, for 0.02 s; steps are ten times longer
     for depth in (1e-3, 5e-5, 1e-6):
         section = Crossing("v", 1.0 - depth, "up", 20.0)
-        found = returns(VAN_DER_POL, CIRCLE, [[-1.0, 0.0]], section, n_transient=1, n_keep=3, rtol=1e-9)
+        options = {"n_transient": 1, "n_keep": 3, "rtol": 1e-9}
+        found = returns(VAN_DER_POL, CIRCLE, [[-1.0, 0.0]], section, **options, **RISING)
         assert found.return_time[0, 0] == pytest.approx(2.0 * np.pi, abs=1e-5)
         assert found.section[0, 0, :, 1] == pytest.approx(1.0 - depth, abs=1e-12)
         section = Crossing("v", 1.0 - depth, "down", 20.0)
-        found = returns(VAN_DER_POL, CIRCLE, [[-1.0, 0.0]], section, n_transient=1, n_keep=3, rtol=1e-9)
+        found = returns(VAN_DER_POL, CIRCLE, [[-1.0, 0.0]], section, **options)
         assert found.return_time[0, 0] == pytest.approx(2.0 * np.pi, abs=1e-5)
 
 
 def test_section__at_rest_on_the_section_is_no_crossing():
-    found = returns(VAN_DER_POL, [1.0], [[0.0, 0.0]], Crossing("v", 0.0, "up", 30.0))
+    found = returns(VAN_DER_POL, [1.0], [[0.0, 0.0]], Crossing("v", 0.0, "down", 30.0))
     assert found.status[0, 0] == Status.NO_RETURN
 
 
@@ -207,15 +205,15 @@ def test_section__continues_from_its_final_state():
 def test_section__watched_quantities_are_means_over_the_return():
     # over a turn of the circle v is 0 in the mean, its extremes are 1
     found = returns(
-        VAN_DER_POL, CIRCLE, [[-0.8, 0.6]], Crossing("v", 0.6), n_transient=1, n_keep=2, rtol=1e-10,
-        quantities=["v"],
+        VAN_DER_POL, CIRCLE, [[-0.8, 0.6]], Crossing("v", 0.6), n_transient=1, n_keep=2, rtol=1e-10, **RISING,
     )  # fmt: skip
     assert found.extremes[0, 0, :, 0] == pytest.approx(np.tile([-1.0, 1.0, 0.0], (2, 1)), abs=1e-5)
 
 
 @pytest.mark.parametrize("steps", [1, 20])
 def test_section__too_many_steps_end_it(steps):
-    found = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], Crossing("v"), max_steps_per_period=steps)
+    section = Crossing("v", 0.0, "down")
+    found = returns(VAN_DER_POL, [1.0], [[-0.5, -0.1]], section, max_steps_per_period=steps)
     assert found.status[0, 0] == Status.STEP_LIMIT
 
 
@@ -270,29 +268,75 @@ def test_cubic__root_and_dip_are_those_of_numpy():
     assert dips == pytest.approx(expected, abs=1e-9)
 
 
-# --- switches, segments -------------------------------------------------------------------------------
+# --- switches, segments, dry friction --------------------------------------------------------------------
 
 
 @inline
-def _relay(y, u, c):
-    return y[1], 0.0 * y[0] - c[0] * c[1]
+def _stick_constants(frequency, p, out):
+    for i in range(5):
+        out[i] = p[i]
+    out[5] = 2.0 * math.pi * frequency
 
 
 @inline
-def _of_position(t, y, dy, c):
-    return ((y[0], dy[0]),)
+def _stick_forcing(t, c):
+    # pushes between the two edges
+    return c[0] * sincos(c[5] * t)[1] + c[1] * c[7] * (2.0 - c[7])
 
 
 @inline
-def _relay_jacobian(y, u, c):
+def _stick_rhs(y, u, c):
+    # x'' = force - k x - mu sign(v), or sign(x); in mode 0 the mass sticks
+    slipping = absolute(c[6])
+    return y[1], slipping * (u - c[2] * y[0]) - c[3] * c[6]
+
+
+@inline
+def _stick_switches(t, y, dy, c):
+    sine, cosine = sincos(c[5] * t)
+    sigma = (c[0] * cosine + c[1] * c[7] * (2.0 - c[7]) - c[2] * y[0]) / c[3]
+    change = (-c[0] * c[5] * sine - c[2] * dy[0]) / c[3]
+    slipping, of_v = absolute(c[6]), 1.0 - c[4]
+    return (
+        (
+            slipping * (of_v * y[1] + c[4] * y[0]) + (1.0 - slipping) * (1.0 - sigma * sigma),
+            slipping * (of_v * dy[1] + c[4] * dy[0]) - (1.0 - slipping) * (2.0 * sigma * change),
+        ),
+    )
+
+
+@inline
+def _stick_jacobian(y, u, c):
     zero = 0.0 * y[0]
-    return zero, zero + 1.0, zero, zero
+    return zero, zero + 1.0, zero - absolute(c[6]) * c[2], zero
 
 
-RELAY = flow(
-    "relay", ("x", "v"), ("k",), _relay, jacobian=_relay_jacobian, n_modes=1, n_switches=1,
-    switches=_of_position,
+@inline
+def _two_edges(frequency, p, times, half_widths, jumps):
+    times[0], times[1] = 0.25 / frequency, 0.7 / frequency
+    for i in range(2):
+        half_widths[i] = math.inf
+        jumps[i] = 1.0
+
+
+# one system for dry friction, a push between two edges, and a relay: each engine is compiled once
+STICK = System(
+    name="stick", state_names=("x", "v"), parameter_names=("force", "push", "k", "mu", "of_x"), n_constants=6,
+    constants=_stick_constants, forcing=_stick_forcing, rhs=_stick_rhs, jacobian=_stick_jacobian, n_modes=2,
+    n_switches=1, switches=_stick_switches, slides=(True,), has_segments=True, n_edges=2, edges=_two_edges,
 )  # fmt: skip
+RELAY = [0.0, 0.0, 0.0, 1.0, 1.0]
+"""Parameters of x'' = -sign(x)."""
+
+
+def dry(force, mu):
+    """Parameters of x'' = force cos(w t) - x - mu sign(x')."""
+    return [force, 0.0, 1.0, mu, 0.0]
+
+
+def pushed(push, k, mu, of_x=0.0):
+    """Those of a mass on a spring that is pushed between the two edges."""
+    return [0.0, push, k, mu, of_x]
 
 
 def run_cells(system, parameters, frequency, starts, *, n_transient=0, n_keep=1, rtol=1e-8, **options):
@@ -317,7 +361,7 @@ def relay_exactly(amplitude, time):
 
 def test_switch__of_a_relay_gives_parabolas():
     amplitudes = np.linspace(0.3, 2.0, 21)
-    found = run_cells(RELAY, [1.0], 1.0, np.c_[amplitudes, 0.0 * amplitudes], n_keep=6, rtol=1e-6)
+    found = run_cells(STICK, RELAY, 1.0, np.c_[amplitudes, 0.0 * amplitudes], n_keep=6, rtol=1e-6)
     for a, sections in zip(amplitudes, found.section[:, 0], strict=True):
         exact = [relay_exactly(a, i + 1.0) for i in range(6)]
         assert sections == pytest.approx(np.array(exact), abs=3e-12)
@@ -326,90 +370,20 @@ def test_switch__of_a_relay_gives_parabolas():
     assert found.n_rejected.sum() < 3 * n_crossings
 
 
-@inline
-def _low_pass(y, u, c):
-    return (u - c[0] * y[0],)
-
-
-@inline
-def _levels(t, c):
-    # 0 before the first edge, 1 up to the second, 0 again
-    return c[1] * (2.0 - c[1])
-
-
-@inline
-def _two_edges(frequency, p, times, half_widths, jumps):
-    times[0], times[1] = 0.25 / frequency, 0.7 / frequency
-    for i in range(2):
-        half_widths[i] = math.inf
-        jumps[i] = 1.0
-
-
-LOW_PASS = flow(
-    "low_pass", ("x",), ("k",), _low_pass, forcing=_levels, n_edges=2, edges=_two_edges, n_modes=1,
-    has_segments=True,
-)  # fmt: skip
-
-
-def test_segments__of_a_square_drive_give_exponentials():
+def test_segments__of_a_square_drive_turn_about_two_centres():
+    # right of x = 0 the relay pulls by 1/2 to one side: x'' = push - 1/2 - k x
     k, frequency = 1.7, 0.8
-    found = run_cells(LOW_PASS, [k], frequency, [[0.3], [-2.0]], n_keep=5, rtol=1e-11)
-    for start, sections in zip([0.3, -2.0], found.section[:, 0, :, 0], strict=True):
-        x = start
-        for value in sections:
-            for share, level in ((0.25, 0.0), (0.45, 1.0), (0.3, 0.0)):
-                x = level / k + (x - level / k) * math.exp(-k * share / frequency)
-            assert value == pytest.approx(x, abs=1e-10)
+    w, starts = math.sqrt(k), [[1.5, 0.2], [2.0, -0.5]]
+    found = run_cells(STICK, pushed(6.0, k, 0.5, 1.0), frequency, starts, n_keep=5, rtol=1e-11)
+    for start, sections in zip(starts, found.section[:, 0], strict=True):
+        z = complex(start[0], start[1] / w)
+        for x, v in sections:
+            for share, push in ((0.25, 0.0), (0.45, 6.0), (0.3, 0.0)):
+                centre = (push - 0.5) / k
+                z = centre + (z - centre) * np.exp(-1j * w * share / frequency)
+            assert (x, v) == pytest.approx((z.real, w * z.imag), abs=1e-10)
     # no attempt has an edge within it, which would cost a dozen rejections
     assert found.n_rejected.max() <= 3 * 5
-
-
-# --- dry friction ---------------------------------------------------------------------------------------
-
-
-@inline
-def _dry_constants(frequency, p, out):
-    out[0], out[1] = p[0], p[1]
-    out[2] = 2.0 * math.pi * frequency
-
-
-@inline
-def _dry_forcing(t, c):
-    return c[0] * sincos(c[2] * t)[1]
-
-
-@inline
-def _dry_rhs(y, u, c):
-    # x'' = force - x - mu sign(v); in mode 0 the mass sticks
-    slipping = absolute(c[3])
-    return y[1], slipping * (u - y[0]) - c[1] * c[3]
-
-
-@inline
-def _dry_switches(t, y, dy, c):
-    sine, cosine = sincos(c[2] * t)
-    sigma = (c[0] * cosine - y[0]) / c[1]
-    change = (-c[0] * c[2] * sine - dy[0]) / c[1]
-    slipping = absolute(c[3])
-    return (
-        (
-            slipping * y[1] + (1.0 - slipping) * (1.0 - sigma * sigma),
-            slipping * dy[1] - (1.0 - slipping) * (2.0 * sigma * change),
-        ),
-    )
-
-
-@inline
-def _dry_jacobian(y, u, c):
-    zero = 0.0 * y[0]
-    return zero, zero + 1.0, zero - absolute(c[3]), zero
-
-
-DRY = System(
-    name="dry_friction", state_names=("x", "v"), parameter_names=("force", "mu"), n_constants=3,
-    constants=_dry_constants, forcing=_dry_forcing, rhs=_dry_rhs, jacobian=_dry_jacobian, n_modes=1,
-    n_switches=1, switches=_dry_switches, slides=(True,),
-)  # fmt: skip
 
 
 class DryFriction:
@@ -469,49 +443,23 @@ def test_switch__of_dry_friction_sticks_and_slips_as_in_closed_form(force, mu, f
     states = [exact.state(x, times) for x in (0.3, 0.9)]
     # it does stick, or never does
     assert exact.stuck > 0.2 * times[-1] or (exact.stuck == 0.0 and force == 2.0)
-    found = run_cells(DRY, [force, mu], frequency, [[0.3, 0.0], [0.9, 0.0]], n_keep=12, rtol=1e-12)
+    found = run_cells(STICK, dry(force, mu), frequency, [[0.3, 0.0], [0.9, 0.0]], n_keep=12, rtol=1e-12)
     assert (found.status != Status.STEP_LIMIT).all()
     for sections, state in zip(found.section[:, 0], states, strict=True):
         assert sections == pytest.approx(state, abs=2e-10)
 
 
 def test_switch__sticks_for_ever_under_a_weak_force():
-    found = run_cells(DRY, [0.2, 0.5], 0.1, [[0.1, 0.0], [0.0, 1.0]], n_keep=3, n_transient=3)
+    found = run_cells(STICK, dry(0.2, 0.5), 0.1, [[0.1, 0.0], [0.0, 1.0]], n_keep=3, n_transient=3)
     assert found.section[0, 0] == pytest.approx(np.tile([0.1, 0.0], (3, 1)), abs=1e-13)
     assert abs(found.section[1, 0, :, 1]).max() < 1e-13
     assert found.orbit_period.tolist() == [[1], [1]]
 
 
-@inline
-def _pushed_forcing(t, c):
-    # pushes between the two edges
-    return c[0] * c[4] * (2.0 - c[4])
-
-
-@inline
-def _pushed_switches(t, y, dy, c):
-    sigma = (c[0] * c[4] * (2.0 - c[4]) - y[0]) / c[1]
-    change = -dy[0] / c[1]
-    slipping = absolute(c[3])
-    return (
-        (
-            slipping * y[1] + (1.0 - slipping) * (1.0 - sigma * sigma),
-            slipping * dy[1] - (1.0 - slipping) * (2.0 * sigma * change),
-        ),
-    )
-
-
-PUSHED = System(
-    name="pushed_friction", state_names=("x", "v"), parameter_names=("force", "mu"), n_constants=3,
-    constants=_dry_constants, forcing=_pushed_forcing, rhs=_dry_rhs, n_modes=2, has_segments=True, n_edges=2,
-    edges=_two_edges, n_switches=1, switches=_pushed_switches, slides=(True,),
-)  # fmt: skip
-
-
 def test_switch__that_sticks_is_torn_off_by_an_edge():
     # at rest, pushed to 2 (F - mu) in half a swing, let go and back in another; edges at 5 s and 14 s
     times = np.arange(1, 60) * 0.97
-    found = trajectory(given(PUSHED, 1.0, 0.5), 0.05, [0.0, 0.0], times, rtol=1e-10, atol=1e-10)
+    found = trajectory(given(STICK, *pushed(1.0, 1.0, 0.5)), 0.05, [0.0, 0.0], times, rtol=1e-10, atol=1e-10)
     for t, state in zip(np.mod(times, 20.0), found, strict=True):
         there = 0.5 - 0.5 * np.cos(np.clip(t - 5.0, 0.0, np.pi))
         back = 0.5 - 0.5 * np.cos(np.clip(t - 14.0, 0.0, np.pi))
@@ -523,25 +471,41 @@ def test_switch__that_sticks_is_torn_off_by_an_edge():
 
 
 @inline
-def _fall(y, u, c):
-    return y[1], 0.0 * y[0] - c[0]
+def _toss(y, u, c):
+    return y[1], 0.0 * y[0] - c[0] - c[1] * c[6]
 
 
 @inline
-def _fall_jacobian(y, u, c):
+def _toss_jacobian(y, u, c):
     zero = 0.0 * y[0]
     return zero, zero + 1.0, zero, zero
 
 
 @inline
+def _of_level(t, y, dy, c):
+    return ((y[0] - c[2], dy[0]),)
+
+
+@inline
+def _of_floor(t, y, dy, c):
+    return ((y[0] - c[3], dy[0]),)
+
+
+@inline
 def _bounce(k, t, y, c):
-    return y[0], -c[1] * y[1]
+    return y[0] - c[5], -c[4] * y[1]
 
 
-BALL = flow(
-    "ball", ("y", "v"), ("g", "r"), _fall, jacobian=_fall_jacobian, n_impacts=1, impacts=_of_position,
-    impact_directions=(-1,), reset=_bounce,
+# x'' = -g - k sign(x - level); at the floor it is thrown back, or put down below
+TOSS = flow(
+    "toss", ("x", "v"), ("g", "k", "level", "floor", "r", "down"), _toss, jacobian=_toss_jacobian, n_modes=1,
+    n_switches=1, switches=_of_level, n_impacts=1, impacts=_of_floor, impact_directions=(-1,), reset=_bounce,
 )  # fmt: skip
+
+
+def ball(g, r, down=0.0):
+    """Parameters of a ball above a floor at 0."""
+    return [g, 0.0, -1e3, 0.0, r, down]
 
 
 def ball_exactly(height, g, r, time):
@@ -557,85 +521,66 @@ def ball_exactly(height, g, r, time):
         t += 2.0 * v / g
 
 
+# what is thrown back is seen where it falls: one engine does
+FLOOR = Crossing("x", 0.0, "down")
+
+
 def test_impact__of_a_bouncing_ball_is_the_closed_form():
-    g, r, heights = 9.81, 0.9, np.linspace(0.4, 2.0, 17)
-    found = run_cells(BALL, [g, r], 2.0, np.c_[heights, 0.0 * heights], n_keep=8, rtol=1e-9)
-    for h, sections in zip(heights, found.section[:, 0], strict=True):
-        exact = [ball_exactly(h, g, r, 0.5 * (i + 1))[:2] for i in range(8)]
-        assert sections == pytest.approx(np.array(exact), abs=1e-11)
+    g, r, heights, times = 9.81, 0.9, np.linspace(0.4, 2.0, 17), 0.5 * np.arange(1, 9)
+    starts = np.c_[heights, 0.0 * heights]
+    found = sample(TOSS, np.tile(ball(g, r), (17, 1)), starts, [times], piece=np.zeros(17, int), rtol=1e-9)
+    for h, states in zip(heights, found.states, strict=True):
+        exact = [ball_exactly(h, g, r, t)[:2] for t in times]
+        assert states == pytest.approx(np.array(exact), abs=1e-11)
     assert {ball_exactly(h, g, r, 4.0)[2] for h in heights} >= {6, 8, 10}
+    # it is thrown back ever more slowly
+    found = returns(TOSS, ball(g, r), starts, FLOOR, n_keep=8, rtol=1e-9)
+    speeds = np.sqrt(2.0 * g * heights)[:, None] * r ** np.arange(1, 9)
+    assert found.section[:, 0, :, 1] == pytest.approx(speeds, abs=1e-11)
+    assert found.return_time[:, 0, 1:] == pytest.approx(2.0 * speeds[:, :-1] / g, abs=1e-11)
 
 
 def test_impact__without_loss_keeps_the_energy():
-    found = run_cells(BALL, [1.0, 1.0], 1.0, [[0.5, 0.0], [1.3, 0.4]], n_keep=200, rtol=1e-9)
+    above = Crossing("x", 0.1, "down")
+    found = returns(TOSS, ball(1.0, 1.0), [[0.5, 0.0], [1.3, 0.4]], above, n_keep=200, rtol=1e-9)
     energy = found.section[..., 0] + 0.5 * found.section[..., 1] ** 2
-    assert energy == pytest.approx(np.broadcast_to(energy[..., :1], energy.shape), abs=1e-11)
+    assert energy == pytest.approx(np.broadcast_to([[[0.5]], [[1.38]]], energy.shape), abs=1e-11)
 
 
 def test_section__of_a_flow_with_switches_or_impacts():
     a, g, height = 0.7, 2.0, 0.9
-    relay = returns(RELAY, [1.0], [[a, 0.0]], Crossing("v", 0.0, "down"), n_keep=4, rtol=1e-8)
-    assert relay.return_time[0, 0] == pytest.approx(4.0 * math.sqrt(2.0 * a), abs=1e-11)
+    relay = [0.0, 1.0, 0.0, -1e3, 1.0, 0.0]
+    for level in (0.0, 0.1):  # on the switch, and beside it
+        found = returns(TOSS, relay, [[a, 0.0]], Crossing("x", level, "down"), n_keep=4, rtol=1e-8)
+        first, turn = math.sqrt(2.0 * (a - level)), 4.0 * math.sqrt(2.0 * a)
+        assert found.return_time[0, 0] == pytest.approx([first, *[turn] * 3], abs=1e-11)
     flight = 2.0 * math.sqrt(2.0 * height / g)
-    # at the top, where it falls; and on the floor itself, where the section is taken after the impact
-    top = returns(BALL, [g, 1.0], [[height, 0.0]], Crossing("v", 0.0, "down"), n_keep=4, rtol=1e-8)
-    assert top.return_time[0, 0] == pytest.approx(flight, abs=1e-11)
-    floor = returns(BALL, [g, 1.0], [[height, 0.0]], Crossing("y", 0.0, "down"), n_keep=4, rtol=1e-8)
-    assert floor.return_time[0, 0] == pytest.approx([0.5 * flight, *[flight] * 3], abs=1e-11)
-    assert floor.section[0, 0, :, 1] == pytest.approx(math.sqrt(2.0 * g * height), abs=1e-11)
-    # a jump over the level is no crossing of it
-    over = returns(BALL, [g, 1.0], [[height, 0.0]], Crossing("v", 0.0, "up", 20.0), rtol=1e-8)
-    assert over.status[0, 0] == Status.NO_RETURN
+    # half the way down; and on the floor itself, where the section is taken after the impact
+    half = Crossing("x", 0.5 * height, "down")
+    found = returns(TOSS, ball(g, 1.0), [[height, 0.0]], half, n_keep=4, rtol=1e-8)
+    assert found.return_time[0, 0] == pytest.approx([math.sqrt(0.125) * flight, *[flight] * 3], abs=1e-11)
+    found = returns(TOSS, ball(g, 1.0), [[height, 0.0]], FLOOR, n_keep=4, rtol=1e-8)
+    assert found.return_time[0, 0] == pytest.approx([0.5 * flight, *[flight] * 3], abs=1e-11)
+    assert found.section[0, 0, :, 1] == pytest.approx(math.sqrt(2.0 * g * height), abs=1e-11)
+    # a jump over the level is no crossing of it: put down below the floor, it rises past the level, and again
+    below = Crossing("x", -0.2, "down", 20.0)
+    found = returns(TOSS, ball(g, 1.0, 0.4), [[height, 0.0]], below, rtol=1e-8)
+    assert found.status[0, 0] == Status.NO_RETURN
 
 
 @pytest.mark.parametrize("r", [0.5, 0.0])
 def test_impact__endless_ones_end_in_a_status(r):
     # bounces add up in finite time; without rebound the next is at once
-    found = run_cells(BALL, [9.81, r], 0.5, [[1.0, 0.0]], n_keep=3, max_steps_per_period=3000)
+    deep = Crossing("x", -1.0, "down")
+    found = returns(TOSS, ball(9.81, r), [[1.0, 0.0]], deep, n_keep=3, rtol=1e-8, max_steps_per_period=3000)
     assert found.status[0, 0] == Status.STEP_LIMIT
 
 
 # --- tangents through events --------------------------------------------------------------------------------
 
 
-@inline
-def _struck_constants(frequency, p, out):
-    for i in range(4):
-        out[i] = p[i]
-    out[4] = 2.0 * math.pi * frequency
-
-
-@inline
-def _struck_forcing(t, c):
-    return c[1] * sincos(c[4] * t)[1]
-
-
-@inline
-def _struck_rhs(y, u, c):
-    return y[1], u - 2.0 * c[0] * y[1] - y[0]
-
-
-@inline
-def _struck_jacobian(y, u, c):
-    zero = 0.0 * y[0]
-    return zero, zero + 1.0, zero - 1.0, zero - 2.0 * c[0]
-
-
-@inline
-def _wall(t, y, dy, c):
-    return ((y[0] - c[2], dy[0]),)
-
-
-@inline
-def _strike(k, t, y, c):
-    return y[0], -c[3] * y[1]
-
-
-STRUCK = System(
-    name="impact_oscillator", state_names=("x", "v"), parameter_names=("zeta", "force", "gap", "r"),
-    n_constants=5, constants=_struck_constants, forcing=_struck_forcing, rhs=_struck_rhs,
-    jacobian=_struck_jacobian, n_impacts=1, impacts=_wall, impact_directions=(1,), reset=_strike,
-)  # fmt: skip
+# x'' + 2 zeta x' + x = force cos(w t) left of a wall; parameters zeta, force, gap, r
+STRUCK = load_model("impact").system
 
 
 class ImpactOscillator:
@@ -728,8 +673,8 @@ def test_impact__multipliers_of_an_orbit_are_those_of_the_exact_map():
 def test_switch__derivative_of_a_relay_is_that_of_its_period():
     # from rest at a: after time T the derivative by a follows from the closed form
     a, time, step = 0.7, 3.0, 1e-5
-    packed = np.ones((1, 1))
-    _, derivative = stroboscopic_map(packed, np.array([1.0 / time]), np.array([[a, 0.0]]), 1, system=RELAY)
+    packed, start = np.array([RELAY]), np.array([[a, 0.0]])
+    _, derivative = stroboscopic_map(packed, np.array([1.0 / time]), start, 1, system=STICK)
     above, below = (np.array(relay_exactly(a + s, time)) for s in (step, -step))
     assert derivative[0, :, 0] == pytest.approx((above - below) / (2.0 * step), abs=1e-8)
     # a Hamiltonian flow keeps areas, across the switch as well
@@ -740,12 +685,12 @@ def test_switch__sliding_forgets_the_velocity():
     # once it has stuck, the section depends on where it stuck alone: one multiplier is 0
     force, mu, frequency = 1.0, 0.6, 0.05
     starts = np.array([[0.3, 0.2], [0.5, -0.1]])
-    packed = np.tile([force, mu], (2, 1))
-    _, derivatives = stroboscopic_map(packed, np.full(2, frequency), starts, 1, system=DRY)
+    packed = np.tile(dry(force, mu), (2, 1))
+    _, derivatives = stroboscopic_map(packed, np.full(2, frequency), starts, 1, system=STICK)
     step = 1e-5
     for i in range(2):
         shifted = starts[:, None, :] + step * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-        found = run_cells(DRY, packed[0], frequency, shifted[i], rtol=1e-13).section[:, 0, 0]
+        found = run_cells(STICK, packed[0], frequency, shifted[i], rtol=1e-13).section[:, 0, 0]
         differences = np.array([found[0] - found[1], found[2] - found[3]]).T / (2.0 * step)
         assert derivatives[i] == pytest.approx(differences, abs=1e-6)
         assert abs(np.linalg.det(derivatives[i])) < 1e-10
@@ -771,16 +716,17 @@ def test_lyapunov__exponents_through_impacts_add_up_to_the_loss_of_area():
 def test_lyapunov__through_sticking_has_a_largest_exponent():
     # sticking forgets the velocity: the second exponent is none, the first is that of where it stuck
     force, mu, frequency = 1.0, 0.6, 0.05
+    packed = np.array([dry(force, mu)])
     found = lyapunov_exponents(
-        np.array([[force, mu]]), np.array([frequency]), np.array([[0.3, 0.2]]), n_exponents=2, n_transient=8,
-        n_periods=32, system=DRY, rtol=1e-9, atol=1e-9,
+        packed, np.array([frequency]), np.array([[0.3, 0.2]]), n_exponents=2, n_transient=8,
+        n_periods=32, system=STICK, rtol=1e-9, atol=1e-9,
     )  # fmt: skip
     assert found.status[0] == Status.BOUNDED
     assert found.loss[0] > 1e14
     assert found.exponents[0, 1] < -1.0
     _, derivative = stroboscopic_map(
-        np.array([[force, mu]]), np.array([frequency]),
-        run_cells(DRY, [force, mu], frequency, [[0.3, 0.2]], n_transient=8).section[0, 0], 1, system=DRY,
+        packed, np.array([frequency]),
+        run_cells(STICK, packed[0], frequency, [[0.3, 0.2]], n_transient=8).section[0, 0], 1, system=STICK,
     )  # fmt: skip
     largest = abs(np.linalg.eigvals(derivative[0])).max()
     expected = math.log(largest) * frequency if largest > 1e-9 else -1.0
@@ -799,17 +745,17 @@ def test_trajectory__of_dry_friction_and_impacts_is_the_closed_form():
     force, mu, frequency = 1.0, 0.3, 0.07
     times = np.linspace(0.05, 60.0, 240)
     states = DryFriction(force, mu, frequency).state(0.3, times)
-    found = trajectory(given(DRY, force, mu), frequency, [0.3, 0.0], times, rtol=1e-11, atol=1e-11)
+    found = trajectory(given(STICK, *dry(force, mu)), frequency, [0.3, 0.0], times, rtol=1e-11, atol=1e-11)
     assert found == pytest.approx(states, abs=1e-8)
     g, r, times = 9.81, 0.8, np.linspace(0.01, 2.4, 100)
-    found = trajectory(given(BALL, g, r), 0.4, [1.0, 0.0], times)
+    found = trajectory(given(TOSS, *ball(g, r)), 0.4, [1.0, 0.0], times)
     assert found == pytest.approx(np.array([ball_exactly(1.0, g, r, t)[:2] for t in times]), abs=1e-10)
 
 
 def test_sample__of_many_goes_through_impacts():
     g, r, heights, times = 9.81, 0.8, np.linspace(0.5, 1.5, 20), np.linspace(0.01, 2.0, 40)
     starts = np.c_[heights, 0.0 * heights]
-    found = sample(BALL, np.tile([g, r], (20, 1)), starts, [times], piece=np.zeros(20, int))
+    found = sample(TOSS, np.tile(ball(g, r), (20, 1)), starts, [times], piece=np.zeros(20, int))
     for h, states in zip(heights, found.states, strict=True):
         exact = [ball_exactly(h, g, r, t)[:2] for t in times]
         assert states[: len(times)] == pytest.approx(np.array(exact), abs=1e-10)
@@ -817,12 +763,12 @@ def test_sample__of_many_goes_through_impacts():
 
 def test_rates__take_switches_by_their_signs_and_segments_by_time():
     states = np.array([[0.5, 1.0], [0.5, -2.0], [-0.5, 0.0]])
-    found = rates(0.0, states, given(DRY, 1.0, 0.3), 0.1)
+    found = rates(0.0, states, given(STICK, *dry(1.0, 0.3)), 0.1)
     assert found[:, 1] == pytest.approx([1.0 - 0.5 - 0.3, 1.0 - 0.5 + 0.3, 1.0 + 0.5 - 0.3])
     frequency = 0.8
     at = np.array([0.1, 0.25, 0.5, 0.69, 0.71, 0.99, 1.1]) / frequency
-    found = rates(at, np.zeros((7, 1)), given(LOW_PASS, 1.0), frequency)
-    assert found[:, 0].tolist() == [0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    found = rates(at, np.zeros((7, 2)), given(STICK, *pushed(2.0, 1.0, 1.0)), frequency)
+    assert found[:, 1].tolist() == [-1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0]
 
 
 # --- checks -------------------------------------------------------------------------------------------------
@@ -852,21 +798,15 @@ def _half_a_state(k, t, y, c):
         ({"switches": _wrong_rate}, "switches: the rate of number 0"),
         ({"switches": _no_pair}, "switches must return a tuple of 1 pairs"),
         ({"has_segments": True, "n_modes": 2}, "there is no edge"),
-        ({"n_impacts": 1, "impact_directions": (-1,), "impacts": _of_position}, "reset is missing"),
-        (
-            {"n_impacts": 1, "impact_directions": (0,), "impacts": _of_position, "reset": _bounce},
-            "impact_directions: 0 must be 1",
-        ),
-        (
-            {"n_impacts": 1, "impact_directions": (-1,), "impacts": _of_position, "reset": _half_a_state},
-            "reset returns 1 numbers; it must return a tuple of 2",
-        ),
+        ({"reset": None}, "reset is missing"),
+        ({"impact_directions": (0,)}, "impact_directions: 0 must be 1"),
+        ({"reset": _half_a_state}, "reset returns 1 numbers; it must return a tuple of 2"),
     ],
 )
 def test_check_system__names_what_is_wrong_with_events(fields, message):
-    system = dataclasses.replace(RELAY, **fields)
+    system = dataclasses.replace(TOSS, **fields)
     with pytest.raises(SystemCheckError) as error:
-        check_system(system, np.ones((1, 1)), np.ones(1), np.ones((1, 2)))
+        check_system(system, np.ones((1, 6)), np.ones(1), np.ones((1, 2)))
     assert message in str(error.value)
 
 
@@ -874,7 +814,7 @@ def test_events__bits_depend_on_the_lane_alone():
     rng = np.random.default_rng(5)
     n = 45
     options = {"n_transient": 4, "n_keep": 2, "rtol": 1e-7}
-    for system, parameters in ((DRY, [1.0, 0.4]), (STRUCK, [0.05, 1.0, 0.4, 0.8])):
+    for system, parameters in ((STICK, dry(1.0, 0.4)), (STRUCK, [0.05, 1.0, 0.4, 0.8])):
         starts = rng.uniform(-0.4, 0.4, (n, 2))
         whole = run_cells(system, parameters, 0.1, starts, **options)
         order = rng.permutation(n)

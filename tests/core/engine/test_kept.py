@@ -213,8 +213,9 @@ from magpend_core.engine import jit, kept
 def summed(x, y):
     return x + y
 dispatcher = jit.kernel(summed)
-arguments = (1.0, 2.0) if sys.argv[1] == "0" else (1, 2)
-print(*(float(dispatcher(*arguments)) for _ in range(3)), sum(dispatcher.stats.cache_hits.values()))
+for word in sys.argv[1]:
+    arguments = (1.0, 2.0) if word == "0" else (1, 2)
+    print(*(float(dispatcher(*arguments)) for _ in range(3)), sum(dispatcher.stats.cache_hits.values()))
 """
 
 
@@ -225,14 +226,16 @@ def test_keep__two_processes_that_write_at_once(tmp_path):
     environment = {**os.environ, "MAGPEND_CACHE_DIR": str(tmp_path / "cache"), "PYTHONWARNINGS": "error"}
     environment["PYTHONPATH"] = str(Path(jit.__file__).parents[2])
 
-    def started(i):
-        words = [sys.executable, str(script), str(i % 2)]
+    def started(which):
+        words = [sys.executable, str(script), which]
         return subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True)
 
-    for hits in ("0", "1"):
-        processes = [started(i) for i in range(2)]
-        printed = [process.communicate(timeout=120)[0].split() for process in processes]
-        assert printed == [["3.0"] * 3 + [hits]] * 2
+    def printed(process):
+        return process.communicate(timeout=120)[0].split()
+
+    assert [printed(process) for process in [started("0"), started("1")]] == [["3.0"] * 3 + ["0"]] * 2
+    assert len(entries(tmp_path / "cache")) == 2
+    assert printed(started("01")) == ["3.0"] * 3 + ["1"] + ["3.0"] * 3 + ["2"]
     assert len(entries(tmp_path / "cache")) == 2
 
 

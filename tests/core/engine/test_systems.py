@@ -192,18 +192,11 @@ def _growth_rhs(y, u, c):
     return (y[0] * (1.0 - y[0]),)
 
 
-def test_one_state__without_forcing_or_parameters():
-    # logistic growth: x(t) = 1/(1 + (1/x0 - 1) exp(-t))
-    growth = System(
-        name="growth", state_names=("x",), parameter_names=(), n_constants=0, constants=_no_constants,
-        rhs=_growth_rhs,
-    )  # fmt: skip
-    result = run_branches(
-        np.empty((1, 1, 0)), np.array([[2.0]]), np.array([[0.1]]), system=growth, n_transient=0, n_keep=4,
-        rtol=1e-11, atol=1e-11,
-    )  # fmt: skip
-    exact = 1.0 / (1.0 + 9.0 * np.exp(-0.5 * np.arange(1, 5)))
-    assert result.section.ravel() == pytest.approx(exact, abs=1e-10)
+GROWTH = System(
+    name="growth", state_names=("x",), parameter_names=(), n_constants=0, constants=_no_constants,
+    rhs=_growth_rhs,
+)  # fmt: skip
+"""x' = x (1 - x), the least of all: neither forcing nor parameters"""
 
 
 def test_one_state__that_is_left_unbounded_fails_by_a_status():
@@ -222,8 +215,10 @@ class _Count(NamedTuple):
     n: int
 
 
-def _count_positive(section, turns, i_period, memory, record, measures, settings):
+def _count_above(section, turns, i_period, memory, record, measures, settings):
     measures[0] += section[0] > LEVEL  # noqa: F821
+    if i_period <= len(record):
+        record[i_period - 1, 0] = section[0]
     return BOUNDED if i_period == settings.n else PENDING  # noqa: F821
 
 
@@ -232,16 +227,21 @@ def _no_memory(settings, n_states):
     return 0
 
 
-def test_observer__of_ones_own(duffing):
-    codes = {"PENDING": int(Status.PENDING), "BOUNDED": int(Status.BOUNDED), "LEVEL": 0.0}
-    observer = Observer("count_positive", _count_positive, _no_memory, codes)
-    # two wells: the attractors of the two starts lie on either side of 0
+@pytest.mark.parametrize("n_keep", [0, 4])
+def test_observer__of_ones_own_on_one_state_without_forcing_or_parameters(n_keep):
+    codes = {"PENDING": int(Status.PENDING), "BOUNDED": int(Status.BOUNDED), "LEVEL": 0.5}
+    observer = Observer("count_above", _count_above, _no_memory, codes)
+    starts = np.array([0.0, 0.1, 0.9])
     cells = integrate(
-        duffing, observer, _Count(7), parameters=np.tile([0.15, -1.0, 1.0, 0.2], (2, 1, 1)),
-        frequency_hz=np.full((2, 1), UNIT_FREQUENCY), initial_states=np.array([[-0.8, 0.0], [1.2, 0.0]]),
-        n_keep=0, n_measures=1, rtol=1e-7, atol=1e-7, max_steps_per_period=20_000,
+        GROWTH, observer, _Count(7), parameters=np.empty((3, 1, 0)), frequency_hz=np.full((3, 1), 2.0),
+        initial_states=starts[:, None], n_keep=n_keep, n_measures=1, rtol=1e-11, atol=1e-11,
+        max_steps_per_period=20_000,
     )  # fmt: skip
-    assert cells.measures.ravel().tolist() == [0.0, 7.0]
-    assert cells.n_periods.ravel().tolist() == [7, 7]
+    # logistic growth: x(t) = 1/(1 + (1/x0 - 1) exp(-t)), 1/2 at t = ln 9 from the second start
+    assert cells.measures.ravel().tolist() == [0.0, 3.0, 7.0]
+    assert cells.n_periods.ravel().tolist() == [7, 7, 7]
     assert (cells.status == Status.BOUNDED).all()
-    assert cells.section.shape == (2, 1, 0, 2)
+    assert cells.section.shape == (3, 1, n_keep, 1)
+    decay = np.exp(-0.5 * np.arange(1, n_keep + 1))
+    exact = starts[:, None] / (starts[:, None] + (1.0 - starts[:, None]) * decay)
+    assert cells.section[:, 0, :, 0] == pytest.approx(exact, abs=1e-10)
