@@ -188,8 +188,8 @@ def test_impact__doublings_and_touches(example, magpend, folder, size):
     for period, known in zip((1, 2, 3), REFERENCE["impact"]["doublings"], strict=True):
         assert found[period] == pytest.approx(known, abs=2e-7)
     ends = _stuck(AnalysedRun.of(folder / run).derive("branches", max_period=3, **part), period=2)
-    # the last step before it is short, and falls short of it
-    assert np.abs(ends - REFERENCE["impact"]["second_touch"]).min() < 1e-5
+    # steps that get ever shorter end 6e-7 short of it
+    assert np.abs(ends - REFERENCE["impact"]["second_touch"]).min() < 2e-6
 
 
 def _stuck(branches, period):
