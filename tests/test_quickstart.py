@@ -13,6 +13,7 @@ import pytest
 
 import pipeline
 from magpend_core import Status
+from magpend_core.engine import lanes
 from magpend_core.models.pendulum.sides import Side
 from pipeline.analysis.sides import classify
 from pipeline.runs.workflows import shipped_workflows
@@ -98,29 +99,25 @@ def test_quickstart__period_2_and_period_1(ds):
     assert ((window == 1).mean("branch") > most).all()
 
 
-def test_quickstart__run_again_does_nothing(directory):
+def test_quickstart__run_again_does_nothing(directory, command):
     before = {p: p.stat().st_mtime_ns for p in (directory / "cube.zarr").rglob("*") if p.is_file()}
-    done = magpend("run", "quickstart", "--out", directory)
-    assert done.returncode == 0
-    assert "nothing to do" in done.stderr
+    _, notes = command(directory.parent, "run", "quickstart", "--out", directory)
+    assert "nothing to do" in notes
     assert before == {p: p.stat().st_mtime_ns for p in (directory / "cube.zarr").rglob("*") if p.is_file()}
 
 
-def test_plot__without_kernel(directory, tmp_path):
-    """The figure comes from the cube alone: with a kernel that raises, it is the same file."""
+def test_plot__without_kernel(directory, tmp_path, command, monkeypatch):
+    """The figure comes from the cube alone: with a kernel that raises, it is the other process's file."""
+
+    def broken(*_):
+        raise AssertionError("the kernel was called")
+
+    # what every engine is had from, whoever has imported `integrate` or `engine_of` by then
+    monkeypatch.setattr(lanes, "_engine_of", broken)
+    with pytest.raises(AssertionError, match="the kernel was called"):
+        command(tmp_path, "run", "quickstart", "--smoke", "--out", "other", "--workers", "0")
     plotted = tmp_path / "again.png"
-    code = (
-        "import sys, magpend_core.engine.entry as entry, magpend_core.engine.lanes as lanes\n"
-        "def broken(*a, **k): raise AssertionError('the kernel was called')\n"
-        "entry.integrate = entry.engine_of = lanes.engine_of = broken\n"
-        "from pipeline.cli.main import main\n"
-        f"sys.argv = ['magpend', 'plot', 'bifurcation', {str(directory)!r}, '--out', {str(plotted)!r}]\n"
-        "main()"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
+    command(tmp_path, "plot", "bifurcation", directory, "--out", plotted)
     assert plotted.read_bytes() == (directory / "figures" / "bifurcation_psi1.png").read_bytes()
 
 

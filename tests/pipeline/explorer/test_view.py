@@ -37,14 +37,16 @@ from pipeline.store.errors import DamagedError
 from pipeline.store.run import Run
 from pipeline.store.setup import create
 
-# the same model and section as in test_live.py: nothing more is compiled
+# the same model, and the same is watched, as in tests/test_duffing_day.py: nothing more is compiled
 SWEEP = """
 kind = "sweep"
 title = "<script>alert(1)</script>"
-model = "duffing5"
+model = "duffing"
+[parameters]
+preset = "twin-well-periodic"
 [axes]
 frequency_hz = { values = [0.15, 0.15915494309189535] }
-A = { values = [0.2, 0.25, 0.3] }
+amplitude = { values = [0.2, 0.25, 0.3] }
 [initial_conditions]
 kind = "grid"
 x = { start = -0.9375, stop = 0.9375, num = 6 }
@@ -55,18 +57,19 @@ atol = 1e-9
 n_transient = 150
 n_keep = 12
 [products]
-extremes = { quantities = ["energy"] }
+extremes = { quantities = ["energy", "v"] }
 """
 
 WALK = """
 kind = "continuation"
-model = "duffing5"
+model = "duffing"
 [parameters]
+preset = "twin-well-periodic"
 frequency_hz = 0.15915494309189535
 [axes]
-A = { start = 0.15, stop = 0.3, num = 4 }
+amplitude = { start = 0.15, stop = 0.3, num = 4 }
 [continuation]
-path = "A"
+path = "amplitude"
 direction = "both"
 [initial_conditions]
 kind = "random"
@@ -127,7 +130,7 @@ def sweep(tmp_path_factory):
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     directory = made(tmp_path_factory.mktemp("view") / "walk", WALK)
-    derive(directory, "branches", {"parameter": "A"})
+    derive(directory, "branches", {"parameter": "amplitude"})
     return directory
 
 
@@ -156,18 +159,21 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
     assert found["cells"] == {
         "total": cube.status.size, "pending": 0, "failed": int((cube.status == DIVERGED).sum())
     }  # fmt: skip
-    assert [a["name"] for a in found["axes"]] == ["frequency", "A"]
-    assert found["axes"][1]["values"] == cube["A"].values.tolist()
+    assert [a["name"] for a in found["axes"]] == ["frequency", "amplitude"]
+    assert found["axes"][1]["values"] == cube["amplitude"].values.tolist()
     assert found["starts"] == {"dims": ["x_0", "v_0"], "count": 24}
     names = [v["name"] for v in found["verticals"]]
     assert names[:2] == list(explored.model.state_names)
     quantities = [q.name for q in explored.model.quantities]
-    assert names[2:] == [*quantities, "energy.min", "energy.max", "energy.mean"]
+    assert names[2:] == [
+        *quantities,
+        *(f"{watched}.{extreme}" for watched in ("energy", "v") for extreme in ("min", "max", "mean")),
+    ]
     assert found["planes"][0] == ["x", "v"]
     assert found["has"]["attractors"]
     assert found["has"]["basins"]
     assert not found["has"]["branches"]
-    assert [p["value"] is None for p in found["model"]["parameters"] if p["name"] == "A"] == [True]
+    assert [p["value"] is None for p in found["model"]["parameters"] if p["name"] == "amplitude"] == [True]
 
 
 def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made_run):
@@ -208,13 +214,13 @@ def test_plain__writes_greek_accents_and_subscripts():
 # ---- the diagram
 
 
-@pytest.mark.parametrize("x", ["frequency", "A"])
+@pytest.mark.parametrize("x", ["frequency", "amplitude"])
 @pytest.mark.parametrize("y", ["v", "energy.max"])
 def test_diagram__has_every_point_of_the_cube(sweep, x, y):
     """Cells are where their numbers say, and points are the cube's, whichever axis is horizontal."""
     explored = ExploredRun.of(sweep)
     cube = explored.cube().load()
-    other = "A" if x == "frequency" else "frequency"
+    other = "amplitude" if x == "frequency" else "frequency"
     arrays, attrs = unpack_arrays(diagram(explored, x, y, {other: 1}))
     assert attrs["at"] == {other: 1}
     assert np.all(np.diff(arrays["x"]) > 0)
@@ -240,7 +246,7 @@ def test_diagram__shows_quantities_at_the_sections(sweep):
     """The energy at the end of a period lies between its extremes over that period, and nowhere else."""
     explored = ExploredRun.of(sweep)
     found = [
-        unpack_arrays(diagram(explored, "frequency", y, {"A": 2}))[0]["y"]
+        unpack_arrays(diagram(explored, "frequency", y, {"amplitude": 2}))[0]["y"]
         for y in ("energy", "energy.min", "energy.max")
     ]
     energy, low, high = found
@@ -252,8 +258,12 @@ def test_diagram__shows_quantities_at_the_sections(sweep):
 
 def test_diagram__colours_are_those_of_the_analyses(sweep):
     explored = ExploredRun.of(sweep)
-    arrays, _ = unpack_arrays(diagram(explored, "A", "x", {"frequency": 0}))
-    ids = derive(sweep, "attractors")["attractor_id"].transpose("frequency", "A", "x_0", "v_0").values.ravel()
+    arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
+    ids = (
+        derive(sweep, "attractors")["attractor_id"]
+        .transpose("frequency", "amplitude", "x_0", "v_0")
+        .values.ravel()
+    )
     expected = ids[arrays["cell"]]
     assert len(set(expected.tolist())) > 1
     np.testing.assert_array_equal(arrays["colour_attractor"], np.where(expected < 0, NONE, expected))
@@ -263,7 +273,7 @@ def test_diagram__colours_are_those_of_the_analyses(sweep):
 
 def test_diagram__tells_directions_and_seeds(walk):
     explored = ExploredRun.of(walk)
-    arrays, _ = unpack_arrays(diagram(explored, "A", "x", {}))
+    arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {}))
     cube = explored.cube()
     branch = arrays["cell"] % cube.sizes["branch"]
     np.testing.assert_array_equal(arrays["colour_direction"], cube["direction"].values[branch] == "down")
@@ -272,26 +282,26 @@ def test_diagram__tells_directions_and_seeds(walk):
 
 def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep, monkeypatch):
     explored = ExploredRun.of(sweep)
-    whole, _ = unpack_arrays(diagram(explored, "A", "x", {"frequency": 0}))
+    whole, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
     monkeypatch.setattr(diagrams, "MOST_POINTS", 72 * 5)
-    part, attrs = unpack_arrays(diagram(explored, "A", "x", {"frequency": 0}))
+    part, attrs = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
     assert (attrs["kept"], attrs["n_keep"]) == (5, 12)
     k = int(np.flatnonzero(np.diff(whole["first"]) == 12)[0])
     own = whole["y"][whole["first"][k] : whole["first"][k + 1]]
     np.testing.assert_array_equal(part["y"][part["first"][k] : part["first"][k + 1]], own[-5:])
     monkeypatch.setattr(diagrams, "MOST_POINTS", 71)
     with pytest.raises(ExplorerError, match="71 cells at most"):
-        diagram(explored, "A", "x", {"frequency": 0})
+        diagram(explored, "amplitude", "x", {"frequency": 0})
 
 
 @pytest.mark.parametrize(
     ("x", "y", "at", "sentence"),
     [
         ("q", "x", {}, "unknown axis 'q'"),
-        ("A", "w", {"frequency": 0}, "unknown vertical axis 'w'"),
-        ("A", "x", {}, "at.frequency is missing"),
-        ("A", "x", {"frequency": 2}, "must be 0 to 1"),
-        ("A", "x", {"frequency": 0, "g": 1}, "unknown axis 'g'"),
+        ("amplitude", "w", {"frequency": 0}, "unknown vertical axis 'w'"),
+        ("amplitude", "x", {}, "at.frequency is missing"),
+        ("amplitude", "x", {"frequency": 2}, "must be 0 to 1"),
+        ("amplitude", "x", {"frequency": 0, "g": 1}, "unknown axis 'g'"),
     ],
 )
 def test_diagram__refuses_in_a_sentence(sweep, x, y, at, sentence):
@@ -404,15 +414,15 @@ def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
         index = explored.cell(number)
         one = int(found["attractor_id"].isel(index))
         assert attrs["attractor"] == one
-        assert attrs["at"] == {d: index[d] for d in ("frequency", "A")}
-        here = found.isel({d: index[d] for d in ("frequency", "A")})
+        assert attrs["at"] == {d: index[d] for d in ("frequency", "amplitude")}
+        here = found.isel({d: index[d] for d in ("frequency", "amplitude")})
         assert attrs["share"] == float(here["share"][one])
         assert attrs["low"] <= attrs["share"] <= attrs["high"]
         assert len(attrs["seeds"]) == int(here["n_cells"][one])
         start = {name: float(explored.cube()[f"{name}_0"][index[f"{name}_0"]]) for name in ("x", "v")}
         assert attrs["start"] == start
         assert {k: attrs["seeds"][0][k] for k in start} == start
-        assert attrs["parameters"]["A"] == float(explored.cube()["A"][index["A"]])
+        assert attrs["parameters"]["amplitude"] == float(explored.cube()["amplitude"][index["amplitude"]])
         if int(here["orbit_period"][one]) == attrs["period"]:
             real = here["multiplier_real"][one].values
             np.testing.assert_allclose([m[0] for m in attrs["multipliers"]], real)
@@ -429,7 +439,7 @@ def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
         multipliers, seconds = linearise(cell)
         index = explored.cell(number)
         one = int(found["attractor_id"].isel(index))
-        here = found.isel(frequency=index["frequency"], A=index["A"], attractor=one)
+        here = found.isel(frequency=index["frequency"], amplitude=index["amplitude"], attractor=one)
         if int(here["orbit_period"]) == cell.period:
             expected = here["multiplier_real"].values + 1j * here["multiplier_imag"].values
             np.testing.assert_allclose(np.sort_complex(multipliers), np.sort_complex(expected), atol=1e-6)
@@ -502,32 +512,34 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
 def test_curves__are_shares_and_exponents_of_the_analysis(sweep):
     explored = ExploredRun.of(sweep)
     found = derive(sweep, "attractors").isel(frequency=1)
-    listed = curves(explored, "A", {"frequency": 1})["curves"]
+    listed = curves(explored, "amplitude", {"frequency": 1})["curves"]
     json.dumps(listed, allow_nan=False)
     shares = {c["attractor"]: c for c in listed if c["group"] == "fractions"}
     assert shares
     for number, one in shares.items():
         np.testing.assert_array_equal(one["y"], found["share"].isel(attractor=number).values)
         assert all(low <= y <= high for low, y, high in zip(one["low"], one["y"], one["high"], strict=True))
-        assert one["x"] == found["A"].values.tolist()
+        assert one["x"] == found["amplitude"].values.tolist()
 
 
 def test_branches__lie_on_the_diagram(walk):
     """Where a branch is stable, points of the cube lie on it; every located point has its branch."""
     explored = ExploredRun.of(walk)
-    found = branches(explored, "A", "x", {})
+    found = branches(explored, "amplitude", "x", {})
     json.dumps(found, allow_nan=False)
     assert found["note"] is None
     stable = [s for b in found["branches"] for s in b["segments"] if s["stable"]]
     cube = explored.cube().load()
     tried = 0
-    for i in range(cube.sizes["A"]):
+    for i in range(cube.sizes["amplitude"]):
         for j in np.flatnonzero(cube["status"].values[i] == PERIODIC):
             value = float(cube["section"].sel(state="x").values[i, j, -1])
             heights = [
-                np.interp(float(cube["A"][i]), *(np.array(s[k])[np.argsort(s["x"])] for k in ("x", "y")))
+                np.interp(
+                    float(cube["amplitude"][i]), *(np.array(s[k])[np.argsort(s["x"])] for k in ("x", "y"))
+                )
                 for s in stable
-                if min(s["x"]) <= float(cube["A"][i]) <= max(s["x"])
+                if min(s["x"]) <= float(cube["amplitude"][i]) <= max(s["x"])
             ]
             if heights:
                 tried += 1
@@ -538,15 +550,15 @@ def test_branches__lie_on_the_diagram(walk):
 
 
 def test_branches__without_an_analysis_say_how_to_get_them(sweep):
-    found = branches(ExploredRun.of(sweep), "A", "x", {"frequency": 0})
+    found = branches(ExploredRun.of(sweep), "amplitude", "x", {"frequency": 0})
     assert found["branches"] == []
     assert "magpend analyse branches" in found["note"]
 
 
 def test_attractors__are_those_of_the_point(sweep):
     explored = ExploredRun.of(sweep)
-    here = derive(sweep, "attractors").isel(frequency=0, A=2)
-    found = attractors(explored, {"frequency": 0, "A": 2})["attractors"]
+    here = derive(sweep, "attractors").isel(frequency=0, amplitude=2)
+    found = attractors(explored, {"frequency": 0, "amplitude": 2})["attractors"]
     json.dumps(found, allow_nan=False)
     assert {a["id"] for a in found} == set(np.flatnonzero(here["kind"].values > 0).tolist())
     assert [a["share"] for a in found] == sorted((a["share"] for a in found), reverse=True)
@@ -557,9 +569,9 @@ def test_attractors__are_those_of_the_point(sweep):
 
 def test_plane__has_the_label_of_every_start(sweep):
     explored = ExploredRun.of(sweep)
-    arrays, attrs = unpack_arrays(plane(explored, {"frequency": 1, "A": 0}))
+    arrays, attrs = unpack_arrays(plane(explored, {"frequency": 1, "amplitude": 0}))
     assert (attrs["states"], attrs["source"]) == (["x", "v"], "basins")
-    found = derive(sweep, "basins").isel(frequency=1, A=0)
+    found = derive(sweep, "basins").isel(frequency=1, amplitude=0)
     expected = found["attractor_id"].transpose("v_0", "x_0")
     np.testing.assert_array_equal(arrays["u"], expected["x_0"].values)
     np.testing.assert_array_equal(arrays["v"], expected["v_0"].values)
@@ -570,7 +582,7 @@ def test_plane__has_the_label_of_every_start(sweep):
 
 def test_plane__of_scattered_starts_lists_them(walk):
     explored = ExploredRun.of(walk)
-    arrays, attrs = unpack_arrays(plane(explored, {"A": 1}))
+    arrays, attrs = unpack_arrays(plane(explored, {"amplitude": 1}))
     assert attrs["source"] is None
     assert arrays["label"].size == 0
     cube = explored.cube()
@@ -585,8 +597,8 @@ def test_plane__of_scattered_starts_lists_them(walk):
 @pytest.mark.parametrize("kind", ["diagram", "curves", "orbit", "plane", "attractors"])
 def test_table__has_the_same_rows_in_both_formats(sweep, kind, tmp_path):
     explored = ExploredRun.of(sweep)
-    at = {"frequency": 0} if kind in ("diagram", "curves") else {"frequency": 0, "A": 1}
-    asked = {"x": "A", "y": "x", "at": at, "cell": some_cells(explored)[0], "point": 0}
+    at = {"frequency": 0} if kind in ("diagram", "curves") else {"frequency": 0, "amplitude": 1}
+    asked = {"x": "amplitude", "y": "x", "at": at, "cell": some_cells(explored)[0], "point": 0}
     text = table(explored, kind, asked).decode()
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = list(csv.DictReader(io.StringIO("\n".join(lines))))
@@ -616,7 +628,7 @@ def test_table__a_word_is_no_formula(monkeypatch):
 
 def test_table__of_branches_and_its_refusals(walk):
     explored = ExploredRun.of(walk)
-    asked = {"x": "A", "y": "x", "at": {}}
+    asked = {"x": "amplitude", "y": "x", "at": {}}
     assert table(explored, "branches", asked).startswith(b"# title")
     with pytest.raises(ExplorerError, match="unknown view"):
         table(explored, "planet", asked)
@@ -636,12 +648,14 @@ def test_query__takes_whole_numbers_alone(text):
 
 
 def test_zoom__is_a_specification_of_the_region(sweep, tmp_path):
-    body = json.dumps({"x": [0.21, 0.24], "axes": ["A", "x"], "y": [0, 1], "at": {"frequency": 0}}).encode()
+    body = json.dumps(
+        {"x": [0.21, 0.24], "axes": ["amplitude", "x"], "y": [0, 1], "at": {"frequency": 0}}
+    ).encode()
     reply = ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, body), None)
     path = tmp_path / "zoom.toml"
     path.write_bytes(reply.content)
     spec = load_spec(path)
-    assert spec.axes["A"].array()[[0, -1]].tolist() == [0.21, 0.24]
+    assert spec.axes["amplitude"].array()[[0, -1]].tolist() == [0.21, 0.24]
     with pytest.raises(ExplorerError, match="x"):
         ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, b'{"x": 3}'), None)
 

@@ -50,6 +50,11 @@ def written(command, folder, *words):
     return (folder / "report.html").read_text("utf-8")
 
 
+def bare(folder, target):
+    """A copy of the sweep's run without the analyses that other tests have made of it."""
+    return shutil.copytree(folder / "run", target, ignore=shutil.ignore_patterns("derived"))
+
+
 def wilson(count, n, z=1.959964):
     """Share and score interval (Wilson, 1927), as the page spells them."""
     share = count / n
@@ -58,9 +63,10 @@ def wilson(count, n, z=1.959964):
     return f"{share:.3f} ({middle - half:.3f} to {middle + half:.3f})"
 
 
-def test_report__only_stored_computes_nothing(folder, command):
-    html = written(command, folder, "run", "--only-stored")
-    assert not (folder / "run" / "derived").exists()
+def test_report__only_stored_computes_nothing(folder, command, tmp_path):
+    bare(folder, tmp_path / "run")
+    html = written(command, tmp_path, "run", "--only-stored")
+    assert not (tmp_path / "run" / "derived").exists()
     assert "magpend analyse attractors run" in html
     assert html.count("<img") == 1
 
@@ -130,9 +136,9 @@ def test_report__jumps_of_walks_have_their_place(folder, command):
     assert rows == list(zip(names, *ends, letters, strict=True))
 
 
-def test_report__several_runs(folder, command):
-    command(folder, "run", "spec.toml", "--out", "second", "--workers", "0")
-    page = report([str(folder / "run"), str(folder / "second")], only_stored=True, echo=lambda _: None)
+def test_report__several_runs(folder, tmp_path):
+    both = [str(bare(folder, tmp_path / name)) for name in ("first", "second")]
+    page = report(both, only_stored=True, echo=lambda _: None)
     assert page.title == "2 runs"
     assert [part.title for part in page.parts] == [HOSTILE, HOSTILE]
     assert len(page.summary[0].rows) == 2

@@ -1,8 +1,11 @@
 """A real browser before a real explorer: chromium by playwright, a small run, its page served on loopback.
 
-The run is computed once; `browser` starts chromium once for each file of tests: playwright's event loop
-counts as running in its thread while it is there, so that it must end before other tests begin. Where there
-is no chromium or no playwright the tests say so and are skipped.
+The run is computed once and served once; `browser` starts chromium once for each file of tests: playwright's
+event loop counts as running in its thread while it is there, so that it must end before other tests begin.
+Where there is no chromium or no playwright the tests say so and are skipped.
+
+Loading the page is what takes long: tests that leave it as they find it but for what it shows have `reused`
+open it once, and what it shows put back.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -96,7 +100,7 @@ def looked_at(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Directory of a small run of the pendulum whose attractors have been analysed."""
     folder = tmp_path_factory.mktemp("looked-at")
     (folder / "small.toml").write_text(SMALL, "utf-8")
-    run(folder / "small.toml", folder / "small", workers=1, echo=_silent)
+    run(folder / "small.toml", folder / "small", workers=0, echo=_silent)
     derive(folder / "small", "attractors", {})
     return folder / "small"
 
@@ -122,7 +126,7 @@ def served(directory: Path) -> Iterator[str]:
             process.terminate()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def explorer(looked_at: Path) -> Iterator[str]:
     """Address of the explorer that shows `looked_at`."""
     with served(looked_at) as address:
@@ -142,8 +146,7 @@ def browser() -> Iterator[Any]:
         started.close()
 
 
-@pytest.fixture
-def visit(browser: Any) -> Iterator[Callable[..., Opened]]:
+def visiting(browser: Any) -> Iterator[Callable[..., Opened]]:
     """Open an address in a window of its own: ``visit(address, width=1440, height=900, **context)``."""
     contexts = []
 
@@ -159,3 +162,30 @@ def visit(browser: Any) -> Iterator[Callable[..., Opened]]:
     yield go
     for context in contexts:
         context.close()
+
+
+@pytest.fixture
+def visit(browser: Any) -> Iterator[Callable[..., Opened]]:
+    """See `visiting`; what is opened ends with the test."""
+    yield from visiting(browser)
+
+
+@pytest.fixture(scope="module")
+def lasting(browser: Any) -> Iterator[Callable[..., Opened]]:
+    """See `visiting`; what is opened stays for all tests of a file."""
+    yield from visiting(browser)
+
+
+@contextmanager
+def reused(opened: Opened) -> Iterator[Opened]:
+    """Give a page to a test, and put back what it showed before; it complains of nothing in between."""
+    begun = opened.page.evaluate("magpend.state.get()")
+    yield opened
+    opened.page.mouse.move(5, 5)
+    opened.page.evaluate("begun => { document.activeElement?.blur(); magpend.state.set(begun); }", begun)
+    end = time.monotonic() + WAIT_MS / 1000.0
+    while opened.page.evaluate("!!document.querySelector('.diagram[aria-busy]')"):
+        assert time.monotonic() < end, "what was shown does not come back"
+        opened.page.wait_for_timeout(20)
+    assert opened.page.evaluate("magpend.state.get()") == begun
+    assert opened.complaints == []

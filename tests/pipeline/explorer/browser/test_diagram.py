@@ -6,7 +6,7 @@ import json
 import re
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -17,7 +17,7 @@ import xarray as xr
 
 from pipeline.runs.run import run
 from pipeline.store.reading import open_run
-from tests.pipeline.explorer.browser.conftest import served
+from tests.pipeline.explorer.browser.conftest import reused, served
 
 WAIT_S = 60.0  # a machine that is busy with other tests
 
@@ -28,9 +28,22 @@ def cube(looked_at: Path) -> xr.Dataset:
     return open_run(looked_at).load()
 
 
-@pytest.fixture
-def page(visit: Callable[..., Any], explorer: str) -> Any:
+@pytest.fixture(scope="module")
+def first(lasting: Callable[..., Any], explorer: str) -> Any:
     """The page once its diagram is drawn."""
+    return drawn(lasting(explorer))
+
+
+@pytest.fixture
+def page(first: Any) -> Iterator[Any]:
+    """The page as it begins, loaded once for all who use this."""
+    with reused(first):
+        yield first
+
+
+@pytest.fixture
+def own(visit: Callable[..., Any], explorer: str) -> Any:
+    """A page for one test alone."""
     return drawn(visit(explorer))
 
 
@@ -161,9 +174,9 @@ def test_diagram__hover_tells_values_of_the_cube(page: Any, cube: xr.Dataset) ->
 
 
 def test_diagram__address_restores_the_view(
-    page: Any, visit: Callable[..., Any], explorer: str, cube: xr.Dataset
+    own: Any, visit: Callable[..., Any], explorer: str, cube: xr.Dataset
 ) -> None:
-    one = page.page
+    one = own.page
     one.select_option("select[name=y]", "psi2_dot")
     until(
         one, "magpend.diagram.vertical.name === 'psi2_dot' && !document.querySelector('.diagram[aria-busy]')"
@@ -321,8 +334,8 @@ def test_diagram__legend_switches_points_off(page: Any) -> None:
     assert one.evaluate(ask) == before
 
 
-def test_diagram__a_lost_server_is_said_and_tried_again(page: Any) -> None:
-    one = page.page
+def test_diagram__a_lost_server_is_said_and_tried_again(own: Any) -> None:
+    one = own.page
     one.route("**/api/diagram*", lambda route: route.abort())
     one.select_option("select[name=y]", "psi2")
     one.wait_for_selector(".banner:not([hidden])")
@@ -333,8 +346,8 @@ def test_diagram__a_lost_server_is_said_and_tried_again(page: Any) -> None:
     assert one.evaluate("magpend.diagram.vertical.name") == "psi2"
 
 
-def test_diagram__a_refusal_is_shown_as_the_server_says_it(page: Any) -> None:
-    one = page.page
+def test_diagram__a_refusal_is_shown_as_the_server_says_it(own: Any) -> None:
+    one = own.page
     asked = "magpend.source.diagram({ x: 'frequency', y: 'nothing', at: {} })"
     answer = one.evaluate(f"{asked}.catch((error) => error.message)")
     assert "nothing" in answer
@@ -375,8 +388,8 @@ def test_diagram__texts_can_be_read(visit: Callable[..., Any], explorer: str, sc
     assert [entry for entry in found if entry[1] < 4.5] == []
 
 
-def test_diagram__the_switch_of_colours_is_kept(page: Any) -> None:
-    one = page.page
+def test_diagram__the_switch_of_colours_is_kept(own: Any) -> None:
+    one = own.page
     one.locator(".theme-switch").click()
     assert one.evaluate("document.documentElement.dataset.theme") == "dark"
     assert "dark" not in one.url
@@ -512,7 +525,9 @@ def test_diagram__zoom_here_gives_the_window_as_a_specification_and_runs_it(
     assert page.complaints == []
 
 
-def test_diagram__of_a_run_that_is_not_complete_says_so(visit: Callable[..., Any], made: Any) -> None:
+def test_diagram__of_a_run_that_is_not_complete_says_so_and_other_axes_are_chosen(
+    visit: Callable[..., Any], made: Any
+) -> None:
     total = made.plan.n_cells
     with served(made.info.directory) as address:
         opened = drawn(visit(address))
@@ -532,25 +547,22 @@ def test_diagram__of_a_run_that_is_not_complete_says_so(visit: Callable[..., Any
             made.commit(index)
         note.get_by_role("button", name="Look again").click()
         note.wait_for(state="detached")
+        _choose_other_axes(drawn(opened).page, open_run(made.info.directory).load())
         assert opened.complaints == []
 
 
-def test_diagram__other_axes_are_chosen(visit: Callable[..., Any], made: Any) -> None:
-    for index in range(made.plan.n_tasks):
-        made.commit(index)
-    cube = open_run(made.info.directory).load()
-    with served(made.info.directory) as address:
-        page = drawn(visit(address)).page
-        shown, at = state_of(page)["x"], state_of(page)["at"]
-        (other,) = at
-        page.select_option(f"select[name='at.{other}']", "1")
-        drawn_of = "[...magpend.diagram.data.cell].join()"
-        part = cube.assign(
-            number=(cube["status"].dims, np.arange(cube["status"].size).reshape(cube["status"].shape))
-        )
-        cells = part["number"].isel({other: 1}).transpose(shown, ...).values.ravel()
-        until(page, f"{drawn_of} === '{','.join(map(str, cells))}'")
-        page.select_option("select[name=x]", other)
-        until(page, f"magpend.diagram.data.attrs.x === '{other}'")
-        assert state_of(page)["at"] == {shown: 0}
-        assert page.evaluate("[...magpend.diagram.data.x]") == sorted(cube[other].values.tolist())
+def _choose_other_axes(page: Any, cube: xr.Dataset) -> None:
+    """Another value of the other axis, then that axis itself: what is drawn is the cube's part."""
+    shown, at = state_of(page)["x"], state_of(page)["at"]
+    (other,) = at
+    page.select_option(f"select[name='at.{other}']", "1")
+    drawn_of = "[...magpend.diagram.data.cell].join()"
+    part = cube.assign(
+        number=(cube["status"].dims, np.arange(cube["status"].size).reshape(cube["status"].shape))
+    )
+    cells = part["number"].isel({other: 1}).transpose(shown, ...).values.ravel()
+    until(page, f"{drawn_of} === '{','.join(map(str, cells))}'")
+    page.select_option("select[name=x]", other)
+    until(page, f"magpend.diagram.data.attrs.x === '{other}'")
+    assert state_of(page)["at"] == {shown: 0}
+    assert page.evaluate("[...magpend.diagram.data.x]") == sorted(cube[other].values.tolist())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -16,7 +16,7 @@ from pipeline.layout.letters import letter
 from pipeline.runs.derive import stored
 from pipeline.store.reading import open_run
 from pipeline.store.run import Run
-from tests.pipeline.explorer.browser.conftest import HOSTILE, WAIT_MS, served
+from tests.pipeline.explorer.browser.conftest import HOSTILE, WAIT_MS, reused, served
 from tests.pipeline.explorer.browser.test_diagram import click_on, drawn, places_of
 
 SOURCES = Path(__file__).parents[4] / "pipeline" / "explorer" / "page" / "src"
@@ -39,7 +39,20 @@ def owners(looked_at: Path, cube: xr.Dataset) -> np.ndarray:
 
 @pytest.fixture
 def page(visit: Callable[..., Any], explorer: str) -> Any:
+    """A page for one test alone: its panels keep what was done with them."""
     return drawn(visit(explorer, **QUIET))
+
+
+@pytest.fixture(scope="module")
+def first(lasting: Callable[..., Any], explorer: str) -> Any:
+    return drawn(lasting(explorer, **QUIET))
+
+
+@pytest.fixture
+def shown(first: Any) -> Iterator[Any]:
+    """A page for tests that select something and look at it, loaded once."""
+    with reused(first):
+        yield first
 
 
 def cells_of(cube: xr.Dataset) -> list[dict[str, float]]:
@@ -86,32 +99,33 @@ def alone(cube: xr.Dataset, owners: np.ndarray, section: np.ndarray) -> int:
     return max(distances, key=lambda i: distances[i])
 
 
-def test_click__shows_the_orbit_of_the_cube(page, cube, owners):
+def test_click__shows_the_orbit_of_the_cube(shown, cube, owners):
     section = cube["section"].transpose(*cube["status"].dims, "period_index", "state").values
     section = section.reshape(-1, *section.shape[-2:])
     cell = alone(cube, owners, section)
     own = cells_of(cube)[cell]
-    page.page.evaluate("magpend.state.set({ y: 'psi1' })")
+    shown.page.evaluate("magpend.state.set({ y: 'psi1' })")
     x, y = np.array([own["frequency"]]), section[cell, :1, 0]
-    click_on(page.page, places_of(page.page, x, y)[0])
-    page.page.locator(".panels[data-shown]").wait_for()
-    selected = page.page.evaluate("magpend.state.get().selected")
+    click_on(shown.page, places_of(shown.page, x, y)[0])
+    shown.page.locator(".panels[data-shown]").wait_for()
+    selected = shown.page.evaluate("magpend.state.get().selected")
     point = section[selected["cell"], selected["point"]]
     assert owners[selected["cell"]] == owners[cell]
     assert abs(point[0] - y[0]) < 1e-3  # a pixel
-    assert float(fact(page, "frequency")) == pytest.approx(own["frequency"])
-    assert fact(page, "Period") == "1 drive period"
-    assert fact(page, "Attractor").startswith(f"{letter(int(owners[selected['cell']]))}:")
-    shown = numbers(page.page.locator(".panel-series output").text_content())
+    assert float(fact(shown, "frequency")) == pytest.approx(own["frequency"])
+    assert fact(shown, "Period") == "1 drive period"
+    assert fact(shown, "Attractor").startswith(f"{letter(int(owners[selected['cell']]))}:")
+    told = numbers(shown.page.locator(".panel-series output").text_content())
     # four significant digits, at the section's own instant; the angles of the cube are within half a turn
-    assert shown[0] == 0.0
-    assert shown[1:] == pytest.approx(point.tolist(), rel=1e-3)
-    page.page.locator(".panel-multipliers .value").nth(3).wait_for()  # compiled for, if nobody has looked yet
-    assert page.complaints == []
-    assert page.outside == []
+    assert told[0] == 0.0
+    assert told[1:] == pytest.approx(point.tolist(), rel=1e-3)
+    # compiled for, if nobody has looked yet
+    shown.page.locator(".panel-multipliers .value").nth(3).wait_for()
+    assert shown.complaints == []
+    assert shown.outside == []
 
 
-def test_click__on_a_point_that_comes_once_shows_that_very_point(page, cube):
+def test_click__on_a_point_that_comes_once_shows_that_very_point(shown, cube):
     section = cube["section"].transpose(*cube["status"].dims, "period_index", "state").values
     section = section.reshape(-1, *section.shape[-2:])
     frequency = np.array([cell["frequency"] for cell in cells_of(cube)])
@@ -124,14 +138,14 @@ def test_click__on_a_point_that_comes_once_shows_that_very_point(page, cube):
                 lonely, most = (int(i), k), gap
     cell, point = lonely
     x, y = frequency[[cell]], section[cell, [point], 0]
-    page.page.evaluate("magpend.state.set({ y: 'psi1' })")
-    click_on(page.page, places_of(page.page, x, y)[0])
-    page.page.locator(f".panels[data-shown='{cell}-{point}']").wait_for()
-    shown = numbers(page.page.locator(".panel-series output").text_content())
-    assert shown[1:] == pytest.approx(section[cell, point].tolist(), rel=1e-3)
-    page.page.locator(".panel-facts summary", has_text="Starts that lead here").click()
+    shown.page.evaluate("magpend.state.set({ y: 'psi1' })")
+    click_on(shown.page, places_of(shown.page, x, y)[0])
+    shown.page.locator(f".panels[data-shown='{cell}-{point}']").wait_for()
+    told = numbers(shown.page.locator(".panel-series output").text_content())
+    assert told[1:] == pytest.approx(section[cell, point].tolist(), rel=1e-3)
+    shown.page.locator(".panel-facts summary", has_text="Starts that lead here").click()
     own = cells_of(cube)[cell]
-    first = numbers(page.page.locator(".panel-facts details li").first.text_content())
+    first = numbers(shown.page.locator(".panel-facts details li").first.text_content())
     assert first[:2] == pytest.approx([own["psi1_0"], own["psi2_0"]], abs=1e-3)
 
 
@@ -210,15 +224,15 @@ def test_controls__all_have_names_and_time_obeys_keys(page):
     page.page.get_by_role("button", name="Pause").wait_for()
 
 
-def test_save__gives_the_picture_and_the_data_of_a_panel(page, cube):
-    choose(page, 4)
-    card = page.page.locator(".panel-portraits")
+def test_save__gives_the_picture_and_the_data_of_a_panel(shown, cube):
+    choose(shown, 4)
+    card = shown.page.locator(".panel-portraits")
     card.locator("details.save summary").click()
-    with page.page.expect_download() as drawn_file:
+    with shown.page.expect_download() as drawn_file:
         card.get_by_role("button", name="save as SVG").click()
     svg = ElementTree.fromstring(Path(drawn_file.value.path()).read_bytes())
     assert sum("path" in part.tag for part in svg.iter()) > 10
-    with page.page.expect_download() as table:
+    with shown.page.expect_download() as table:
         card.get_by_role("button", name="save as CSV").click()
     lines = [line for line in Path(table.value.path()).read_text("utf-8").splitlines() if line[0] != "#"]
     assert "psi1_dot [rad/s]" in lines[0].split(",")
@@ -234,12 +248,12 @@ def test_connection__that_is_lost_is_said_and_sought(visit, looked_at):
     note_of(opened, "plane", "connection to magpend was lost")
 
 
-def test_hostile_title__stays_text(page):
-    choose(page, 0)
-    assert HOSTILE in page.page.locator("h1").text_content()
-    assert page.page.locator("img").count() == 0
-    assert "run by a title" not in page.page.title().replace(HOSTILE, "")
-    assert page.complaints == []
+def test_hostile_title__stays_text(shown):
+    choose(shown, 0)
+    assert HOSTILE in shown.page.locator("h1").text_content()
+    assert shown.page.locator("img").count() == 0
+    assert "run by a title" not in shown.page.title().replace(HOSTILE, "")
+    assert shown.complaints == []
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
