@@ -163,7 +163,7 @@ def _solved(
 def _quotient(graph: Graph, top: Node, bottom: Node) -> Node:
     """A quotient whose divisor is the difference that a side makes.
 
-    Where that is 0, as of friction without a coefficient, no state stays on the surface and any number will do.
+    Where that is 0, as of friction without a coefficient, no state stays on the surface: any number will do.
     """
     makes_none = graph.call("absolute", bottom), graph.number(_NO_DIFFERENCE)
     return graph.div(top, graph.where_less(*makes_none, graph.one, bottom))
