@@ -22,7 +22,7 @@ from numba import njit
 
 LIMITED, TEXTBOOK = "limited", "textbook"
 OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
-# what compiled functions alone call has no doors for Python and C, which cost half of the compilation
+# what compiled functions alone call has no doors for Python and C, which cost a fifth of the compilation
 WITHOUT_DOORS = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 inlined = njit(forceinline=True, **WITHOUT_DOORS)  # calls with so many parameters cost a fifth of the time
 TWO_PI = 2.0 * math.pi
