@@ -342,26 +342,3 @@ def test_derived__takes_seconds_at_most(what):
             stack.enter_context(pytest.raises(ModelError, match=f"more than .* {what}"))
         _ = model.digest
     assert time.process_time() - begin < 20.0
-
-
-ALL_AT_ONCE = {
-    "x": "v",
-    "v": "a*cos(2*pi*f*t) + 0.3*tanh(20*v)*(x - v) - x**3 - 0.1*atan(30*x)*v + exp(-x**2)*sin(v)*cos(v)"
-    " - 0.2*sign(v) + 0.1*max(x, 0) + 0.2*square(t*f, 0.4) - power*log(2 + x**2)/(1 + v**2)",
-}
-
-
-@pytest.mark.slow
-def test_sections__of_a_text_are_the_same_bits_alone_and_among_others():
-    model = model_of(ALL_AT_ONCE, {"a": 0.9, "power": 0.05})
-    y0 = np.random.default_rng(8).normal(size=(41, 2))
-    frequency = np.linspace(0.1, 0.4, 41)
-    keywords = {"n_transient": 5, "n_keep": 3, "rtol": 1e-8, "atol": 1e-8}
-    together = sections(model.load(), frequency, y0, **keywords)
-    assert np.isfinite(together.section).all()
-    for i in (0, 7, 40):
-        alone = sections(model.load(), frequency[[i]], y0[[i]], n_lanes=1, **keywords)
-        np.testing.assert_array_equal(alone.section[0], together.section[i])
-        assert alone.n_steps[0] == together.n_steps[i]
-    watched = sections(model.load(), frequency, y0, quantities=["x"], **keywords)
-    np.testing.assert_array_equal(watched.section, together.section)

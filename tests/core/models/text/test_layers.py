@@ -274,10 +274,14 @@ CORNERS = {
 
 @pytest.fixture(scope="module")
 def cornered():
-    """An oscillator with all corners, each times a parameter, and a ball on a floor, in one engine."""
+    """An oscillator with all corners, each times a parameter, and a ball on a floor, in one engine.
+
+    It can rub in a layer, too, with functions besides: then the engine has all three to land on.
+    """
     terms = [f"p{i}*({text})" for i, text in enumerate(CORNERS)]
-    weights = {f"p{i}": 0.0 for i in range(len(CORNERS))}
-    oscillator = {"x": "v", "v": f"cos(2*pi*f*t) - 0.1*v - x - ({' + '.join(terms)})"}
+    weights = {**{f"p{i}": 0.0 for i in range(len(CORNERS))}, "rub": 1e-9}
+    layer = "rub*(tanh(20*v) + atan(3*v)*exp(-x**2)/(1 + log(2 + v**2)))"
+    oscillator = {"x": "v", "v": f"cos(2*pi*f*t) - 0.1*v - {layer} - x - ({' + '.join(terms)})"}
     impacts = [{"of": "h", "direction": "down", "set": {"w": "-r*w", "n": "n + 1"}}]
     return model_of(
         {**oscillator, "h": "w", "w": "-g", "n": "0"}, {**weights, "g": 0.0, "r": 0.5}, impacts=impacts
@@ -376,3 +380,31 @@ def test_jacobian__beside_a_corner_is_that_of_its_side():
     model = model_of({"x": "v", "v": "-x*abs(x) - v*where(v > 0, 2, 3) - 0.1*sign(v)"})
     found = jacobian(0.0, [[0.5, 0.2], [-0.5, -0.2]], model.load(), 1.0)
     np.testing.assert_allclose(found[:, 1], [[-1.0, -2.0], [-1.0, -3.0]])
+
+
+EVERYTHING = {
+    "cornered": {**{f"p{i}": 1.0 for i in range(len(CORNERS))}, "rub": 0.1, "g": 0.5, "r": 1.0},
+    "rubbing": {"p": 0.3, "q": 0.6, "mu1": 0.5, "mu2": 0.6, "m": 2.0, "k": 1.0, "belt": 0.1, "jump": 0.3},
+    "jumping": {"jumps": 1.0, "wave": 1.0, "saw": 1.0, "tones": 0.5},
+    "shaken": {},
+}
+"""Parameters with which all that a model here has takes part."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EVERYTHING)
+def test_sections__of_a_text_are_the_same_bits_alone_and_among_others(name, request):
+    parameters = request.getfixturevalue(name).load(**EVERYTHING[name])
+    y0 = np.random.default_rng(8).normal(size=(41, len(parameters.model.states)))
+    y0[:, 2:3] = np.abs(y0[:, 2:3])  # the ball begins above the floor
+    frequency = np.linspace(0.1, 0.4, 41)
+    keywords = {"n_transient": 5, "n_keep": 3, "rtol": 1e-8, "atol": 1e-8}
+    together = sections(parameters, frequency, y0, **keywords)
+    assert np.isfinite(together.section).all()
+    for i in (0, 7, 40):
+        alone = sections(parameters, frequency[[i]], y0[[i]], n_lanes=1, **keywords)
+        np.testing.assert_array_equal(alone.section[0], together.section[i])
+        assert alone.n_steps[0] == together.n_steps[i]
+    if name == "cornered":  # one engine more
+        watched = sections(parameters, frequency, y0, quantities=["x"], **keywords)
+        np.testing.assert_array_equal(watched.section, together.section)
