@@ -3,10 +3,11 @@
 Run it alone on a machine that does nothing else::
 
     python tests/bench/tangents.py [--trajectories 256] [--periods 480] [--frequency 2.4] [--rounds 5]
+        [--exponents 1 2 4]
 
-The same trajectories over the same periods, plain and with one, two and four exponents, in turns and in
-one process; CPU time, the least of the rounds. The targets are 2.5 times the plain trajectory for the
-largest exponent and 6 times for the spectrum.
+The same trajectories over the same periods, plain and with so many exponents, in turns and in one process;
+CPU time, the least of the rounds. The targets are 2.5 times the plain trajectory for the largest exponent and
+6 times for the spectrum.
 """
 
 from __future__ import annotations
