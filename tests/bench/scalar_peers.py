@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -65,7 +66,13 @@ def numbalsoda_runner(parameters: magpend_core.Parameters, method: str) -> Calla
 
 def _scipy_function(parameters: magpend_core.Parameters, frequency_hz: float) -> Callable[..., Any]:
     """Right-hand side as `solve_ivp` calls it, with as little as possible on Python's side."""
-    rhs, omega = scalar_rhs(parameters.as_dict()), 2.0 * math.pi * frequency_hz
+    return _compiled_function(tuple(parameters.as_dict().items()), frequency_hz)
+
+
+@cache
+def _compiled_function(parameters: tuple[tuple[str, float], ...], frequency_hz: float) -> Callable[..., Any]:
+    """Once for all trajectories: each would compile it anew."""
+    rhs, omega = scalar_rhs(dict(parameters)), 2.0 * math.pi * frequency_hz
 
     @njit(error_model="numpy")
     def function(t: float, y: np.ndarray) -> np.ndarray:

@@ -3,10 +3,11 @@
 Run it alone on a machine that does nothing else::
 
     python tests/bench/tangents.py [--trajectories 256] [--periods 480] [--frequency 2.4] [--rounds 5]
+        [--exponents 1 2 4]
 
-The same trajectories over the same periods, plain and with one, two and four exponents, in turns and in
-one process; CPU time, the least of the rounds. The targets are 2.5 times the plain trajectory for the
-largest exponent and 6 times for the spectrum.
+The same trajectories over the same periods, plain and with so many exponents, in turns and in one process;
+CPU time, the least of the rounds. The targets are 2.5 times the plain trajectory for the largest exponent and
+6 times for the spectrum.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ N_BLOCKS = 16
 
 
 def variants(
-    packed: np.ndarray, frequency: np.ndarray, states: np.ndarray, n_periods: int
+    packed: np.ndarray, frequency: np.ndarray, states: np.ndarray, n_periods: int, numbers: Sequence[int]
 ) -> dict[str, Callable[[], object]]:
-    """What is timed, by name; all integrate `n_periods` drive periods."""
+    """What is timed, by name: the plain trajectory and so many exponents, over `n_periods` drive periods."""
 
     def plain() -> object:
         return run_branches(
@@ -45,8 +46,8 @@ def variants(
             packed, frequency, states, n_exponents=n, n_transient=0, n_periods=n_periods, n_blocks=N_BLOCKS
         )
 
-    names = {n: f"{n} exponent{'s' * (n > 1)}" for n in NUMBERS}
-    return {"plain": plain, **{names[n]: exponents(n) for n in NUMBERS}}
+    names = {n: f"{n} exponent{'s' * (n > 1)}" for n in numbers}
+    return {"plain": plain, **{names[n]: exponents(n) for n in numbers}}
 
 
 def cpu_seconds(function: Callable[[], object]) -> float:
@@ -63,6 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--periods", type=int, default=480, help=f"a multiple of {N_BLOCKS}")
     parser.add_argument("--frequency", type=float, default=2.4, help="drive frequency [Hz]")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--exponents", type=int, nargs="+", default=NUMBERS, help="how many (1 2 4)")
     options = parser.parse_args(arguments)
     n = options.trajectories
     packed = np.tile(load_preset().pack(), (n, 1))
@@ -72,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     settled = run_branches(
         packed[:, None], frequency[:, None], starts, n_transient=TRANSIENT, n_keep=1, rtol=1e-8, atol=1e-8
     )
-    cases = variants(packed, frequency, settled.section[:, 0, -1], options.periods)
+    cases = variants(packed, frequency, settled.section[:, 0, -1], options.periods, options.exponents)
     for function in cases.values():
         function()  # compiles
     times = {name: [] for name in cases}

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from magpend_core.crossing import Crossing
 from magpend_core.models import LIBRARY, load_model
@@ -192,14 +193,32 @@ def test_van_der_pol__period_amplitude_and_multiplier(library):
     assert library["van-der-pol"][2]["period"] == pytest.approx(6.6632868593231, abs=1e-12)
 
 
+RETURN = Crossing("x", 0.0, "up", 60.0)
+"""That of test_flows, whose engines serve here, too."""
+
+
+def _half_a_turn(point):
+    """Where Rossler's flow next crosses x = 0 upwards, by another integrator."""
+
+    def rises(t, y, p):
+        return y[0]
+
+    rises.terminal, rises.direction = True, 1.0
+    found = solve_ivp(
+        _rossler, (0.0, 30.0), point, "DOP853", events=rises, args=(EQUATIONS["rossler"][1],), rtol=1e-12,
+        atol=1e-12,
+    )  # fmt: skip
+    return found.y_events[0][0]
+
+
 def test_rossler__orbits_of_chaosbook(library):
     """Unstable orbits of 1, 2 and 3 returns at c = 5.7: periods and multipliers."""
     known = library["rossler"]["orbits"]
-    points = np.array([orbit["point"] for orbit in known]) + [0.0, 1e-4, 1e-5]
-    found = _cycles("rossler", Crossing("x", 0.0, "down", 60.0), points, [1, 2, 3])
+    points = np.array([_half_a_turn(orbit["point"]) for orbit in known])
+    found = _cycles("rossler", RETURN, points + [0.0, 1e-4, 1e-5], [1, 2, 3])
     assert found.converged.all()
     for i, orbit in enumerate(known):
-        assert found.section[i] == pytest.approx(orbit["point"], abs=1e-8)
+        assert found.section[i] == pytest.approx(points[i], abs=1e-8)
         assert found.seconds[i] == pytest.approx(orbit["period"], abs=1e-8)
         assert found.multipliers[i, 0] == pytest.approx(orbit["multiplier"], rel=1e-6)
     # as printed by ChaosBook (P. Simon, extras/simon/Roessler.html)
@@ -212,10 +231,10 @@ def test_rossler__multiplier_is_minus_one_at_the_doublings(library):
     """The stable orbit of 1, 2, 4 returns loses its stability where Brent's method found it."""
     for known in library["rossler"]["doublings"]:
         n, c = known["returns"], known["c"]
-        model = sectioned(load_model("rossler"), Crossing("x", 0.0, "down", 60.0))
+        model = sectioned(load_model("rossler"), RETURN)
         start = _run(model, [[0.0, -4.0, 0.06]], 4000, 1, c=c - 2e-3, frequency_hz=1.0 / 60.0)
         point = start.section[0, 0, :1]
-        found = _cycles("rossler", Crossing("x", 0.0, "down", 60.0), point, [n], c=c)
+        found = _cycles("rossler", RETURN, point, [n], c=c)
         assert found.orbit_period[0] == n
         assert found.seconds[0] == pytest.approx(known["period"], abs=1e-7)
         assert found.multipliers[0, 0] == pytest.approx(-1.0, abs=1e-6)
@@ -292,24 +311,47 @@ def test_impact__the_stop_is_first_touched_at_the_grazing_amplitude(library):
         assert (np.abs(found[1] - found[0]).max() < 1e-6) == closes
 
 
+FARTHEST_BACK = Crossing("v", 0.0, "up", 30.0)
+"""One section for both tests of the belt, and that of workflows/belt.toml: its engines are the same."""
+
+
+def _turning_point(start, belt):
+    """Where a mass that slips on the belt, slower than it, is farthest back, by another integrator."""
+    p = EQUATIONS["belt-stick"][1]
+
+    def slips(t, y):
+        x, v = y
+        size = p["mu"] + p["mu"] * (p["ratio"] - 1.0) * np.exp((v - belt) / p["v0"])
+        return v, size - x - 2.0 * p["zeta"] * v
+
+    def turns(t, y):
+        return y[1]
+
+    turns.terminal, turns.direction = True, 1.0
+    found = solve_ivp(slips, (0.0, 30.0), start, "DOP853", events=turns, rtol=1e-12, atol=1e-12)
+    return found.y_events[0][0][0]
+
+
 @pytest.mark.parametrize(("name", "tolerance"), [("belt", 5e-3), ("belt-stick", 1e-8)])
 def test_belt__stick_slip_cycle(name, tolerance, library):
     """Period and turning point of the cycle with true sticking; the steep tanh creeps a little."""
     for known in library["belt"]["cycles"]:
-        model = sectioned(load_model(name), Crossing("x", 0.8, "up", 30.0))
+        model = sectioned(load_model(name), FARTHEST_BACK)
         found = _run(model, [[-2.0, 0.0]], 60, 2, 1e-9, frequency_hz=1.0 / 30.0, belt=known["belt"])
         assert found.return_time[0, 0] == pytest.approx(known["period"], abs=tolerance)
-        # it slips at 1 - 2 zeta belt, behind this section: the mass still sticks
-        assert found.section[0, 0, :, 1] == pytest.approx(known["belt"], abs=tolerance)
+        # it comes here from where it slips, at 1 - 2 zeta belt: until then it has the belt's velocity
+        back = _turning_point([known["x_slip"], known["belt"]], known["belt"])
+        assert found.section[0, 0, :, 0] == pytest.approx(back, abs=tolerance)
 
 
 @pytest.mark.parametrize("name", ["belt", "belt-stick"])
 def test_belt__rest_and_cycle_are_parted_by_the_unstable_cycle(name, library):
     """1e-3 inside it a state spirals to the rest, as far outside it sticks and slips."""
     for known in library["belt"]["rest"]:
-        model = sectioned(load_model(name), Crossing("v", 0.0, "down", 30.0))
+        model = sectioned(load_model(name), FARTHEST_BACK)
         starts = [[known["unstable_x_max"] + off, 0.0] for off in (-1e-3, 1e-3)]
         found = _run(model, starts, 400, 1, 1e-9, frequency_hz=1.0 / 30.0, belt=known["belt"])
         inside, outside = found.section[:, 0, 0, 0]
-        assert inside < known["unstable_x_max"] - 0.05
-        assert outside > known["unstable_x_max"] + 0.05
+        unstable_x_min = _turning_point([known["unstable_x_max"], 0.0], known["belt"])
+        assert inside > unstable_x_min + 0.05
+        assert outside < unstable_x_min - 0.05

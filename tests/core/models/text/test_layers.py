@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 
+import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -85,21 +86,24 @@ def test_layers__are_not_where_the_argument_cannot_pass_zero(text):
     assert (derived.layers, derived.waves, derived.switches) == ((), (), ())
 
 
-def test_layers__may_move_with_time():
+@pytest.fixture(scope="module")
+def shaken():
     """Friction on a shaken table: the layer is where the velocities are the same."""
-    equations = {"x": "v", "v": "-0.3*atan(k*(v - cos(2*pi*f*t))) - x"}
-    model = model_of(equations, {"k": 2e3})
-    system = model.system
-    assert (len(model.derived.layers), model.derived.missed, system.timed_layers) == (1, (), True)
+    return model_of({"x": "v", "v": "-0.3*atan(k*(v - cos(2*pi*f*t))) - x"}, {"k": 2e3})
+
+
+def test_layers__may_move_with_time(shaken):
+    system = shaken.system
+    assert (len(shaken.derived.layers), shaken.derived.missed, system.timed_layers) == (1, (), True)
     c = np.zeros(system.n_constants)
-    plain(system.constants)(0.4, model.load().pack(), c)
+    plain(system.constants)(0.4, shaken.load().pack(), c)
     ((value, rate, width, _),) = plain(system.layers)((0.1, 0.5), (0.5, -0.2, 0.7), tuple(c))
     omega = 2 * math.pi * 0.4
     assert value == pytest.approx(0.5 - math.cos(omega * 0.7))
     assert rate == pytest.approx(-0.2 + omega * math.sin(omega * 0.7))
     assert width == pytest.approx(1 / 2e3)
     y0 = np.random.default_rng(2).normal(size=(8, 2))
-    packed = np.tile(model.load().pack(), (8, 1, 1))
+    packed = np.tile(shaken.load().pack(), (8, 1, 1))
     keywords = {"n_transient": 6, "n_keep": 1, "rtol": 1e-8, "atol": 1e-8}
     found = [
         run_branches(packed, np.full((8, 1), 0.4), y0, **keywords, system=s)
@@ -110,19 +114,18 @@ def test_layers__may_move_with_time():
     assert with_layer < 0.2 * without
 
 
-def test_layers__that_move_with_time_carry_tangents():
-    model = model_of({"x": "v", "v": "-0.3*atan(50*(v - cos(2*pi*f*t))) - x"})
-    extended = with_tangents(model.system, 2)
+def test_layers__that_move_with_time_carry_tangents(shaken):
+    extended = with_tangents(shaken.system, 2)
     start = np.array([[0.3, 0.2]])
     whole = np.concatenate([start, np.eye(2).reshape(1, 4)], axis=1)
     keywords = {"n_transient": 0, "n_keep": 1, "rtol": 1e-10, "atol": 1e-10}
-    packed, frequency = model.load().pack()[None, None], np.full((1, 1), 0.4)
+    packed, frequency = shaken.load(k=50.0).pack()[None, None], np.full((1, 1), 0.4)
     carried = run_branches(packed, frequency, whole, **keywords, system=extended).section[0, 0, 0, 2:]
     h = 1e-5
     for k, direction in enumerate(np.eye(2)):
         ends = [
             run_branches(
-                packed, frequency, start + s * h * direction, **keywords, system=model.system
+                packed, frequency, start + s * h * direction, **keywords, system=shaken.system
             ).section
             for s in (1.0, -1.0)
         ]
@@ -130,16 +133,26 @@ def test_layers__that_move_with_time_carry_tangents():
         np.testing.assert_allclose(carried[2 * k : 2 * k + 2], slope, atol=1e-5)
 
 
+DRIVEN_FRICTION = {
+    "name": "driven-friction",
+    "states": {"x": {"unit": "1"}, "v": {"unit": "1/s"}},
+    "parameters": {"zeta": 0.02, "mu": 0.3, "amplitude": 1.0, "eps": 1e3},
+    "equations": {"x": "v", "v": "amplitude*cos(2*pi*f*t) - 2*zeta*v - x - mu*tanh(eps*v)"},
+}
+"""To the letter that of tests/bench/text_models.py, so that its engines serve here, too."""
+
+
 def test_layers__make_a_steep_friction_cheaper():
     """The same system with and without its layer: the limit saves most of the attempts that are rejected."""
-    model = model_of({"x": "v", "v": "0.5*cos(2*pi*f*t) - x - 0.3*atan(k*v)*2/pi"}, {"k": 3e3})
+    model = read_model(DRIVEN_FRICTION)
+    system = model.system
     y0 = np.random.default_rng(2).normal(size=(8, 2))
-    packed = np.tile(model.load().pack(), (8, 1, 1))
+    packed = np.tile(model.load(zeta=0.0, amplitude=0.5, eps=3e3).pack(), (8, 1, 1))
     found = [
         run_branches(
-            packed, np.full((8, 1), 0.2), y0, n_transient=6, n_keep=1, rtol=1e-7, atol=1e-7, system=system
+            packed, np.full((8, 1), 0.2), y0, n_transient=6, n_keep=1, rtol=1e-7, atol=1e-7, system=s
         )
-        for system in (model.system, dataclasses.replace(model.system, name="hidden", has_layers=False))
+        for s in (system, dataclasses.replace(system, name=f"{system.name}_without", has_layers=False))
     ]
     with_layer, without = (int(f.n_rejected.sum()) for f in found)
     assert with_layer < 0.2 * without
@@ -165,11 +178,25 @@ def piecewise(levels, x):
     return x
 
 
+JUMPS = (
+    "2*square(3*t*f + s, d) - square(t*f - s, e)*(1 + k)"
+    " + where(phase < d, 0.5, where(phase <= e and phase > 0.1, -1, 4))"
+)
+
+
+@pytest.fixture(scope="module")
+def jumping():
+    """All that jumps in time, and time in two numbers, each times a parameter: one engine has it all."""
+    tones = "tones*(cos(2*pi*f*t) + x*sin(2*pi*f*t))"
+    text = f"jumps*({JUMPS}) + wave*square(t*f, duty) + saw*phase + {tones} - k*x"
+    weights = dict.fromkeys(("jumps", "wave", "saw", "tones"), 0.0)
+    return model_of({"x": text}, {"d": 0.3, "e": 0.6, "s": 0.37, "k": 1.0, "duty": 0.3, **weights})
+
+
 @pytest.mark.parametrize("duty", [0.3, 0.5, 0.9])
-def test_square__is_followed_exactly(duty):
-    model = model_of({"x": "square(t*f, d) - x"}, {"d": 0.3})
-    assert model.derived.missed == ()
-    found = sections(model.load(d=duty), [0.7], [[0.2]], **KEPT)
+def test_square__is_followed_exactly(duty, jumping):
+    assert model_of({"x": "square(t*f, d) - x"}, {"d": 0.3}).derived.missed == ()
+    found = sections(jumping.load(duty=duty, wave=1.0), [0.7], [[0.2]], **KEPT)
     wanted = piecewise([(duty / 0.7, 1.0), ((1 - duty) / 0.7, -1.0)], 0.2)
     assert found.section[0, 0, 0] == pytest.approx(wanted, abs=1e-9)
     assert found.n_rejected[0] <= 2
@@ -178,13 +205,9 @@ def test_square__is_followed_exactly(duty):
 @pytest.mark.parametrize(
     ("d", "e", "s"), [(0.3, 0.6, 0.37), (0.7, 0.2, -0.9), (0.5, 0.5, 2.6), (0.1, 0.95, 0.0)]
 )
-def test_jumps_in_time__are_followed_in_whatever_order_the_parameters_put_them(d, e, s):
-    text = (
-        "2*square(3*t*f + s, d) - square(t*f - s, e)*(1 + k)"
-        " + where(phase < d, 0.5, where(phase <= e and phase > 0.1, -1, 4)) - k*x"
-    )
-    model = model_of({"x": text}, {"d": 0.3, "e": 0.6, "s": 0.37, "k": 1.0})
-    assert model.derived.n_edges == 12
+def test_jumps_in_time__are_followed_in_whatever_order_the_parameters_put_them(d, e, s, jumping):
+    alone = model_of({"x": f"{JUMPS} - k*x"}, {"d": 0.3, "e": 0.6, "s": 0.37, "k": 1.0})
+    assert alone.derived.n_edges == 12
     frequency = 0.7
 
     def level(share):
@@ -200,18 +223,31 @@ def test_jumps_in_time__are_followed_in_whatever_order_the_parameters_put_them(d
     ])  # fmt: skip
     breaks = np.unique(breaks[(breaks >= 0.0) & (breaks <= 1.0)])
     levels = [((b - a) / frequency, level(0.5 * (a + b))) for a, b in itertools.pairwise(breaks)]
-    found = sections(model.load(d=d, e=e, s=s), [frequency], [[0.2]], **KEPT)
+    found = sections(jumping.load(d=d, e=e, s=s, jumps=1.0), [frequency], [[0.2]], **KEPT)
     assert found.section[0, 0, 0] == pytest.approx(piecewise(levels, 0.2), abs=2e-9)
 
 
-def test_sawtooth__jumps_where_the_period_begins():
+def test_sawtooth__jumps_where_the_period_begins(jumping):
     """x' = phase - x: at time t exactly f (t - 1) + (x0 + f) exp(-t), anew in each period."""
-    model = model_of({"x": "phase - x"})
-    found = sections(model.load(), [0.5], [[0.2]], **{**KEPT, "n_transient": 2})
+    found = sections(jumping.load(saw=1.0), [0.5], [[0.2]], **{**KEPT, "n_transient": 2})
     wanted = 0.2
     for _ in range(3):
         wanted = 0.5 * (2.0 - 1.0) + (wanted + 0.5) * math.exp(-2.0)
     assert found.section[0, 0, 0] == pytest.approx(wanted, abs=1e-9)
+
+
+def test_system__with_time_in_two_numbers_runs(jumping):
+    """x' = -x + cos(wt) + x sin(wt) by an exact integrating factor on a fine grid."""
+    assert jumping.derived.forcing.op == "time"
+    found = sections(jumping.load(tones=1.0), [1.0], [[0.5]], n_transient=0, n_keep=1, rtol=1e-11, atol=1e-11)
+    with mpmath.workdps(20):
+        w = 2 * mpmath.pi
+
+        def factor(t):
+            return mpmath.exp(t + (mpmath.cos(w * t) - 1) / w)
+
+        wanted = (0.5 + mpmath.quad(lambda t: factor(t) * mpmath.cos(w * t), [0, 0.5, 1])) / factor(1)
+    assert found.section[0, 0, 0] == pytest.approx(float(wanted), abs=1e-10)
 
 
 def test_square__of_what_has_no_known_edges_is_told_as_missed():
@@ -238,10 +274,18 @@ CORNERS = {
 
 @pytest.fixture(scope="module")
 def cornered():
-    """An oscillator with all corners, each times a parameter, so that one engine has them all."""
+    """An oscillator with all corners, each times a parameter, and a ball on a floor, in one engine.
+
+    It can rub in a layer, too, with functions besides: then the engine has all three to land on.
+    """
     terms = [f"p{i}*({text})" for i, text in enumerate(CORNERS)]
-    weights = {f"p{i}": 0.0 for i in range(len(CORNERS))}
-    return model_of({"x": "v", "v": f"cos(2*pi*f*t) - 0.1*v - x - ({' + '.join(terms)})"}, weights)
+    weights = {**{f"p{i}": 0.0 for i in range(len(CORNERS))}, "rub": 1e-9}
+    layer = "rub*(tanh(20*v) + atan(3*v)*exp(-x**2)/(1 + log(2 + v**2)))"
+    oscillator = {"x": "v", "v": f"cos(2*pi*f*t) - 0.1*v - {layer} - x - ({' + '.join(terms)})"}
+    impacts = [{"of": "h", "direction": "down", "set": {"w": "-r*w", "n": "n + 1"}}]
+    return model_of(
+        {**oscillator, "h": "w", "w": "-g", "n": "0"}, {**weights, "g": 0.0, "r": 0.5}, impacts=impacts
+    )
 
 
 @pytest.mark.slow
@@ -249,12 +293,12 @@ def cornered():
 def test_corners__are_stepped_on(text, cornered):
     assert model_of({"x": "v", "v": f"cos(2*pi*f*t) - 0.1*v - x - {text}"}).derived.switches
     weight = {f"p{list(CORNERS).index(text)}": 1.0}
-    found = sections(cornered.load(**weight), [0.2], [[0.5, -0.3]], **KEPT)
+    found = sections(cornered.load(**weight), [0.2], [[0.5, -0.3, 1.0, 0.0, 0.0]], **KEPT)
     omega = 2 * math.pi * 0.2
     wanted = by_scipy(
         lambda t, y: [y[1], math.cos(omega * t) - 0.1 * y[1] - y[0] - CORNERS[text](y[0])], [0.5, -0.3], 5.0
     )
-    np.testing.assert_allclose(found.section[0, 0], wanted, atol=3e-5 if "or" in text else 2e-7)
+    np.testing.assert_allclose(found.section[0, 0, :2], wanted, atol=3e-5 if "or" in text else 2e-7)
     # no corner is found by trial: hardly a step is rejected but to land
     assert found.n_rejected[0] < 60
 
@@ -272,60 +316,95 @@ def test_switch__is_one_for_all_that_turns_at_the_same_place():
     assert derived.sliding.slides == (True,)
 
 
-def test_switch__whose_surface_jumps_with_time_is_on_the_right_side_of_it():
+@pytest.fixture(scope="module")
+def rubbing():
+    """A body that lies on another one, on a spring and on a belt: one engine for all that sticks."""
+    rubbed = "mu1*sign(v1 - v2)"
+    ground = "mu2*sign(v2 - belt - where(phase < 0.5, jump, -jump))"
+    # as strong as this, the upper body goes with the lower one, which doubles the mass
+    rest = {"p": 0.0, "q": 0.0, "mu1": 5.0, "mu2": 1.0, "m": 1.0, "k": 0.0, "belt": 0.0, "jump": 0.0}
+    model = model_of({"x": "v2", "v1": f"p - {rubbed}", "v2": f"(q - k*x + {rubbed} - {ground})/m"}, rest)
+    assert model.derived.sliding.slides == (True, True)
+    return model
+
+
+def test_switch__whose_surface_jumps_with_time_is_on_the_right_side_of_it(rubbing):
     """A body rubbed by a belt that runs forth and back: v' = mu towards the belt's velocity."""
-    model = model_of({"v": "-mu*sign(v - where(phase < 0.5, 1, -1))"}, {"mu": 0.5})
-    found = sections(model.load(), [0.5, 0.5], [[0.0], [-0.3]], **KEPT)
-    np.testing.assert_allclose(found.section[:, 0, 0], [0.0, -0.3], atol=1e-10)
+    start = [[0.0, 0.0, 0.0], [0.0, -0.3, -0.3]]
+    found = sections(rubbing.load(mu2=2 * 0.5, jump=1.0), [0.5, 0.5], start, **KEPT)
+    np.testing.assert_allclose(found.section[:, 0, 1:], [[0.0, 0.0], [-0.3, -0.3]], atol=1e-10)
     # with more friction it gets to the belt's velocity and sticks to it, both times
-    stuck = sections(model.load(mu=3.0), [0.5], [[0.1]], **KEPT)
-    np.testing.assert_allclose(stuck.section[0, 0], [-1.0], atol=1e-10)
+    stuck = sections(rubbing.load(mu2=2 * 3.0, jump=1.0), [0.5], [[0.0, 0.1, 0.1]], **KEPT)
+    np.testing.assert_allclose(stuck.section[0, 0, 1:], -1.0, atol=1e-10)
 
 
-def test_sticking__is_exact():
+def test_sticking__is_exact(rubbing):
     """A mass on a belt, stuck until the spring pulls as hard as friction: x = x0 + belt t, then slipping."""
-    model = model_of({"x": "v", "v": "-x - mu*sign(v - belt)"}, {"mu": 0.4, "belt": 0.1})
-    assert model.derived.sliding.slides == (True,)
-    stuck = sections(model.load(), [1 / 3.0], [[-0.1, 0.1]], **KEPT)
-    np.testing.assert_allclose(stuck.section[0, 0], [-0.1 + 0.3, 0.1], atol=1e-12)
+    alone = model_of({"x": "v", "v": "-x - mu*sign(v - belt)"}, {"mu": 0.4, "belt": 0.1})
+    assert alone.derived.sliding.slides == (True,)
+    pulled, start = rubbing.load(k=2 * 1.0, mu2=2 * 0.4, belt=0.1), [[-0.1, 0.1, 0.1]]
+    stuck = sections(pulled, [1 / 3.0], start, **KEPT)
+    np.testing.assert_allclose(stuck.section[0, 0], [-0.1 + 0.3, 0.1, 0.1], atol=1e-12)
     # it lets go at x = mu, after 5 s, with velocity belt; then x = mu + belt sin(t - 5)
-    slipped = sections(model.load(), [1 / 6.0], [[-0.1, 0.1]], **KEPT)
-    np.testing.assert_allclose(
-        slipped.section[0, 0], [0.4 + 0.1 * math.sin(1.0), 0.1 * math.cos(1.0)], atol=1e-9
-    )
+    slipped = sections(pulled, [1 / 6.0], start, **KEPT)
+    x, v = 0.4 + 0.1 * math.sin(1.0), 0.1 * math.cos(1.0)
+    np.testing.assert_allclose(slipped.section[0, 0], [x, v, v], atol=1e-9)
 
 
-def test_sticking__of_two_bodies_on_one_another_is_exact():
+def test_sticking__of_two_bodies_on_one_another_is_exact(rubbing):
     """Two masses pulled apart with less than friction can hold move as one: a = (p + q)/(m1 + m2).
 
     Both surfaces at once, each acting on the other: the lower one stands on the ground.
     """
-    text = {"v1": "p - mu1*sign(v1 - v2)", "v2": "(q + mu1*sign(v1 - v2) - mu2*sign(v2))/2"}
-    model = model_of(text, {"p": 0.3, "q": 0.0, "mu1": 0.5, "mu2": 0.6})
-    assert model.derived.sliding.slides == (True, True)
-    at_rest = sections(model.load(), [1.0], [[0.0, 0.0]], **KEPT)
+    bodies = rubbing.load(p=0.3, mu1=0.5, mu2=0.6, m=2.0)
+    at_rest = sections(bodies, [1.0], [[0.0, 0.0, 0.0]], **KEPT)
     np.testing.assert_allclose(at_rest.section[0, 0], 0.0, atol=1e-12)
     # pulled harder the two slide on the ground together
-    together = sections(model.load(q=0.6), [1.0], [[0.2, 0.2]], **KEPT)
-    np.testing.assert_allclose(together.section[0, 0], 0.2 + (0.3 + 0.6 - 0.6) / 3.0, atol=1e-12)
+    together = sections(bodies.replace(q=0.6), [1.0], [[0.0, 0.2, 0.2]], **KEPT)
+    np.testing.assert_allclose(together.section[0, 0, 1:], 0.2 + (0.3 + 0.6 - 0.6) / 3.0, atol=1e-12)
 
 
-def test_impacts__set_what_the_text_sets():
+def test_impacts__set_what_the_text_sets(cornered):
     """A ball on the floor: the time of flight after each bounce is r times that before."""
-    model = model_of(
-        {"h": "v", "v": "-g", "n": "0"}, {"g": 9.81, "r": 0.5},
-        impacts=[{"of": "h", "direction": "down", "set": {"v": "-r*v", "n": "n + 1"}}],
-    )  # fmt: skip
-    assert len(model.derived.impacts) == 1
+    assert len(cornered.derived.impacts) == 1
     first = math.sqrt(2.0 / 9.81)
     speed = 9.81 * first
     end = first + 2 * 0.5 * speed / 9.81 + 0.1  # after two bounces
-    found = sections(model.load(), [1.0 / end], [[1.0, 0.0, 0.0]], **KEPT)
-    v = 0.25 * speed
-    np.testing.assert_allclose(found.section[0, 0], [v * 0.1 - 0.5 * 9.81 * 0.01, v - 0.981, 2.0], atol=1e-9)
+    found = sections(cornered.load(g=9.81), [1.0 / end], [[0.5, -0.3, 1.0, 0.0, 0.0]], **KEPT)
+    w = 0.25 * speed
+    wanted = [w * 0.1 - 0.5 * 9.81 * 0.01, w - 0.981, 2.0]
+    np.testing.assert_allclose(found.section[0, 0, 2:], wanted, atol=1e-9)
 
 
 def test_jacobian__beside_a_corner_is_that_of_its_side():
     model = model_of({"x": "v", "v": "-x*abs(x) - v*where(v > 0, 2, 3) - 0.1*sign(v)"})
     found = jacobian(0.0, [[0.5, 0.2], [-0.5, -0.2]], model.load(), 1.0)
     np.testing.assert_allclose(found[:, 1], [[-1.0, -2.0], [-1.0, -3.0]])
+
+
+EVERYTHING = {
+    "cornered": {**{f"p{i}": 1.0 for i in range(len(CORNERS))}, "rub": 0.1, "g": 0.5, "r": 1.0},
+    "rubbing": {"p": 0.3, "q": 0.6, "mu1": 0.5, "mu2": 0.6, "m": 2.0, "k": 1.0, "belt": 0.1, "jump": 0.3},
+    "jumping": {"jumps": 1.0, "wave": 1.0, "saw": 1.0, "tones": 0.5},
+    "shaken": {},
+}
+"""Parameters with which all that a model here has takes part."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EVERYTHING)
+def test_sections__of_a_text_are_the_same_bits_alone_and_among_others(name, request):
+    parameters = request.getfixturevalue(name).load(**EVERYTHING[name])
+    y0 = np.random.default_rng(8).normal(size=(41, len(parameters.model.states)))
+    y0[:, 2:3] = np.abs(y0[:, 2:3])  # the ball begins above the floor
+    frequency = np.linspace(0.1, 0.4, 41)
+    keywords = {"n_transient": 5, "n_keep": 3, "rtol": 1e-8, "atol": 1e-8}
+    together = sections(parameters, frequency, y0, **keywords)
+    assert np.isfinite(together.section).all()
+    for i in (0, 7, 40):
+        alone = sections(parameters, frequency[[i]], y0[[i]], n_lanes=1, **keywords)
+        np.testing.assert_array_equal(alone.section[0], together.section[i])
+        assert alone.n_steps[0] == together.n_steps[i]
+    if name == "cornered":  # one engine more
+        watched = sections(parameters, frequency, y0, quantities=["x"], **keywords)
+        np.testing.assert_array_equal(watched.section, together.section)
