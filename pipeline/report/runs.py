@@ -19,7 +19,7 @@ from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
 from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.report.page import Block, Facts, Grid, Note, Part, Source, grid_of, picture_of
-from pipeline.report.stored import stored_options
+from pipeline.report.stored import settled_options, stored_options
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.drawing import figure
 from pipeline.runs.status import state
@@ -298,6 +298,8 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     unit = str(found[path].attrs.get("units", "1")) if path in found.coords else "1"
     axis = f"{path} [{unit}]" if unit != "1" else path
     rows = [_with_letters(row, axis) for row in function_of(ANALYSES[name].table)(found).rows]
+    # as they were settled, so that a page made from what is stored by now is the same
+    options = settled_options(name, found.attrs)
     command = command_of(f"analyse {name}", options, shown.directory)
     if rows:
         yield grid_of(rows, _CAPTIONS[name], command)

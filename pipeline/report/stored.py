@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 from pipeline.products.registry import ANALYSES
@@ -28,7 +29,6 @@ def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
     list of dict
         Options that differ from their defaults, those with the fewest first.
     """
-    analysis = ANALYSES[name]
     found = []
     for place in products_in(run.info.files.below(DERIVED)):
         try:
@@ -40,9 +40,19 @@ def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
             and attrs.get("cube_digest") == run.digest
             and attrs.get("analysis_version") == code_version(name)
         ):
-            given = json.loads(str(attrs["derived_options"]))
-            found.append(analysis.options.model_validate(_tuples(given)).changed())
+            found.append(settled_options(name, attrs))
     return sorted(found, key=lambda options: (len(options), json.dumps(options, sort_keys=True)))
+
+
+def settled_options(name: str, attrs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that a result of an analysis was found with, as its attributes hold them.
+
+    What was left open is settled in them, like a range that is that of the axis: those that differ from their
+    defaults.
+    """
+    given = json.loads(str(attrs["derived_options"]))
+    found: dict[str, Any] = ANALYSES[name].options.model_validate(_tuples(given)).changed()
+    return found
 
 
 def _tuples(value: Any) -> Any:
