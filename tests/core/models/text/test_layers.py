@@ -364,6 +364,20 @@ def test_sticking__of_two_bodies_on_one_another_is_exact(rubbing):
     np.testing.assert_allclose(together.section[0, 0, 1:], 0.2 + (0.3 + 0.6 - 0.6) / 3.0, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("mu1", "mu2", "start", "end"),
+    [
+        (0.0, 0.0, [0.0, 0.5, -0.4], [-0.4 + 0.05, 0.5 + 0.3, -0.4 + 0.1]),
+        (0.0, 0.6, [0.0, -0.1, 0.0], [0.0, -0.1 + 0.3, 0.0]),  # the lower one sticks to the ground
+        (5.0, 0.0, [0.0, 0.0, 0.0], [0.25 / 3.0, 0.5 / 3.0, 0.5 / 3.0]),  # the two are one
+    ],
+)
+def test_sticking__without_friction_there_is_none(rubbing, mu1, mu2, start, end):
+    slippery = rubbing.load(p=0.3, q=0.2, mu1=mu1, mu2=mu2, m=2.0)
+    found = sections(slippery, [1.0], [start], **KEPT)
+    np.testing.assert_allclose(found.section[0, 0], end, atol=1e-12)
+
+
 def test_impacts__set_what_the_text_sets(cornered):
     """A ball on the floor: the time of flight after each bounce is r times that before."""
     assert len(cornered.derived.impacts) == 1
