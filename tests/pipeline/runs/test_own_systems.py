@@ -129,7 +129,8 @@ def test_run__text_is_integrated_as_it_is_written(text_spec, tmp_path):
 def test_run__workers_take_text_from_the_compile_cache(text_spec, tmp_path, bytes_of):
     run(text_spec, tmp_path / "one", workers=0, echo=lambda line: None)
     system = model_of(open_run(tmp_path / "one")).system.name
-    mine = re.compile(rf"lanes\.advance_{system}_[0-9a-f]+_record-.*\.nbc")  # other tests compile beside this one
+    # other tests compile beside this one
+    mine = re.compile(rf"lanes\.advance_{system}_[0-9a-f]+_record-.*\.nbc")
     before = {p for p in jit.CACHE_FOLDER.rglob("*") if mine.fullmatch(p.name)}
     run(text_spec, tmp_path / "two", workers=1, echo=lambda line: None)
     assert before
