@@ -149,14 +149,14 @@ class Window:
         """Have a result fetched; in a thread of the client's."""
         if ticket not in self._flights:
             return
-        if future.status == "finished":
+        if future.status in ("error", "cancelled"):
+            error = future.exception() if future.status == "error" else asyncio.CancelledError()
+            self._news.put(("end", ticket, (None, error)))
+        else:  # finished; or lost since, with the worker that had it: then it is computed again
             fetch = asyncio.run_coroutine_threadsafe(
                 _fetched(self._client, future), self._client.loop.asyncio_loop
             )
             fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
-        else:
-            error = future.exception() if future.status == "error" else asyncio.CancelledError()
-            self._news.put(("end", ticket, (None, error)))
 
     def _wait(self) -> Iterator[tuple[str, int, Any]]:
         """Yield all news, after waiting for some for a moment."""
