@@ -29,6 +29,12 @@ class Step:
 Act = Callable[[int, Step], None]
 
 
+def _put(functions: dict[str, Callable[..., Any]], opener: Callable[..., Any]) -> None:
+    for name, function in functions.items():
+        setattr(os, name, function)
+    io.open = builtins.open = opener  # type: ignore[assignment]
+
+
 @dataclass
 class Steps:
     """Calls for what lies below a folder, in order; before each of them `act` may kill or raise.
@@ -114,14 +120,10 @@ class Steps:
         }  # fmt: skip
         original |= {"open": low_open, "scandir": scandir}
         try:
-            for name, function in patched.items():
-                setattr(os, name, function)
-            io.open = builtins.open = opening  # type: ignore[assignment]
+            _put(patched, opening)
             yield self
         finally:
-            for name, function in original.items():
-                setattr(os, name, function)
-            io.open = builtins.open = plain_open
+            _put(original, plain_open)
 
 
 class _Written:
