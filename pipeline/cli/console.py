@@ -31,7 +31,7 @@ def visible(text: str) -> str:
     """Show control characters as escapes: a text from a file must not steer a terminal."""
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in text)
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 class _Visible(logging.Formatter):

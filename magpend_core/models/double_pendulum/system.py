@@ -8,7 +8,7 @@ from typing import Any
 from magpend_core.engine.jit import inline
 from magpend_core.engine.simd import absolute, multiply_add
 from magpend_core.engine.system import System, positions
-from magpend_core.engine.vecmath import LOG2_E, TWO_PI, atan, exp2_falling, sin, sincos
+from magpend_core.engine.vecmath import LN2, LOG2_E, TWO_PI, atan, exp2_falling, sin, sincos
 from magpend_core.models.double_pendulum.models import PARAMETERS, QUANTITIES, STATES
 
 AT = positions(tuple(p.name for p in PARAMETERS))
@@ -61,7 +61,7 @@ def _dry(v: Any, c: Any) -> Any:
     u = c[C.eps] * v
     angle = atan(u)
     # d/dv of |v| is v/|v|, and atan(u) v/|v| = |atan(u)|
-    falling = (-math.log(2.0) * c[C.c0]) * fading
+    falling = (-LN2 * c[C.c0]) * fading
     slope = multiply_add(c[C.eps] / multiply_add(u, u, 1.0), size, absolute(angle) * falling)
     return angle * size, slope
 

@@ -78,11 +78,11 @@ def refused(monkeypatch, capsys, tmp_path):
 
     spec = tmp_path / "spec.toml"
 
-    def call(text):
+    def call(text, *options):
         spec.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8", "surrogatepass"))
         monkeypatch.chdir(tmp_path)
         for words in (["run", "spec.toml", "--out", "run"], ["run", "spec.toml", "--dry-run"]):
-            monkeypatch.setattr(sys, "argv", ["magpend", *words])
+            monkeypatch.setattr(sys, "argv", ["magpend", *words, *options])
             with pytest.raises(SystemExit) as end:
                 main()
             said = capsys.readouterr()
@@ -196,15 +196,15 @@ def spelled(value):
     return hex(value) if isinstance(value, int) and abs(value) > 10**300 else toml_value(value)
 
 
-def test_outcome__what_is_mutated_can_be_planned(write_spec):
-    assert outcome(write_spec(BASE))
+@pytest.mark.parametrize("smoke", [False, True])
+def test_outcome__what_is_mutated_can_be_planned(write_spec, smoke):
+    assert outcome(write_spec(BASE), smoke)
 
 
-def outcome(path):
-    """Whether a specification can be planned."""
+def outcome(path, smoke):
+    """Whether a specification can be planned, in its own size or in its small one."""
     try:
-        for smoke in (False, True):
-            make_plan(load_spec(path, smoke=smoke))
+        make_plan(load_spec(path, smoke=smoke))
     except SpecError:
         return False
     return True
@@ -220,12 +220,15 @@ FUZZ = settings(
 @given(mutations())
 @example({"kind": []})
 @example({"kind": "sweep", "model": "duffing", "initial_conditions": {"kind": []}})
+@example(tomllib.loads(BASE) | {"\t": {"num": 3}})
+@example(tomllib.loads(BASE) | {"smoke": {"initial_conditions.none": 1}})
 def test_run__mutated_tables_are_planned_or_refused(refused, tmp_path, data):
     text = "\n".join(f"{spelled_key} = {spelled(value)}" for spelled_key, value in _top(data))
     path = tmp_path / "spec.toml"
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
-    if not outcome(path):
-        refused(text)
+    for smoke, options in ((False, ()), (True, ("--smoke",))):
+        if not outcome(path, smoke):
+            refused(text, *options)
 
 
 def _top(data):
@@ -254,8 +257,9 @@ def test_run__mutated_bytes_are_planned_or_refused(refused, tmp_path, data):
             break
     path = tmp_path / "spec.toml"
     path.write_bytes(content)
-    if not outcome(path):
-        refused(bytes(content))
+    for smoke, options in ((False, ()), (True, ("--smoke",))):
+        if not outcome(path, smoke):
+            refused(bytes(content), *options)
 
 
 # ---- sizes ------------------------------------------------------------------------------------------
