@@ -370,11 +370,21 @@ def test_incomplete__what_is_committed_is_taken(place, tmp_path, monkeypatch, by
     assert bytes_of(tmp_path / "new") == bytes_of(fresh)
 
 
+def integrated(timings):
+    """Cells of finished tasks that were not taken from the old run."""
+    lines = timings.read_text().splitlines(keepends=True) if timings.exists() else []
+    done = [json.loads(line) for line in lines if line.endswith("\n")]
+    return sum(task["cells"] - task.get("reused", 0) for task in done)
+
+
 def test_kill__extended_run_has_the_same_bytes(place, start, tmp_path, bytes_of):
     mine, wide, fresh = place
     process = start("extend", mine, wide, "--out", "new", "--workers", 1)
-    while process.poll() is None and not list((tmp_path / "new" / "commits").glob("0*.json")):
+    # a task of taken cells alone would say nothing of those that a worker integrates
+    timings = tmp_path / "new" / "timings.jsonl"
+    while process.poll() is None and not integrated(timings):
         time.sleep(0.002)
+    assert integrated(timings)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
     extend(mine, wide, tmp_path / "new", workers=0, echo=silent)
