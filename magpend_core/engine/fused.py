@@ -4,9 +4,11 @@ A fused product and sum, ``a * b + c`` rounded once, costs half as much as the t
 compiler wants to fuse. Left to it, what is fused depends on the CPU, on its version and on what was inlined
 where, and with that the last bits of a result. Here it depends on the function's source alone:
 
-- a sum or difference with a product in it, of the same function, is fused with it;
-- with two products it is fused with the one on the left;
-- nothing else is.
+- a sum or difference is fused with a product that is one of its two terms, written there or named before, or
+  with that product's negative;
+- if both terms are products, with the one on the left;
+- nothing else is: neither what another function returns, nor a named product that is used in another branch
+  or on the other side of a loop's begin or end.
 
 The rule is applied to numba's intermediate code of a function, before LLVM sees any of it; LLVM may fuse
 nothing on its own then. A CPU without such an operation calls its C library's, for the same bits.

@@ -221,6 +221,24 @@ def test_rule__is_for_float64_alone():
     assert of(1, 2, 3) == 5
 
 
+def test_rule__ends_at_branches_and_loops():
+    @njit(**OPTIONS)
+    def of(a, b, c, n):
+        here = a * b
+        used_here = here + c
+        there, looped = b * a, a * b
+        used_there = used_in_loop = 1.0
+        if n > 0:
+            used_there = there + c
+        for _ in range(n):
+            used_in_loop = looped + c
+        return used_here, used_there, used_in_loop
+
+    # the square is 1 + 2**-29 + 2**-60, of which a float64 drops the last
+    a, c = 1.0 + 2.0**-30, -1.0 - 2.0**-29
+    assert of(a, a, c, 1) == (2.0**-60, 0.0, 0.0)
+
+
 def test_rule__elementary_functions():
     rng = np.random.default_rng(6)
     x = np.concatenate(

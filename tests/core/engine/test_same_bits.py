@@ -1,6 +1,7 @@
 """Bits depend on the trajectory alone: not on lanes, neighbours, order, CPU, compiler or restarts."""
 
 import hashlib
+import platform
 import shutil
 from pathlib import Path
 
@@ -132,6 +133,8 @@ def straight_struck():
 @pytest.mark.parametrize("build", BUILDS)
 def test_engine__same_bits_however_it_is_built(straight, straight_struck, run_python, tmp_path, build):
     settings, package = BUILDS[build], Path(magpend_core.__file__).parent.parent
+    if settings and platform.machine() not in ("x86_64", "AMD64"):
+        pytest.skip(f"this machine, a {platform.machine()}, cannot run code for {build}")
     features = llvmlite.binding.get_host_cpu_features()
     wanted = [f[1:] for f in settings.get("NUMBA_CPU_FEATURES", "").split(",") if f.startswith("+")]
     missing = [f for f in wanted if not features.get(f)]
@@ -150,7 +153,8 @@ def test_engine__same_bits_however_it_is_built(straight, straight_struck, run_py
     out = run_python(SCRIPT, package=package, MAGPEND_CACHE="0", **settings).splitlines()
     assert out[:2] == [digest(straight), digest(straight_struck)]
     assert out[2] == ("1" if build == "scalar" else "16")
-    assert out[3] == INSTRUCTIONS.get(build, out[3])
+    if build in INSTRUCTIONS:
+        assert out[3] == INSTRUCTIONS[build]
 
 
 CACHED = """
