@@ -39,6 +39,10 @@ MOST_LOSS = 1e14
 """Shortening of a vector in one orthonormalisation beyond which rounding errors decide its direction."""
 
 
+MOST_NUMBERS = 2**24
+"""Numbers that the records of cells in one call of the engine may have: a large system's have many."""
+
+
 @dataclass(frozen=True)
 class LyapunovExponents:
     """Outcome of `lyapunov_exponents`; the leading dim is the cell.
@@ -219,7 +223,8 @@ def lyapunov_exponents(
     Raises
     ------
     ValueError
-        If an argument has the wrong shape or is out of bounds.
+        If an argument has the wrong shape or is out of bounds, or the system has more than
+        `sizes.MAX_STATES` states.
 
     Notes
     -----
@@ -240,13 +245,19 @@ def lyapunov_exponents(
     n, has_returns = system.n_states, system.section is not None
     extended = with_tangents(system, n_exponents, divergence=True)
     extended = dataclasses.replace(extended, n_controlled=n * (1 + n_exponents))
-    cells = integrate(
-        extended, _observer(n, n_exponents, has_returns), settings,
-        parameters=packed[:, None], frequency_hz=frequency[:, None],
-        initial_states=_with_vectors(start, n_exponents), n_keep=n_blocks, n_measures=n_exponents + 3,
-        rtol=rtol, atol=atol, max_steps_per_period=max_steps_per_period, n_lanes=n_lanes,
-    )  # fmt: skip
-    record = cells.section[:, 0]
+
+    def averaged(own: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        cells = integrate(
+            extended, _observer(n, n_exponents, has_returns), settings,
+            parameters=packed[own, None], frequency_hz=frequency[own, None],
+            initial_states=_with_vectors(start[own], n_exponents), n_keep=n_blocks,
+            n_measures=n_exponents + 3, rtol=rtol, atol=atol, max_steps_per_period=max_steps_per_period,
+            n_lanes=n_lanes,
+        )  # fmt: skip
+        return cells.section[:, 0, :, : n_exponents + 2].copy(), cells.measures[:, 0], cells.status[:, 0]
+
+    parts = [averaged(own) for own in _parts(len(frequency), extended.n_states * n_blocks, n_lanes)]
+    record, all_measures, status = (np.concatenate(column) for column in zip(*parts, strict=True))
     by_drive = (settings.periods_per_block / frequency)[:, None]
     seconds = record[:, :, n_exponents + 1] if has_returns else by_drive
     sums = record / seconds[:, :, None]
@@ -255,7 +266,7 @@ def lyapunov_exponents(
     means = (sums[:, :, :n_exponents] * shares[:, :, None]).mean(axis=1)
     order = np.argsort(-means, axis=1, kind="stable")
     blocks = np.take_along_axis(sums[:, :, :n_exponents], order[:, None, :], axis=2)
-    measures = np.where(cells.status == BOUNDED, cells.measures[:, 0], np.nan)
+    measures = np.where(status[:, None] == BOUNDED, all_measures, np.nan)
     per_weight = np.ones_like(frequency) if has_returns else frequency
     weighted = measures[:, :n_exponents] / measures[:, n_exponents + 1, None] * per_weight[:, None]
     return LyapunovExponents(
@@ -265,9 +276,15 @@ def lyapunov_exponents(
         blocks=blocks,
         divergence=(sums[:, :, n_exponents] * shares).mean(axis=1),
         loss=measures[:, n_exponents + 2],
-        status=cells.status[:, 0].astype(np.int8),
+        status=status.astype(np.int8),
         is_whole=n_exponents == n,
     )
+
+
+def _parts(n_cells: int, per_cell: int, n_lanes: int) -> list[slice]:
+    """Split cells into parts that are integrated one after the other, each with few enough numbers."""
+    most = max(n_lanes, MOST_NUMBERS // per_cell // n_lanes * n_lanes)
+    return [slice(i, i + most) for i in range(0, max(n_cells, 1), most)]
 
 
 def _settings(n_exponents: int, n_transient: int, n_periods: int, n_blocks: int, system: System) -> _Settings:

@@ -170,8 +170,23 @@ def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarr
 
 def jacobian_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
     """Jacobians of `rates_at`, shape (n, n_states, n_states)."""
-    n = system.n_states
-    return _flow_at("jacobian", n * n, system, states, packed).reshape(-1, n, n)
+    flat = _flow_at("jacobian", _n_entries(system), system, states, packed)
+    return _whole(system, flat)
+
+
+def _n_entries(system: System) -> int:
+    entries = system.jacobian_entries
+    return system.n_states**2 if entries is None else len(entries)
+
+
+def _whole(system: System, flat: np.ndarray) -> np.ndarray:
+    """Jacobians (..., n_states, n_states) from the entries that the system's function returns."""
+    n, leading = system.n_states, flat.shape[:-1]
+    if system.jacobian_entries is None:
+        return flat.reshape((*leading, n, n))
+    whole = np.zeros((*leading, n * n))
+    whole[..., list(system.jacobian_entries)] = flat
+    return whole.reshape((*leading, n, n))
 
 
 def _flow_at(kind: str, n_out: int, system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
@@ -281,9 +296,8 @@ def jacobian(t: Any, state: Any, parameters: Parameters, frequency_hz: float) ->
     ValueError
         As for `rates`.
     """
-    n = parameters.model.system.n_states
-    flat = _at("jacobian", n * n, t, state, parameters, frequency_hz)
-    return flat.reshape((*flat.shape[:-1], n, n))
+    system = parameters.model.system
+    return _whole(system, _at("jacobian", _n_entries(system), t, state, parameters, frequency_hz))
 
 
 def evaluate(

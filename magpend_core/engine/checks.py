@@ -171,6 +171,10 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
             yield f"{field} = {getattr(system, field)} is out of bounds: it must be 0 or more."
     if not 1 <= system.controlled <= max(n, 1):
         yield f"n_controlled = {system.n_controlled} is out of bounds: it must be between 1 and {n}."
+    entries = system.jacobian_entries
+    good = sorted({i for i in entries or () if 0 <= i < n * n})
+    if entries is not None and (not entries or list(entries) != good):
+        yield f"jacobian_entries must be whole numbers from 0 to {n * n - 1} in rising order, one at least."
     yield from event_checks.declaration(system)
     if linearised and system.jacobian is None:
         yield "jacobian is missing; exponents, multipliers and orbits need it."
@@ -392,11 +396,17 @@ class _Motion:
     def _check_jacobian(self, rates: np.ndarray) -> None:
         """Compare with differences of two steps, whose own difference bounds their error."""
         n, names = self.system.n_states, self.system.state_names
+        declared = self.system.jacobian_entries
         what = "the derivatives of each rate by each state, row by row"
-        flat = self.functions.numbers("jacobian", n * n, what, tuple(self.y), self.u, self.c)
+        places = range(n * n) if declared is None else declared
+        if declared is not None:
+            what = "the derivatives whose places jacobian_entries has"
+        flat = self.functions.numbers("jacobian", len(places), what, tuple(self.y), self.u, self.c)
         if flat is None:
             return
-        given = np.array(flat).reshape(n, n, N_SAMPLES)
+        whole = np.zeros((n * n, N_SAMPLES))
+        whole[list(places)] = flat
+        given = whole.reshape(n, n, N_SAMPLES)
         size = np.abs(rates[:, np.isfinite(rates).all(axis=0)]).max(axis=1)
         for j in range(n):
             step = STEP * self.scales[j]

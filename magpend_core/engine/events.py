@@ -173,8 +173,8 @@ def judge_events(w: Any, base: int, failed: Any) -> Any:
     ACCEPT, TAKE_BACK or LANDED; in the last case `fired` tells on which.
     """
     h = load(w, base + ROWS.step)
-    y = load_rows(w, base + ROWS.trial, N)
-    dy = load_rows(w, base + ROWS.slopes + (N_STAGES - 1) * N * WIDTH, N)
+    y = load_rows(w, base + ROWS.trial, N_KNOWN)
+    dy = load_rows(w, base + ROWS.slopes + (N_STAGES - 1) * N * WIDTH, N_KNOWN)
     c = load_rows(w, base + ROWS.constants, NC)
     found = event_values(load(w, base + ROWS.time) + h, y, dy, c, load(w, base + ROWS.level))
     store_rows(w, base + ROWS.found, found)

@@ -26,6 +26,7 @@ import numpy as np
 from magpend_core.engine import events as event_templates
 from magpend_core.engine import modes as mode_templates
 from magpend_core.engine import observers
+from magpend_core.engine import tangents as tangent_templates
 from magpend_core.engine.digests import code_length
 from magpend_core.engine.events import LANDED, TAKE_BACK, event_bindings
 from magpend_core.engine.jit import bound_part, inline, keeping, kernel, specialise
@@ -45,6 +46,7 @@ from magpend_core.engine.simd import (
     where_less,
 )
 from magpend_core.engine.system import System
+from magpend_core.engine.tangents import n_entries, tangent_bindings
 from magpend_core.engine.vecmath import TWO_PI, exp2_rough, hypot_rough, log2_rough
 from magpend_core.engine.watching import (
     begin_watch,
@@ -125,6 +127,7 @@ class Rows(NamedTuple):
     ahead: int  # s, from the begin of the step to where `passed` is of
     resolution: int  # s, of the instant that is looked for; 0 if none is
     level: int  # of the section
+    entries: int  # of the Jacobian at each stage but the first, where the engine carries tangent vectors
     constants: int  # last and in fours, so that systems with few and with some more agree in all other rows
     size: int
 
@@ -135,6 +138,7 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
     counts = [
         system.n_states, system.tableau.n_stages * system.n_states, system.n_states, *[1] * 18,
         system.n_states if n_watched else 0, *[n_watched] * 6, *[2 * n] * 3, *[n] * 3, *[1 if n else 0] * 4,
+        (system.tableau.n_stages - 1) * n_entries(system),
         -(-(system.n_constants + system.n_modes) // 4) * 4,
     ]  # fmt: skip
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
@@ -161,8 +165,8 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     fade are not felt from further away than `FADED`: a step may lead to there, or to a tenth of D. A step
     ends on the segment's end exactly, and the last two steps before that share the rest.
     """
-    y = load_rows(w, base + ROWS.state, N)
-    dy = load_rows(w, base + ROWS.slopes, N)
+    y = load_rows(w, base + ROWS.state, N_KNOWN)
+    dy = load_rows(w, base + ROWS.slopes, N_KNOWN)
     c = load_rows(w, base + ROWS.constants, NC)
     t = load(w, base + ROWS.time)
     remaining = load(w, base + ROWS.target) - t
@@ -207,7 +211,7 @@ def choose_step(w: Any, base: int, slack: float) -> None:
 def run_stage(w: Any, base: int, s: int) -> None:
     """Compute the state and the slope of stage `s` (1, 2, ...)."""
     h = load(w, base + ROWS.step)
-    for i in range(N):
+    for i in range(N_KNOWN):
         row = base + i * WIDTH
         # named: written out, the first sum has a product on either side, in a loop on one
         total = STAGES[s, 0] * load(w, row + ROWS.slopes)
@@ -219,7 +223,12 @@ def run_stage(w: Any, base: int, s: int) -> None:
         store(w, base + ROWS.forcing, forcing(load(w, base + ROWS.time) + NODES[s] * h, c))
     # read after the last store, so that they can be operands in memory instead of spilled registers
     c = load_rows(w, base + ROWS.constants, NC)
-    slopes = rhs(load_rows(w, base + ROWS.trial, N), load(w, base + ROWS.forcing), c)
+    y, u = load_rows(w, base + ROWS.trial, N_KNOWN), load(w, base + ROWS.forcing)
+    slopes = rhs(y, u, c)
+    if CARRIES:
+        # before the store, so that both share what they compute
+        entries = tangent_entries(y, u, c)
+        store_rows(w, base + ROWS.entries + (s - 1) * N_ENTRIES * WIDTH, entries)
     store_rows(w, base + ROWS.slopes + s * N * WIDTH, slopes)
 
 
@@ -797,8 +806,13 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "layers_at": _layers_at(system),
         "memory_size": observer.memory_size,
         **observer.bindings,
+        **tangent_bindings(system),
     }
-    short = code_length(system.rhs) + code_length(system.forcing) <= UNROLLED_LENGTH
+    if bindings["CARRIES"]:
+        # a tuple's entry is found by a branch for each, an array's by its place
+        bindings |= {key: np.array(bindings[key]) for key in ("IS_ANGLE", "SCALES", "ESCAPE")}
+    lengths = code_length(system.rhs) + code_length(system.forcing)
+    short = lengths <= UNROLLED_LENGTH and not bindings["CARRIES"]
     for key in observers.HELPERS:
         bindings[key] = bound_part(getattr(observers, key), name, bindings, True, short)
     bindings["observe"] = bound_part(observer.observe, name, bindings, True, short)
@@ -807,11 +821,15 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
     for module in (event_templates, mode_templates):
         templates |= {key: getattr(module, key) for key in (*module.INLINE, *module.CALLED)}
     templates |= {key: globals()[key] for key in (*_INLINE, *_CALLED)}
-    if system.n_states <= UNROLLED_STATES + short:
+    if bindings["CARRIES"]:
+        own = (*tangent_templates.INLINE, *tangent_templates.CALLED)
+        templates = {key: getattr(tangent_templates, key) for key in own} | templates
+        templates["run_stages"] = tangent_templates.run_stages_and_vectors
+    elif system.n_states <= UNROLLED_STATES + short:
         templates["run_stages"] = unrolled_stages(system)
     if system.tableau.has_two_errors:
         templates["squared_error"] = squared_error_of_two
-    dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *_INLINE}
+    dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *tangent_templates.INLINE, *_INLINE}
     for key, template in templates.items():
         bindings[key] = bound_part(template, name, bindings, key in dissolving, short)
     return bindings

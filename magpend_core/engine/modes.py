@@ -18,7 +18,7 @@ from typing import Any
 from magpend_core.engine.jit import inline
 from magpend_core.engine.simd import WIDTH
 from magpend_core.engine.system import System
-from magpend_core.engine.variational import DIVERGENCE
+from magpend_core.engine.tangents import DIVERGENCE
 from magpend_core.engine.vecmath import log
 
 STEP = 1e-3
@@ -68,13 +68,13 @@ def mode_bindings(system: System) -> dict[str, Any]:
         "HAS_IMPACTS": system.n_impacts > 0,
         "HAS_VECTORS": n_vectors > 0,
         "SLIDES": (*system.slides, False),
-        "ZEROS": (0.0,) * system.n_states,
+        "ZEROS": (0.0,) * system.known,
         "N_BASE": base.n_states,
         "N_VECTORS": n_vectors,
         # with unit vectors, where the change of volumes is wanted
         "N_THROUGH": n_vectors + (base.n_states if has_divergence else 0),
         "HAS_DIVERGENCE": has_divergence,
-        "lane_states": _numbers(system.n_states),
+        "lane_states": _numbers(system.known),
         "lane_base": _numbers(base.n_states),
         "lane_constants": _numbers(system.n_constants + system.n_modes),
         "reset_along": _reset_along(system, base.n_states),

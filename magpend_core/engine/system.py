@@ -79,6 +79,9 @@ class System:
     jacobian : callable
         ``jacobian(y, u, c)``: derivatives of `rhs` by the states, as one flat tuple, row by row. None if
         neither exponents nor multipliers nor orbits are asked for.
+    jacobian_entries : tuple of int or None
+        Places of the entries that `jacobian` returns, in the flat tuple of all and in rising order; the
+        others are 0 everywhere. None if it returns all. Declare it for a large system with many zeros.
     is_angle : tuple of bool
         Which states live on a circle of 2 pi; empty for none. They are brought back to (-pi, pi] at every
         section, their full turns counted apart; `rhs` must not change under such a shift.
@@ -108,6 +111,9 @@ class System:
         ``dy[n_states]``.
     n_controlled : int or None
         How many of the states, from the first, enter the error control; None for all.
+    n_known : int or None
+        How many of the states, from the first, the functions know and take; None for all. The states behind
+        them are tangent vectors, which the engine carries along (see `tangents`).
     n_modes : int
         Numbers that `rhs`, `jacobian` and `quantities` find behind the constants, ``c[n_constants + k]``,
         and that change at events and edges alone: each stage of a step sees the same. First one for each
@@ -188,6 +194,7 @@ class System:
     forcing: Callable[..., Any] = None  # type: ignore[assignment]
     forcing_is_time: bool = False
     jacobian: Callable[..., Any] | None = None
+    jacobian_entries: tuple[int, ...] | None = None
     is_angle: tuple[bool, ...] = ()
     scales: tuple[float, ...] = ()
     escape: tuple[float, ...] = ()
@@ -198,6 +205,7 @@ class System:
     timed_layers: bool = False
     layers_fade: bool = False
     n_controlled: int | None = None
+    n_known: int | None = None
     n_modes: int = 0
     n_switches: int = 0
     switches: Callable[..., Any] | None = None
@@ -255,6 +263,8 @@ class System:
             )  # fmt: skip
         if self.method != "dopri5":
             data += (self.method,)  # type: ignore[assignment]
+        if self.n_known is not None or self.jacobian_entries is not None:
+            data += (self.n_known, self.jacobian_entries)  # type: ignore[assignment]
         return f"{self.name}_{hashlib.sha256(repr(data).encode()).hexdigest()[:8]}"
 
     @property
@@ -276,6 +286,11 @@ class System:
     def controlled(self) -> int:
         """Number of states in the error control."""
         return self.n_states if self.n_controlled is None else self.n_controlled
+
+    @property
+    def known(self) -> int:
+        """Number of states that the functions know."""
+        return self.n_states if self.n_known is None else self.n_known
 
     @property
     def n_states(self) -> int:

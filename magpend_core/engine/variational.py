@@ -18,22 +18,25 @@ from typing import Any
 
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
-
-DIVERGENCE = "divergence"
-"""Name of the state that integrates the trace of the Jacobian."""
+from magpend_core.engine.tangents import DIVERGENCE, entries_of, order_of, trace_of
+from magpend_core.sizes import WRITTEN_OUT, too_many_states
 
 
 def _first(n: int) -> str:
     return ", ".join(f"y[{i}]" for i in range(n))
 
 
-def _products(n: int, n_vectors: int) -> str:
-    """Source of J v for each tangent vector v, entry by entry."""
-    return ", ".join(
-        " + ".join(f"jacobian[{i * n + j}] * y[{n * (1 + k) + j}]" for j in range(n))
-        for k in range(n_vectors)
-        for i in range(n)
-    )
+def _products(system: System, n_vectors: int) -> list[str]:
+    """Sources of the entries of J v for each tangent vector v, one vector after the other."""
+    n, found = system.n_states, []
+    for k in range(n_vectors):
+        for row in entries_of(system):
+            first, second = order_of(row)[:1], order_of(row)[1:2]
+            # of two products the one on the left is fused
+            columns = [*second, *first, *order_of(row)[2:]]
+            terms = [f"jacobian[{row[j]}] * y[{n * (1 + k) + j}]" for j in columns]
+            found.append(" + ".join(terms) or "0.0 * y[0]")
+    return found
 
 
 def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict[str, Any]) -> Any:
@@ -47,8 +50,13 @@ def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict
 
 
 @cache
-def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> System:
+def with_tangents(
+    system: System, n_vectors: int, divergence: bool = False, written_out: bool | None = None
+) -> System:
     """Return `system` extended by `n_vectors` tangent vectors.
+
+    A small system gets a right-hand side with the products of Jacobian and vectors written out. With a large
+    one the engine loops over the vectors (see `tangents`): both give the same bits.
 
     Parameters
     ----------
@@ -59,6 +67,8 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> S
     divergence
         Whether one more state, the last, integrates the trace of the Jacobian: the logarithm of the
         factor by which the flow changes volumes.
+    written_out
+        Whether the products are written out; by default up to `sizes.WRITTEN_OUT` states.
 
     Returns
     -------
@@ -68,19 +78,49 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> S
     Raises
     ------
     ValueError
-        If `n_vectors` is out of bounds.
+        If `n_vectors` is out of bounds, or the system has more than `sizes.MAX_STATES` states.
     """
     n = system.n_states
+    problem = too_many_states(system.name, n)
+    if problem is not None:
+        raise ValueError(problem)
     if not 1 <= n_vectors <= n:
         raise ValueError(f"n_vectors = {n_vectors} is out of bounds: it must be between 1 and {n}.")
+    if written_out is None:
+        written_out = n <= WRITTEN_OUT
+    entries = n * n_vectors + divergence
+    return dataclasses.replace(
+        system,
+        name=f"{system.name}_tangents{n_vectors}" + ("_divergence" if divergence else ""),
+        state_names=(
+            *system.state_names,
+            *(f"d{s}_{k}" for k in range(n_vectors) for s in system.state_names),
+            *[DIVERGENCE] * divergence,
+        ),
+        is_angle=(*system.is_angle, *[False] * entries),
+        scales=(*system.scales, *[1.0] * entries),
+        escape=(*system.escape, *[math.inf] * entries),
+        n_controlled=system.controlled,
+        quantity_names=(),
+        quantities=None,
+        tangents_of=system,
+        **(_extended_functions(system, n_vectors, divergence) if written_out else {"n_known": n}),
+    )
+
+
+def _extended_functions(system: System, n_vectors: int, divergence: bool) -> dict[str, Any]:
+    """Return functions of the extended system, with the products of Jacobian and vectors written out."""
+    n = system.n_states
     bindings = {"_rhs": system.rhs, "_jacobian": system.jacobian, "_layers": system.layers}
-    trace = ", " + " + ".join(f"jacobian[{i * n + i}]" for i in range(n)) if divergence else ""
+    parts = [f"dy[{i}]" for i in range(n)] + _products(system, n_vectors)
+    if divergence:
+        parts.append(trace_of(entries_of(system), "jacobian") or "0.0 * y[0]")
     rhs = _compile(
         f"def rhs(y, u, c):\n"
         f"    base = ({_first(n)},)\n"
         f"    jacobian = _jacobian(base, u, c)\n"
         f"    dy = _rhs(base, u, c)\n"
-        f"    return ({', '.join(f'dy[{i}]' for i in range(n))}, {_products(n, n_vectors)}{trace})\n",
+        f"    return ({', '.join(parts)})\n",
         "rhs",
         system.rhs,
         bindings,
@@ -103,26 +143,7 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False) -> S
         for name, function in (("switches", system.switches), ("impacts", system.impacts))
         if function is not None
     }
-    entries = n * n_vectors + divergence
-    return dataclasses.replace(
-        system,
-        name=f"{system.name}_tangents{n_vectors}" + ("_divergence" if divergence else ""),
-        state_names=(
-            *system.state_names,
-            *(f"d{s}_{k}" for k in range(n_vectors) for s in system.state_names),
-            *[DIVERGENCE] * divergence,
-        ),
-        is_angle=(*system.is_angle, *[False] * entries),
-        scales=(*system.scales, *[1.0] * entries),
-        escape=(*system.escape, *[math.inf] * entries),
-        n_controlled=system.controlled,
-        rhs=rhs,
-        layers=layers,
-        **events,
-        quantity_names=(),
-        quantities=None,
-        tangents_of=system,
-    )
+    return {"rhs": rhs, "layers": layers, **events}
 
 
 PLUS, MINUS, PER_STEP = "_plus", "_minus", "per_step"
@@ -176,9 +197,7 @@ def with_parameter_tangent(system: System) -> System:
     ]
     sets = [f"c{k} = c[{k * nc}:{(k + 1) * nc}]" for k in range(3)]
     changes = ", ".join(
-        " + ".join(f"jacobian[{i * n + j}] * y[{n + j}]" for j in range(n))
-        + f" + (f1[{i}] - f2[{i}]) * c[{3 * nc}]"
-        for i in range(n)
+        f"{product} + (f1[{i}] - f2[{i}]) * c[{3 * nc}]" for i, product in enumerate(_products(system, 1))
     )
     own_rates = f"dy[:{n}]" + (f" + (dy[{2 * n}],)" if system.timed_layers else "")
     own = ", ".join(f"f0[{i}]" for i in range(n))

@@ -44,3 +44,14 @@ ROSSLER, LORENZ = "rossler", "lorenz"
 def flow(table: dict[str, object] | str) -> Model:
     """Return a model of one of the texts, or of the library."""
     return load_model(table)
+
+
+def lorenz96(n: int, forcing: float = 8.0) -> dict[str, object]:
+    """Lorenz-96 with `n` states in a ring: every one with the same four neighbours in its equation."""
+    return {
+        "name": "lorenz96", "states": {f"x{i}": {} for i in range(n)}, "parameters": {"F": forcing},
+        "equations": {
+            f"x{i}": f"(x{(i + 1) % n} - x{(i - 2) % n})*x{(i - 1) % n} - x{i} + F"
+            for i in range(n)
+        },
+    }  # fmt: skip

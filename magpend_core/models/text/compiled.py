@@ -42,6 +42,7 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
         forcing_is_time=forcing is not None and forcing.op == "time",
         rhs=functions["rhs"],
         jacobian=functions["jacobian"],
+        jacobian_entries=source.jacobian_entries,
         is_angle=tuple(s.on_circle for s in states),
         scales=tuple(s.scale for s in states),
         escape=tuple(s.escape for s in states),

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from magpend_core.models.text.derive import Derived
 from magpend_core.models.text.graph import CONSTANT, STATED, Node, in_order
+from magpend_core.sizes import WRITTEN_OUT
 
 SIMD = ("sqrt", "absolute", "minimum", "maximum", "copysign", "where_less", "multiply_add", "floor")
 """What comes from `engine.simd`; other functions come from `engine.vecmath`."""
@@ -185,12 +186,15 @@ class Source:
         Python source.
     n_constants, n_modes, n_edges : int
         Numbers of what they use and fill.
+    jacobian_entries : tuple of int or None
+        See `System.jacobian_entries`.
     """
 
     text: str
     n_constants: int
     n_modes: int
     n_edges: int
+    jacobian_entries: tuple[int, ...] | None = None
 
 
 def source_of(derived: Derived) -> Source:
@@ -216,19 +220,29 @@ def source_of(derived: Derived) -> Source:
     timed = leaves | {n.number: "t" for n in derived.graph.nodes if n.op == "time"}
     behind = dict.fromkeys((n for n, name in timed.items() if name == "t"), f"dy[{len(derived.rates)}]")
     driven = leaves if derived.forcing is None else leaves | {derived.forcing.number: "u"}
+    entries = _entries(derived)
+    jacobian = derived.jacobian if entries is None else [derived.jacobian[i] for i in entries]
     parts = [
         *_edges(derived),
         _constants(constants),
         _forcing(derived.forcing, timed),
         _tuple("rhs", "y, u, c", derived.rates, driven),
-        _tuple("jacobian", "y, u, c", derived.jacobian, driven),
+        _tuple("jacobian", "y, u, c", jacobian, driven),
         _tuple("quantities", "t, y, dy, u, c", derived.quantities, timed | driven),
         _tuple("layers", "y, dy, c", layers, leaves | behind, 4),
         _tuple("switches", "t, y, dy, c", switches, timed, 2),
         _tuple("impacts", "t, y, dy, c", impacts, timed, 2),
         _reset(derived, timed),
     ]
-    return Source("\n\n".join(parts) + "\n", n_constants, n_modes, derived.n_edges)
+    return Source("\n\n".join(parts) + "\n", n_constants, n_modes, derived.n_edges, entries)
+
+
+def _entries(derived: Derived) -> tuple[int, ...] | None:
+    """Places of a large Jacobian's entries that are not 0 everywhere; None for all of a small one's."""
+    if len(derived.rates) <= WRITTEN_OUT:
+        return None
+    found = tuple(i for i, node in enumerate(derived.jacobian) if not node.is_number(0.0))
+    return found or (0,)
 
 
 def _leaves(derived: Derived, constants: list[Node], n_constants: int, n_modes: int) -> dict[int, str]:

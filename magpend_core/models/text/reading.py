@@ -14,7 +14,8 @@ from magpend_core.models.text.definition import Definition, Impact
 from magpend_core.models.text.grammar import Tree, names
 from magpend_core.models.text.reader import shown
 from magpend_core.models.text.scene import mirror_problem
-from magpend_core.models.text.views import MAX_OTHERS, MAX_PARAMETERS, MAX_STATES, ViewsReader
+from magpend_core.models.text.views import MAX_OTHERS, MAX_PARAMETERS, ViewsReader
+from magpend_core.sizes import MAX_STATES
 
 MAX_DEFINED = 200
 ESCAPE = 1e9
@@ -78,6 +79,8 @@ class _Reading(ViewsReader):
         head = {key: self.text(table, key, self.place) for key in ("name", "title", "source", "section")}
         self._model_name(head["name"], "name" in table)
         states = self._states(table.get("states", {}))
+        if isinstance(table.get("states"), Mapping) and len(table["states"]) > MAX_STATES:
+            return None  # every use of a state would be a problem of its own
         parameters, values = self._parameters(table.get("parameters", {}))
         define = self._defined(table.get("define", {}))
         states, equations = self._equations(table.get("equations", {}), states, "equations" in table)

@@ -9,8 +9,9 @@ from magpend_core.models.parameters import Parameter, near_names
 from magpend_core.models.text.definition import ClassifierText, DrawingText, needed
 from magpend_core.models.text.grammar import BUILT_IN, Tree
 from magpend_core.models.text.reader import Reader, shown
+from magpend_core.sizes import MAX_STATES
 
-MAX_STATES, MAX_PARAMETERS, MAX_OTHERS = 24, 120, 60
+MAX_PARAMETERS, MAX_OTHERS = 120, 60
 DEFAULT_PRESET = "default"
 """Name of the preset with the values that stand in the table of parameters."""
 

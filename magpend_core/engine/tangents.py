@@ -1,0 +1,157 @@
+"""Tangent vectors of large systems: carried through the stages of a step by loops.
+
+Templates for the engine, see `lanes`. For a small system the products of the Jacobian J and tangent vectors
+are written out in the right-hand side (see `variational.with_tangents`). For a large one the right-hand side
+knows the states alone. The engine computes all stages of the states first, and keeps the entries of J at each
+stage. Then it takes the vectors through all stages one by one, so that the rows of a vector stay in the
+first-level cache. No vector acts on the states, so this order changes no number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from magpend_core.engine.jit import part
+from magpend_core.engine.simd import WIDTH, load, multiply_add, store
+from magpend_core.engine.system import System
+
+DIVERGENCE = "divergence"
+"""Name of the state that integrates the trace of the Jacobian."""
+
+
+def entries_of(system: System) -> list[dict[int, int]]:
+    """Return where the tuple of `system.jacobian` has the entries of each row, by column."""
+    n = system.n_states
+    rows: list[dict[int, int]] = [{} for _ in range(n)]
+    places = range(n * n) if system.jacobian_entries is None else system.jacobian_entries
+    for k, place in enumerate(places):
+        rows[place // n][place % n] = k
+    return rows
+
+
+def order_of(row: dict[int, int]) -> list[int]:
+    """Return the columns of a row of the Jacobian in the order in which their products are summed.
+
+    The first product is rounded by itself, the others are fused with the sum. Where neither of the first two
+    columns is 0, the second comes first, as in a written-out sum (see `fused`). So leaving out the zeros of a
+    row changes no bit of the sum.
+    """
+    columns = sorted(row)
+    return [1, 0, *columns[2:]] if columns[:2] == [0, 1] else columns
+
+
+def trace_of(rows: list[dict[int, int]], name: str) -> str:
+    """Return the source of the trace of the Jacobian whose tuple is called `name`."""
+    return " + ".join(f"{name}[{row[i]}]" for i, row in enumerate(rows) if i in row)
+
+
+def n_entries(system: System) -> int:
+    """Return how many numbers each stage of a step keeps of the Jacobian; 0 where nothing is carried."""
+    if system.known == system.n_states or system.tangents_of is None:
+        return 0
+    return sum(map(len, entries_of(system.tangents_of))) + _has_trace(system)
+
+
+def _has_trace(system: System) -> bool:
+    """Whether a last state integrates the trace of the Jacobian."""
+    return system.state_names[-1] == DIVERGENCE
+
+
+def tangent_bindings(system: System) -> dict[str, Any]:
+    """Names that these templates use, for a system."""
+    known, base = system.known, system.tangents_of
+    names = {"N_KNOWN": known, "N_ENTRIES": n_entries(system), "CARRIES": n_entries(system) > 0}
+    if base is None or not names["CARRIES"]:
+        return names
+    order: list[int] = []
+    columns: list[int] = []
+    starts = [0]
+    for row in entries_of(base):
+        own = order_of(row)
+        columns += own
+        order += [row[j] for j in own]
+        starts.append(len(columns))
+    return names | {
+        # machine code of its own would take a third of the time to compile
+        "rhs": _as_part(system.rhs),
+        "ENTRY_COLUMNS": np.array(columns),
+        "ROW_STARTS": np.array(starts),
+        "HAS_TRACE": _has_trace(system),
+        "tangent_entries": _tangent_entries(base, order, _has_trace(system)),
+    }
+
+
+def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callable[..., Any]:
+    """Return a function that gives the entries of the Jacobian in the order of the loops, and the trace."""
+    parts = [f"entries[{k}]" for k in order]
+    if has_trace:
+        parts.append(trace_of(entries_of(base), "entries") or "0.0 * y[0]")
+    lines = ["def tangent_entries(y, u, c):", "entries = _jacobian(y, u, c)", f"return ({', '.join(parts)},)"]
+    scope: dict[str, Any] = {"__name__": base.rhs.__module__, "_jacobian": _as_part(base.jacobian)}
+    exec("\n    ".join(lines), scope)
+    return part(scope["tangent_entries"], True)
+
+
+def _as_part(function: Any) -> Any:
+    """Return a compiled function of a system as a part of an engine, without machine code of its own."""
+    return part(getattr(function, "py_func", function), True)
+
+
+def stage_row(w: Any, row: int, s: int, h: Any) -> None:
+    """Compute one row of the state of stage `s`."""
+    total = STAGES[s, 0] * load(w, row + ROWS.slopes)
+    for j in range(1, s):
+        # half of the eighth-order method's coefficients are 0, and add nothing
+        if STAGES[s, j] != 0.0:
+            total = multiply_add(STAGES[s, j], load(w, row + ROWS.slopes + j * N * WIDTH), total)
+    store(w, row + ROWS.trial, load(w, row + ROWS.state) + h * total)
+
+
+def carry_vector(w: Any, base: int, k: int) -> None:
+    """Compute the states and slopes of tangent vector `k` at all stages but the first."""
+    h = load(w, base + ROWS.step)
+    first = base + N_KNOWN * (1 + k) * WIDTH
+    for s in range(1, N_STAGES):
+        for i in range(N_KNOWN):
+            stage_row(w, first + i * WIDTH, s, h)
+        entries = base + ROWS.entries + (s - 1) * N_ENTRIES * WIDTH
+        vector, slopes = first + ROWS.trial, first + ROWS.slopes + s * N * WIDTH
+        for i in range(N_KNOWN):
+            at, end = ROW_STARTS[i], ROW_STARTS[i + 1]
+            total = 0.0 * h
+            if at < end:
+                total = load(w, entries + at * WIDTH) * load(w, vector + ENTRY_COLUMNS[at] * WIDTH)
+            for p in range(at + 1, end):
+                entry = load(w, entries + p * WIDTH)
+                total = multiply_add(entry, load(w, vector + ENTRY_COLUMNS[p] * WIDTH), total)
+            store(w, slopes + i * WIDTH, total)
+
+
+def carry_trace(w: Any, base: int) -> None:
+    """Compute the integral of the trace, the last row, at all stages but the first."""
+    h = load(w, base + ROWS.step)
+    row = base + (N - 1) * WIDTH
+    for s in range(1, N_STAGES):
+        stage_row(w, row, s, h)
+        trace = load(w, base + ROWS.entries + (s * N_ENTRIES - 1) * WIDTH)
+        store(w, row + ROWS.slopes + s * N * WIDTH, trace)
+
+
+def run_stages_and_vectors(w: Any, base: int) -> None:
+    """Compute all stages but the first: of the states, then of each tangent vector, then of the trace."""
+    for s in range(1, N_STAGES):
+        run_stage(w, base, s)
+    for k in range(N_VECTORS):
+        carry_vector(w, base, k)
+    if HAS_TRACE:
+        carry_trace(w, base)
+
+
+INLINE = ("stage_row",)
+"""Templates here that dissolve into their callers, callees first."""
+
+CALLED = ("carry_vector", "carry_trace")
+"""The others, but for `run_stages_and_vectors`, which stands for `lanes.run_stages`."""

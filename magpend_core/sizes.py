@@ -1,0 +1,24 @@
+"""Sizes that the engine, the models and the pipeline agree on."""
+
+from __future__ import annotations
+
+MAX_STATES = 64
+"""Largest number of states of a model as text, and of any system with tangent vectors."""
+
+WRITTEN_OUT = 6
+"""Largest number of states of a system whose products of Jacobian and tangent vectors are written out.
+
+For a larger system the engine loops over the vectors (see `engine.tangents`), and the Jacobian of a model as
+text leaves out its zeros. The code then grows with the number of entries, not with that of entries times
+vectors.
+"""
+
+
+def too_many_states(name: str, n_states: int) -> str | None:
+    """Return why a system can have no tangent vectors: it has too many states; None if it can."""
+    if n_states <= MAX_STATES:
+        return None
+    return (
+        f"{name} has {n_states} states; Lyapunov exponents, multipliers and orbits are computed for at most "
+        f"{MAX_STATES}."
+    )
