@@ -26,10 +26,14 @@ def _make(name: str) -> Any:
         from pipeline.cli import console
         from pipeline.products.product import function_of
         from pipeline.runs.derive import derive
+        from pipeline.spec.problems import SpecError
 
         check_csv(csv)
         ds = derive(directory, name, options, echo=console.note)
-        tell(function_of(analysis.table)(ds), csv, json)
+        table = function_of(analysis.table)(ds)
+        if table.nothing:
+            raise SpecError([f"{directory}: {table.nothing}"])
+        tell(table, csv, json)
         if "source" in ds.encoding:
             console.note(f"stored: {ds.encoding['source']}")
 

@@ -11,8 +11,8 @@ class BranchOptions(Options):
     """Which orbits are followed, and how far."""
 
     parameter: str = option(
-        "frequency_hz",
-        "What is varied: the drive's frequency, or a parameter; if the run sweeps one other, that.",
+        "",
+        "What is varied: a parameter, or the drive's frequency_hz; by default what the run sweeps.",
     )
     low: float | None = option(None, "Least value; by default what the run spans.", unit="SI", flag="--from")
     high: float | None = option(None, "Largest value; by default what the run spans.", unit="SI", flag="--to")

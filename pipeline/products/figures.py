@@ -12,7 +12,7 @@ from pipeline.products.product import Figure, FigureOptions, StateOptions, optio
 Per = Literal["s", "period"]
 
 
-def _without(options: StateOptions, name: str) -> str:
+def _without(options: FigureOptions, name: str) -> str:
     """The label of options as if one of them were as by default."""
     return FigureOptions.label(options.model_copy(update={name: ""}))
 
@@ -84,20 +84,28 @@ class DimensionFigureOptions(DimensionOptions, FigureOptions):
     """A correlation sum and its fit."""
 
 
-class BranchFigureOptions(BranchOptions, StateOptions):
+class _AlongOptions(BranchOptions, FigureOptions):
+    """Options of a figure along a parameter."""
+
+    def label(self) -> str:
+        """What the file's name says; the drive's frequency goes without saying."""
+        return _without(self, "parameter") if self.parameter == "frequency_hz" else super().label()
+
+
+class BranchFigureOptions(_AlongOptions, StateOptions):
     """Branches over a diagram."""
 
     over: str = option("", "Run over the same parameter that is drawn below; by default DIR.")
     shown: int | None = option(None, "Longest period drawn.", unit="drive periods or returns", ge=1)
 
 
-class MultiplierOptions(BranchOptions, FigureOptions):
+class MultiplierOptions(_AlongOptions):
     """Multipliers along a branch."""
 
     branch: int = option(0, "Number of the branch, as in the table.", ge=0)
 
 
-class CurveFigureOptions(CurveOptions, FigureOptions):
+class CurveFigureOptions(CurveOptions, _AlongOptions):
     """Curves of bifurcations."""
 
 

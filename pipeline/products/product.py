@@ -89,10 +89,13 @@ class Table:
         For ``--csv`` and ``--json``: all rows have the same keys; numbers in SI units, unrounded.
     lines : list of str
         What is printed.
+    nothing : str
+        Why nothing was found, where that is an error of the command; else empty.
     """
 
     rows: Sequence[Mapping[str, Any]]
     lines: Sequence[str]
+    nothing: str = ""
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,13 @@ def named(run: Run, options: Options) -> Options:
 
     ``at`` takes ``frequency`` or ``frequency_hz``, a parameter, and for a grid of initial states its axis
     ``x_0``, the state ``x`` or, of an angle, ``x_deg``. ``parameter`` and ``second`` take either name of the
-    frequency. An empty ``state`` is the model's first that differs from section to section.
+    frequency; an empty ``parameter`` is what the run sweeps. An empty ``state`` is the model's first that
+    differs from section to section.
 
     Raises
     ------
     SpecError
-        Naming all that do not exist, with the nearest that do.
+        Naming all that do not exist, with the nearest that do; or if what is left open is not clear.
     """
     fields, problems = type(options).model_fields, []
     changes: dict[str, Any] = {}
@@ -44,6 +45,8 @@ def named(run: Run, options: Options) -> Options:
                 problems += error.problems
     model = run.model
     if {"parameter", "second", "state"} & fields.keys():
+        if given.get("parameter") == "":
+            given["parameter"] = _swept(run)
         for role in {"parameter", "second"} & fields.keys():
             changes[role] = parameter_name(given[role])
             problems += _unknown("parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY))
@@ -53,6 +56,31 @@ def named(run: Run, options: Options) -> Options:
     if problems:
         raise SpecError(problems)
     return options.model_copy(update=changes)
+
+
+def _swept(run: Run) -> str:
+    """Return the parameter that a run sweeps; the drive's frequency if it sweeps none.
+
+    Raises
+    ------
+    SpecError
+        If it sweeps several, or none and has no drive.
+    """
+    cube = run.cube()
+    swept = [name for name in run.spec.axes if cube.sizes.get(axis_name(name), 1) > 1]
+    if len(swept) > 1:
+        raise SpecError([
+            f"{run.name} sweeps {', '.join(swept)}; say which of them to follow: "
+            + " or ".join(f"--parameter {name}" for name in swept)
+            + "."
+        ])  # fmt: skip
+    if swept or run.model.crossing is None:
+        return swept[0] if swept else FREQUENCY
+    known = ", ".join(run.model.parameter_names)
+    raise SpecError([
+        f"{run.name} sweeps no parameter, and {run.model.name} has no drive's frequency to follow; give "
+        f"--parameter: {known}."
+    ])  # fmt: skip
 
 
 def _unknown(what: str, given: str, name: str, known: Iterable[str]) -> list[str]:

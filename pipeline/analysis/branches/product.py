@@ -18,25 +18,20 @@ LEAST_PERIOD = 4
 
 def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
     """Complete the interval from the run's axis; refuse an empty one."""
-    parameter = _followed(run, options)
+    parameter = options.parameter
+    _refuse_frequency_of_flow(run, parameter)
     low, high = _interval(run, parameter, options.low, options.high)
     return options.model_copy(update={"parameter": parameter, "low": low, "high": high})
 
 
-def _followed(run: Run, options: BranchOptions) -> str:
-    """The parameter to follow: what the run sweeps, if that is no frequency and no interval is given."""
+def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
+    """Raise if the frequency is to be followed of a model that has no drive."""
     from pipeline.spec.problems import SpecError
 
-    parameter, is_flow = options.parameter, run.model.crossing is not None
-    if axis_name(parameter) != FREQUENCY_DIM or _axis(run, parameter) is not None:
-        return parameter
-    swept = [name for name in run.spec.axes if _axis(run, name) is not None]
-    if not is_flow and (len(swept) != 1 or not (options.low is None or options.high is None)):
-        return parameter
-    if len(swept) != 1:
+    if axis_name(parameter) == FREQUENCY_DIM and run.model.crossing is not None:
+        swept = [name for name in run.spec.axes if _axis(run, name) is not None]
         known = ", ".join(swept or run.model.parameter_names)
         raise SpecError([f"{run.model.name} has no drive's frequency to follow; give --parameter: {known}."])
-    return swept[0]
 
 
 def branches(run: Any, options: BranchOptions) -> xr.Dataset:
@@ -53,7 +48,10 @@ def branches(run: Any, options: BranchOptions) -> xr.Dataset:
         starts += [s for s in found if low <= s.value <= high]
     run.echo(f"branches: {len(starts)} starting orbits, periods up to {longest}")
     scope = Scope(low, high, longest, options.generations)
-    return dataset_of(explore(starts, scope), parameter, base, left_out)
+    found = explore(starts, scope)
+    if starts and not found:
+        left_out = [*left_out, f"{len(starts)} starting orbits: could not be followed"]
+    return dataset_of(found, parameter, base, left_out)
 
 
 def _ends(options: BranchOptions) -> tuple[float, float]:

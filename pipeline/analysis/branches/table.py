@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -30,9 +31,20 @@ def branches_table(ds: xr.Dataset) -> Table:
     """
     rows = table_of(ds)
     if not ds.sizes["branch"]:
-        return Table(rows, ["no branch: no closed orbit to begin with", *_left_out(ds)])
+        lines = ["no branch: no closed orbit to begin with", *_left_out(ds)]
+        return Table(rows, lines, _why_none(ds))
     head = f"{ds.sizes['bifurcation']} bifurcations on {ds.sizes['branch']} branches"
     return Table(rows, [head, "", *_lines(ds, rows), "", *_windows(ds), *_left_out(ds)])
+
+
+def _why_none(ds: xr.Dataset) -> str:
+    """Return why there is no branch: a line for each reason, with the number of attractors it holds for."""
+    name = parameter_name(str(ds.attrs["parameter"]))
+    lines = str(ds.attrs.get("left_out", "")).splitlines()
+    reasons = Counter(line.partition(": ")[2] for line in lines)
+    told = [f"\n  {n} of {len(lines)}: {reason}" for reason, n in reasons.most_common()]
+    head = f"no branch along {name}: there is no closed orbit to begin with"
+    return f"{head}. Attractors left out:{''.join(told)}" if told else f"{head}, since no cell has an attractor."
 
 
 def table_of(ds: xr.Dataset) -> list[Row]:

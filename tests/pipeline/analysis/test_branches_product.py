@@ -7,8 +7,11 @@ import pytest
 
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.table import branches_table, curves_table
+from pipeline.cli.exits import Exit
+from pipeline.products.branches import BranchOptions
+from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.products.reporting import reporting
-from pipeline.runs.derive import derive
+from pipeline.runs.derive import AnalysedRun, derive, prepared
 from pipeline.runs.run import run
 from pipeline.spec.problems import SpecError
 
@@ -137,3 +140,43 @@ def test_branches__from_recurrences_in_chaos(directory):
     assert ds.sizes["branch"] >= 2
     assert (ds["n_unstable"].values[:, 0] > 0).any()
     assert float(ds["residual"].max()) < 1e-9
+
+
+@pytest.mark.parametrize("interval", [{"low": 0.24, "high": 0.3}, {"low": 0.26}, {"high": 0.28}, {}])
+def test_branches__by_default_along_what_the_run_sweeps(directory, interval):
+    """Whether the interval is given or not; the frequency is followed where it is asked for."""
+    run = AnalysedRun.of(directory)
+    settled = prepared(run, ANALYSES["branches"], BranchOptions(**interval))
+    assert settled.parameter == "amplitude"
+    assert (settled.low, settled.high) == (interval.get("low", 0.25), interval.get("high", 0.5))
+    asked = BranchOptions(parameter="frequency", low=0.18, high=0.2)
+    assert prepared(run, ANALYSES["branches"], asked).parameter == "frequency_hz"
+    drawn = prepared(run, FIGURES["branches"], FIGURES["branches"].options(**interval))
+    assert drawn.parameter == "amplitude"
+    assert drawn.label().startswith("_x_parameter_amplitude")
+    along = FIGURES["branches"].options(parameter="frequency", low=0.18, high=0.2)
+    assert prepared(run, FIGURES["branches"], along).label() == "_x_low_0.18_high_0.2"
+
+
+@pytest.mark.parametrize("interval", [{}, {"low": 2.1, "high": 2.4}])
+def test_branches__of_several_axes_say_which(made, interval):
+    """Two axes are swept, and none is named: one sentence with both, before anything is computed."""
+    made.commit(0)
+    with pytest.raises(SpecError) as refused:
+        derive(made.info.directory, "branches", interval)
+    (sentence,) = refused.value.problems
+    assert "run sweeps frequency_hz, q; say which of them to follow: " in sentence
+    assert "--parameter frequency_hz or --parameter q" in sentence
+    assert not (made.info.directory / "derived").exists()
+
+
+def test_branches__an_empty_table_is_refused(directory, main, tmp_path):
+    """With the reason, and without a file."""
+    words = ("--parameter", "amplitude", "--from", 0.4, "--to", 0.6)
+    code, out, err = main("analyse", "branches", directory, *words, "--csv", "found.csv")
+    assert code == Exit.REFUSED
+    assert out == ""
+    assert "no branch along amplitude: there is no closed orbit to begin with" in err
+    assert "2 of 3: outside of amplitude 0.4 to 0.6" in err
+    assert "1 of 3: a bounded set, no closed orbit" in err
+    assert not (tmp_path / "found.csv").exists()

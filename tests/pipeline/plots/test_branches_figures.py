@@ -107,14 +107,17 @@ def test_plot_curves__lines():
     assert ax.get_ylabel() == "q [N m]"
 
 
+FREQUENCY = {"parameter": "frequency_hz"}
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"parameter": "ep"}, "did you mean eps"),
         ({"parameter": "c"}, "--from and --to"),
-        ({"low": 2.5, "high": 2.4}, "is empty"),
+        ({**FREQUENCY, "low": 2.5, "high": 2.4}, "is empty"),
         ({"max_period": -1}, "max_period = -1"),
-        ({"low": -1.0}, "greater than 0"),
+        ({**FREQUENCY, "low": -1.0}, "greater than 0"),
         ({"parameter": "m1", "low": -1.0, "high": 1.0}, "m1 = -1.0 is out of bounds"),
     ],
 )
