@@ -48,10 +48,10 @@ def branches(run: Any, options: BranchOptions) -> xr.Dataset:
         starts += [s for s in found if low <= s.value <= high]
     run.echo(f"branches: {len(starts)} starting orbits, periods up to {longest}")
     scope = Scope(low, high, longest, options.generations)
-    found = explore(starts, scope)
-    if starts and not found:
+    followed = explore(starts, scope)
+    if starts and not followed:
         left_out = [*left_out, f"{len(starts)} starting orbits: could not be followed"]
-    return dataset_of(found, parameter, base, left_out)
+    return dataset_of(followed, parameter, base, left_out)
 
 
 def _ends(options: BranchOptions) -> tuple[float, float]:

@@ -44,7 +44,7 @@ def _why_none(ds: xr.Dataset) -> str:
     reasons = Counter(line.partition(": ")[2] for line in lines)
     told = [f"\n  {n} of {len(lines)}: {reason}" for reason, n in reasons.most_common()]
     head = f"no branch along {name}: there is no closed orbit to begin with"
-    return f"{head}. Attractors left out:{''.join(told)}" if told else f"{head}, since no cell has an attractor."
+    return f"{head}. Attractors left out:{''.join(told)}" if told else f"{head}; no cell has an attractor."
 
 
 def table_of(ds: xr.Dataset) -> list[Row]:
