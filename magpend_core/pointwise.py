@@ -10,6 +10,7 @@ import numpy as np
 
 from magpend_core.engine.checks import check_system
 from magpend_core.engine.events import event_bindings
+from magpend_core.engine.jacobians import places_of, whole_jacobian
 from magpend_core.engine.jit import bound_part, keeping, kernel, specialise
 from magpend_core.engine.modes import mode_bindings
 from magpend_core.engine.simd import WIDTH, load, load_rows, store_rows
@@ -170,23 +171,7 @@ def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarr
 
 def jacobian_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
     """Jacobians of `rates_at`, shape (n, n_states, n_states)."""
-    flat = _flow_at("jacobian", _n_entries(system), system, states, packed)
-    return _whole(system, flat)
-
-
-def _n_entries(system: System) -> int:
-    entries = system.jacobian_entries
-    return system.n_states**2 if entries is None else len(entries)
-
-
-def _whole(system: System, flat: np.ndarray) -> np.ndarray:
-    """Jacobians (..., n_states, n_states) from the entries that the system's function returns."""
-    n, leading = system.n_states, flat.shape[:-1]
-    if system.jacobian_entries is None:
-        return flat.reshape((*leading, n, n))
-    whole = np.zeros((*leading, n * n))
-    whole[..., list(system.jacobian_entries)] = flat
-    return whole.reshape((*leading, n, n))
+    return whole_jacobian(system, _flow_at("jacobian", len(places_of(system)), system, states, packed))
 
 
 def _flow_at(kind: str, n_out: int, system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
@@ -297,7 +282,8 @@ def jacobian(t: Any, state: Any, parameters: Parameters, frequency_hz: float) ->
         As for `rates`.
     """
     system = parameters.model.system
-    return _whole(system, _at("jacobian", _n_entries(system), t, state, parameters, frequency_hz))
+    n_entries = len(places_of(system))
+    return whole_jacobian(system, _at("jacobian", n_entries, t, state, parameters, frequency_hz))
 
 
 def evaluate(

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core.engine import event_checks
+from magpend_core.engine.jacobians import declaration_problems, places_of, whole_jacobian
 from magpend_core.engine.plain import plain
 from magpend_core.engine.system import System
 
@@ -171,10 +172,7 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
             yield f"{field} = {getattr(system, field)} is out of bounds: it must be 0 or more."
     if not 1 <= system.controlled <= max(n, 1):
         yield f"n_controlled = {system.n_controlled} is out of bounds: it must be between 1 and {n}."
-    entries = system.jacobian_entries
-    good = sorted({i for i in entries or () if 0 <= i < n * n})
-    if entries is not None and (not entries or list(entries) != good):
-        yield f"jacobian_entries must be whole numbers from 0 to {n * n - 1} in rising order, one at least."
+    yield from declaration_problems(system)
     yield from event_checks.declaration(system)
     if linearised and system.jacobian is None:
         yield "jacobian is missing; exponents, multipliers and orbits need it."
@@ -396,17 +394,14 @@ class _Motion:
     def _check_jacobian(self, rates: np.ndarray) -> None:
         """Compare with differences of two steps, whose own difference bounds their error."""
         n, names = self.system.n_states, self.system.state_names
-        declared = self.system.jacobian_entries
         what = "the derivatives of each rate by each state, row by row"
-        places = range(n * n) if declared is None else declared
-        if declared is not None:
+        if self.system.jacobian_entries is not None:
             what = "the derivatives whose places jacobian_entries has"
-        flat = self.functions.numbers("jacobian", len(places), what, tuple(self.y), self.u, self.c)
+        n_entries = len(places_of(self.system))
+        flat = self.functions.numbers("jacobian", n_entries, what, tuple(self.y), self.u, self.c)
         if flat is None:
             return
-        whole = np.zeros((n * n, N_SAMPLES))
-        whole[list(places)] = flat
-        given = whole.reshape(n, n, N_SAMPLES)
+        given = whole_jacobian(self.system, np.array(flat).T).transpose(1, 2, 0)
         size = np.abs(rates[:, np.isfinite(rates).all(axis=0)]).max(axis=1)
         for j in range(n):
             step = STEP * self.scales[j]

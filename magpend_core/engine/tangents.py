@@ -14,22 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.engine.jacobians import rows_of_entries
 from magpend_core.engine.jit import part
 from magpend_core.engine.simd import WIDTH, load, multiply_add, store
 from magpend_core.engine.system import System
 
 DIVERGENCE = "divergence"
 """Name of the state that integrates the trace of the Jacobian."""
-
-
-def entries_of(system: System) -> list[dict[int, int]]:
-    """Return where the tuple of `system.jacobian` has the entries of each row, by column."""
-    n = system.n_states
-    rows: list[dict[int, int]] = [{} for _ in range(n)]
-    places = range(n * n) if system.jacobian_entries is None else system.jacobian_entries
-    for k, place in enumerate(places):
-        rows[place // n][place % n] = k
-    return rows
 
 
 def order_of(row: dict[int, int]) -> list[int]:
@@ -52,7 +43,7 @@ def n_entries(system: System) -> int:
     """Return how many numbers each stage of a step keeps of the Jacobian; 0 where nothing is carried."""
     if system.known == system.n_states or system.tangents_of is None:
         return 0
-    return sum(map(len, entries_of(system.tangents_of))) + _has_trace(system)
+    return sum(map(len, rows_of_entries(system.tangents_of))) + _has_trace(system)
 
 
 def _has_trace(system: System) -> bool:
@@ -69,7 +60,7 @@ def tangent_bindings(system: System) -> dict[str, Any]:
     order: list[int] = []
     columns: list[int] = []
     starts = [0]
-    for row in entries_of(base):
+    for row in rows_of_entries(base):
         own = order_of(row)
         columns += own
         order += [row[j] for j in own]
@@ -88,7 +79,7 @@ def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callabl
     """Return a function that gives the entries of the Jacobian in the order of the loops, and the trace."""
     parts = [f"entries[{k}]" for k in order]
     if has_trace:
-        parts.append(trace_of(entries_of(base), "entries") or "0.0 * y[0]")
+        parts.append(trace_of(rows_of_entries(base), "entries") or "0.0 * y[0]")
     lines = ["def tangent_entries(y, u, c):", "entries = _jacobian(y, u, c)", f"return ({', '.join(parts)},)"]
     scope: dict[str, Any] = {"__name__": base.rhs.__module__, "_jacobian": _as_part(base.jacobian)}
     exec("\n    ".join(lines), scope)

@@ -16,9 +16,10 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+from magpend_core.engine.jacobians import rows_of_entries
 from magpend_core.engine.jit import inline
 from magpend_core.engine.system import System
-from magpend_core.engine.tangents import DIVERGENCE, entries_of, order_of, trace_of
+from magpend_core.engine.tangents import DIVERGENCE, order_of, trace_of
 from magpend_core.sizes import WRITTEN_OUT, too_many_states
 
 
@@ -30,7 +31,7 @@ def _products(system: System, n_vectors: int) -> list[str]:
     """Sources of the entries of J v for each tangent vector v, one vector after the other."""
     n, found = system.n_states, []
     for k in range(n_vectors):
-        for row in entries_of(system):
+        for row in rows_of_entries(system):
             first, second = order_of(row)[:1], order_of(row)[1:2]
             # of two products the one on the left is fused
             columns = [*second, *first, *order_of(row)[2:]]
@@ -114,7 +115,7 @@ def _extended_functions(system: System, n_vectors: int, divergence: bool) -> dic
     bindings = {"_rhs": system.rhs, "_jacobian": system.jacobian, "_layers": system.layers}
     parts = [f"dy[{i}]" for i in range(n)] + _products(system, n_vectors)
     if divergence:
-        parts.append(trace_of(entries_of(system), "jacobian") or "0.0 * y[0]")
+        parts.append(trace_of(rows_of_entries(system), "jacobian") or "0.0 * y[0]")
     rhs = _compile(
         f"def rhs(y, u, c):\n"
         f"    base = ({_first(n)},)\n"

@@ -1,0 +1,39 @@
+"""Which entries a system's Jacobian has, and the whole matrix from those that its function returns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from magpend_core.engine.system import System
+
+
+def places_of(system: System) -> Sequence[int]:
+    """Return the places, row by row, of the numbers that `system.jacobian` returns."""
+    return range(system.n_states**2) if system.jacobian_entries is None else system.jacobian_entries
+
+
+def rows_of_entries(system: System) -> list[dict[int, int]]:
+    """Return where the tuple of `system.jacobian` has the entries of each row, by column."""
+    n = system.n_states
+    rows: list[dict[int, int]] = [{} for _ in range(n)]
+    for k, place in enumerate(places_of(system)):
+        rows[place // n][place % n] = k
+    return rows
+
+
+def whole_jacobian(system: System, entries: np.ndarray) -> np.ndarray:
+    """Return Jacobians (..., n_states, n_states) from what the function returns, shape (..., n_entries)."""
+    n, leading = system.n_states, entries.shape[:-1]
+    whole = np.zeros((*leading, n * n))
+    whole[..., list(places_of(system))] = entries
+    return whole.reshape((*leading, n, n))
+
+
+def declaration_problems(system: System) -> Iterator[str]:
+    """Sentences on a declaration of the entries that is none."""
+    most, entries = system.n_states**2 - 1, system.jacobian_entries
+    good = sorted({i for i in entries or () if 0 <= i <= most})
+    if entries is not None and (not entries or list(entries) != good):
+        yield f"jacobian_entries must be whole numbers from 0 to {most} in rising order, one at least."
