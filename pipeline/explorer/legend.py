@@ -11,7 +11,7 @@ from magpend_core.status import Status
 from pipeline.explorer.catalog import Catalog, Entry
 from pipeline.layout.vocabulary import ABSENT, EQUILIBRIUM
 from pipeline.plots.motions import COLOURS as MOTION_COLOURS
-from pipeline.plots.palette import COLOURS, GREYS, OTHERS, UNASSIGNED, cast_of
+from pipeline.plots.palette import COLOURS, GREYS, OTHERS, cast_of
 
 
 class Legend:
@@ -94,12 +94,16 @@ class Legend:
         motion = self.motion(entry.motion)
         # paler than any attractor's: a class of cells is none
         return (
-            _pale(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)]) if motion else _grey("undecided")
+            _pale(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)])
+            if motion
+            else _grey("not settled")
         )
 
 
 def _status_word(status: int) -> str:
-    return next((word for word, codes in UNASSIGNED.items() if status in codes), Status(status).name.lower())
+    if status in (Status.STEP_LIMIT, Status.STEP_UNDERFLOW, Status.UNREACHED):
+        return "failed"
+    return Status(status).name.lower().replace("_", " ")
 
 
 def _grey(word: str) -> str:

@@ -11,7 +11,7 @@ import xarray as xr
 
 from magpend_core.models.parameters import Parameters
 from magpend_core.status import Status
-from pipeline.analysis.basins.numbers import binomial_interval
+from pipeline.analysis.outcomes import share_interval
 from pipeline.explorer.arrays import pack_arrays
 from pipeline.explorer.explored import ExploredRun, ExplorerError
 from pipeline.explorer.series import fixed_points, orbit_series
@@ -208,11 +208,10 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
     if number < 0:
         return nothing
     here = found.isel({**_parameter_index(run, cell), "attractor": number})
-    n_starts = int(np.prod([found.sizes[d] for d in run.start_dims], dtype=np.int64))
     told = {**nothing, "attractor": number, "share": finite(here["share"])}
     if BRANCH not in run.start_dims:  # walks are no sample of initial states
-        low, high = binomial_interval(np.array([int(here["n_cells"])]), n_starts)
-        told |= {"low": float(low[0]), "high": float(high[0])}
+        low, high = share_interval(np.array([int(here["n_cells"])]), np.array([float(here["share"])]))
+        told |= {"low": finite(low[0]), "high": finite(high[0])}
     multipliers = here["multiplier_real"].values + 1j * here["multiplier_imag"].values
     period = int(here["orbit_period"])
     told["period"] = period

@@ -20,9 +20,19 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.layout import vocabulary
+from pipeline.analysis import outcomes
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import BOUNDED_SET, CLOSED_ORBIT, EQUILIBRIUM, model_of
+from pipeline.layout.vocabulary import (
+    ABSENT,
+    ATTRACTS,
+    BOUNDED_SET,
+    CHAOTIC_SET,
+    EQUILIBRIUM,
+    PERIODIC_ORBIT,
+    STABILITIES,
+    TORUS,
+    model_of,
+)
 from pipeline.plots import style
 
 COLOURS = (
@@ -31,16 +41,22 @@ COLOURS = (
 )  # fmt: skip
 OTHERS = "#C8E6C0"
 
-UNASSIGNED: dict[str, tuple[int, ...]] = {
-    "undecided": (vocabulary.PERIODIC, vocabulary.BOUNDED, vocabulary.INFERRED),
-    "diverged": (vocabulary.DIVERGED,),
-    "failed": tuple(code for code in vocabulary.FAILED if code != vocabulary.NO_RETURN),
-    "no return": (vocabulary.NO_RETURN,),
-    "pending": (vocabulary.PENDING,),
-}
-"""What a cell without an attractor is called, by its status."""
+GREYS = {
+    "not settled": "0.75", "on a transient set": "0.64", "on an unstable orbit or equilibrium": "0.55",
+    "on a neutral set": "0.84", "diverged": "0.0", "failed": "0.45", "no return": "0.17", "pending": "0.95",
+}  # fmt: skip
+"""Cells that do not end on an attractor, with their greys; see `pipeline.analysis.outcomes`."""
 
-GREYS = {"undecided": "0.75", "diverged": "0.0", "failed": "0.45", "no return": "0.17", "pending": "0.95"}
+_FAILED = ("step limit", "step underflow", "unreached")
+
+
+def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
+    """Cells that do not end on an attractor by the names of `GREYS`, on parameter dims, then start dims."""
+    found: dict[str, np.ndarray] = {}
+    for name, which in outcomes.other_cells(part).items():
+        own = "failed" if name in _FAILED else name
+        found[own] = found.get(own, np.zeros(which.shape, bool)) | which
+    return found
 
 
 @dataclass(frozen=True)
@@ -60,11 +76,6 @@ class Cast:
     colours: dict[int, str]
     names: dict[int, str]
     main: tuple[int, ...]
-
-
-def colour_of(attractors: xr.Dataset) -> dict[int, str]:
-    """Colour by id, for tables and other figures of the same run; see `cast_of`."""
-    return cast_of(attractors).colours
 
 
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
@@ -87,14 +98,26 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
 
 
 def describe(one: xr.Dataset) -> str:
-    """Describe an attractor: its periods and motions where it is present, and its turns if it rotates."""
+    """Describe a set: periods or kinds and motions where it is present, turns if it rotates, and its stability.
+
+    That it attracts is not said.
+    """
     present = one["kind"].values.ravel() > 0
     if not present.any():
         return "absent"
     words = _words(one, one["side"].values.ravel()[present]) if "side" in one else ""
     kinds, periods = (one[name].values.ravel()[present] for name in ("kind", "orbit_period"))
     told = _periods(periods, kinds, model_of(one).autonomous) + _seconds(one)
-    return style.join([told, (words + _turns(one, present)).lstrip("\u00a0")])
+    return style.join([told, (words + _turns(one, present)).lstrip("\u00a0"), _stability(one)])
+
+
+def _stability(one: xr.Dataset) -> str:
+    """What has been shown of a set that does not attract everywhere."""
+    if "stability" not in one:
+        return ""
+    found = sorted({int(code) for code in one["stability"].values.ravel()} - {ABSENT, ATTRACTS})
+    words = " or ".join(STABILITIES[code].replace("_", " ") for code in found)
+    return f"{words} in parts" if words and (one["stability"].values == ATTRACTS).any() else words
 
 
 def _seconds(one: xr.Dataset) -> str:
@@ -115,7 +138,9 @@ def _periods(periods: np.ndarray, kinds: np.ndarray, is_flow: bool) -> str:
         listed = ", ".join(map(str, closed)) if len(closed) < 4 else f"{closed[0]} to {closed[-1]}"
         parts.append(f"period {listed}")
     for kind, text in (
-        (CLOSED_ORBIT, "limit cycle" if is_flow else "not periodic"),
+        (PERIODIC_ORBIT, "limit cycle" if is_flow else "not periodic"),
+        (TORUS, "quasi-periodic"),
+        (CHAOTIC_SET, "chaotic"),
         (BOUNDED_SET, "not periodic"),
         (EQUILIBRIUM, "at rest"),
     ):

@@ -15,8 +15,8 @@ import numpy as np
 from magpend_core.models.sectioned import of_flow
 from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import (
-    CLOSED_ORBIT,
     EQUILIBRIUM,
+    PERIODIC_ORBIT,
     frequency_of,
     parameters_of,
     start_dims,
@@ -117,7 +117,7 @@ def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
     kind, periods = int(one["kind"]), int(one["orbit_period"])
     if kind == EQUILIBRIUM:
         return 0.0
-    if kind != CLOSED_ORBIT:
+    if kind != PERIODIC_ORBIT:
         return math.nan
     if parameters.model.crossing is None and periods and not parameters.model.autonomous:
         return periods / frequency
