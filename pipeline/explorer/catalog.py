@@ -3,9 +3,10 @@
 Where the run's attractors are kept in ``derived/``, those of the point are taken from there with their ids,
 and a trajectory is matched as `pipeline.analysis.attractors` matches the cube's cells: closed or on its way
 to a polished orbit (`deciding.decide`), at an equilibrium, on a limit cycle, or on a set that does not close
-by the section points that it shares with it (`clouds.members`). What closes elsewhere is polished and becomes an entry of its own, without
-an id: so live trajectories are told apart by the same rules where no analysis was made. There is no search
-for bounded sets then; bounded cells have one entry for each motion that the model's classifier tells.
+by the section points that it shares with it (`clouds.members`). What closes elsewhere is polished and
+becomes an entry of its own, without an id: so live trajectories are told apart by the same rules where no
+analysis was made. There is no search for sets that do not close then: cells that do not close have one entry
+for each motion that the model's classifier tells, and are not settled.
 """
 
 from __future__ import annotations
@@ -32,7 +33,15 @@ from pipeline.analysis.attractors.spirals import Recurrence
 from pipeline.analysis.sets import Geometry
 from pipeline.explorer.series import orbit_series
 from pipeline.explorer.settling import Place
-from pipeline.layout.vocabulary import ABSENT, APERIODIC, EQUILIBRIUM, PERIODIC_ORBIT, split_dims
+from pipeline.layout.vocabulary import (
+    ABSENT,
+    APERIODIC,
+    ATTRACTS,
+    EQUILIBRIUM,
+    NOT_SETTLED,
+    PERIODIC_ORBIT,
+    split_dims,
+)
 from pipeline.products.attractors import IdentifyOptions
 
 MOST_ENTRIES = 64
@@ -67,6 +76,8 @@ class Entry:
         Section points; none of a class of cells.
     seconds : float
         Period of a limit cycle; NaN else.
+    stability : int
+        Of `vocabulary.STABILITIES`; 0 of a class of cells that ended.
     """
 
     number: int
@@ -77,6 +88,7 @@ class Entry:
     status: int
     points: np.ndarray
     seconds: float = np.nan
+    stability: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +162,8 @@ class Catalog:
             kind = int(here["kind"].values[i])
             side = int(here["side"].values[i]) if "side" in here else 0
             seconds = float(here["period_s"].values[i])
-            entry = Entry(i, i, kind, int(periods[i]), side, 0, own, seconds)
+            stability = int(here["stability"].values[i])
+            entry = Entry(i, i, kind, int(periods[i]), side, 0, own, seconds, stability)
             self.entries.append(entry)
             if i in found:
                 self._add_orbit(found[i] or raw_orbit(own, self._geometry), entry)
@@ -230,7 +243,7 @@ class Catalog:
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):
             here = self._entry_near(EQUILIBRIUM, found.state)
-            entry = here or self._new(EQUILIBRIUM, 0, found.state[None])
+            entry = here or self._new(EQUILIBRIUM, 0, found.state[None], stability=found.stability)
             assert point.at_rest is not None
             numbers[point.at_rest == k] = entry.number
         if self.model.crossing is None:
@@ -241,7 +254,7 @@ class Catalog:
                 own = point.on_cycle == k
                 last = block.section[own][0, -1:]
                 entry = self._entry_of_seconds(cycle.seconds) or self._new(
-                    PERIODIC_ORBIT, 0, last, seconds=cycle.seconds
+                    PERIODIC_ORBIT, 0, last, seconds=cycle.seconds, stability=ATTRACTS
                 )
                 numbers[own] = entry.number
         status = np.where(numbers >= 0, np.int8(Status.NO_RETURN), block.status)
@@ -263,11 +276,14 @@ class Catalog:
         with self._lock:
             if number_of(orbit, self._orbits, self._geometry) == len(self._orbits):
                 motion = self._motion_of(orbit)
-                entry = self._new(PERIODIC_ORBIT, orbit.period, orbit.points, motion, seconds=orbit.seconds)
+                entry = self._new(
+                    PERIODIC_ORBIT, orbit.period, orbit.points, motion,
+                    seconds=orbit.seconds, stability=orbit.stability,
+                )  # fmt: skip
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Tell which of the run's bounded sets the other bounded cells are in, in place."""
+        """Tell which of the run's sets that do not close the other bounded cells are on, in place."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return
@@ -283,11 +299,11 @@ class Catalog:
 
     def _new(
         self, kind: int, period: int, points: np.ndarray, motion: int = 0, status: int = 0,
-        seconds: float = np.nan,
+        seconds: float = np.nan, stability: int = 0,
     ) -> Entry:  # fmt: skip
         with self._lock:
             number = max([self.n_ids, *(e.number + 1 for e in self.entries)])
-            entry = Entry(number, None, kind, period, motion, status, points, seconds)
+            entry = Entry(number, None, kind, period, motion, status, points, seconds, stability)
             self.entries.append(entry)
             return entry
 
@@ -319,7 +335,8 @@ class Catalog:
             for entry in self.entries:
                 if entry.kind == ABSENT and (entry.period, entry.motion, entry.status) == key:
                     return entry
-            return self._new(ABSENT, period, block.section[row][:0], motion, key[2])
+            stability = NOT_SETTLED if alive else 0
+            return self._new(ABSENT, period, block.section[row][:0], motion, key[2], stability=stability)
 
     # ---- motions -------------------------------------------------------------------------------
 

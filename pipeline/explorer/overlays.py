@@ -17,20 +17,10 @@ from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.outcomes import share_interval
 from pipeline.explorer.colours import rgb
 from pipeline.explorer.explored import ExploredRun
-from pipeline.explorer.orbits import finite
+from pipeline.explorer.orbits import finite, shown
 from pipeline.explorer.verticals import vertical
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import (
-    ATTRACTS,
-    BRANCH,
-    EVIDENCE,
-    FREQUENCY_DIM,
-    PERIODIC_ORBIT,
-    STABILITIES,
-    UNSTABLE,
-    model_of,
-)
-from pipeline.layout.vocabulary import KINDS as ATTRACTOR_KINDS
+from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, PERIODIC_ORBIT, model_of
 from pipeline.layout.words import periods_of
 from pipeline.plots import palette
 from pipeline.plots.branches import NAMES, SHORT, pieces
@@ -254,7 +244,7 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
 
 
 def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return the attractors that coexist at a parameter point, the largest share first.
+    """Return the attractors that coexist at a parameter point, the largest share first, then its other sets.
 
     Parameters
     ----------
@@ -302,7 +292,7 @@ def _attractor(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cas
         "id": number,
         "name": cast.names[number],
         "letter": letter(number),
-        "kind": ATTRACTOR_KINDS[int(one["kind"])].replace("_", " "),
+        **shown(one),
         "period": int(one["orbit_period"]) or None,
         "period_s": finite(one["period_s"]),
         "periods": periods_of(run.model),
@@ -312,9 +302,6 @@ def _attractor(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cas
         "high": interval[1],
         "n_starts": count,
         "colour": rgb(cast.colours[number]),
-        "stability": STABILITIES[int(one["stability"])].replace("_", " "),
-        "evidence": EVIDENCE[int(one["evidence"])],
-        "stable": {ATTRACTS: True, UNSTABLE: False}.get(int(one["stability"])),
         "multipliers": [[float(m.real), float(m.imag)] for m in multipliers] if closed else None,
         "exponents": None if exponent is None else [exponent],
         "section": points.tolist(),

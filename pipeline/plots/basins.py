@@ -53,8 +53,8 @@ def plot_basins(
     -------
     DataFigure
         Cells that end on no attractor are grey, with the reason. The legend gives each basin's share of the
-        cells drawn. Its `data` hold ``attractor_id``, ``status`` and ``outcome`` of these, and ``n_periods`` if
-        drawn.
+        cells drawn. Its `data` hold ``attractor_id``, ``status`` and ``outcome`` of these, and
+        ``n_periods`` if drawn.
 
     Raises
     ------

@@ -28,9 +28,13 @@ from pipeline.layout.vocabulary import (
     BOUNDED_SET,
     CHAOTIC_SET,
     EQUILIBRIUM,
+    NEUTRAL,
+    NOT_SETTLED,
     PERIODIC_ORBIT,
     STABILITIES,
     TORUS,
+    TRANSIENT,
+    UNSTABLE,
     model_of,
 )
 from pipeline.plots import style
@@ -42,10 +46,23 @@ COLOURS = (
 OTHERS = "#C8E6C0"
 
 GREYS = {
-    "not settled": "0.75", "on a transient set": "0.64", "on an unstable orbit or equilibrium": "0.55",
-    "on a neutral set": "0.84", "diverged": "0.0", "failed": "0.45", "no return": "0.17", "pending": "0.95",
+    "not settled": "0.7", "on a transient set": "0.82", "on an unstable orbit or equilibrium": "#6b5d4f",
+    "on a neutral set": "#acbfd2", "diverged": "0.0", "failed": "0.45", "no return": "0.17",
+    "pending": "0.95",
 }  # fmt: skip
-"""Cells that do not end on an attractor, with their greys; see `pipeline.analysis.outcomes`."""
+"""Cells that do not end on an attractor, with their greys; see `pipeline.analysis.outcomes`.
+
+Two are tinted: between twelve colours there are not eight greys that can be told apart.
+"""
+
+SETS = {
+    "not settled": NOT_SETTLED, "on a transient set": TRANSIENT,
+    "on an unstable orbit or equilibrium": UNSTABLE, "on a neutral set": NEUTRAL,
+}  # fmt: skip
+"""Stability of the sets that such cells are on."""
+
+GREY_OF = {code: GREYS[name] for name, code in SETS.items()}
+"""Grey of a set that does not attract, by its stability."""
 
 _FAILED = ("step limit", "step underflow", "unreached")
 
@@ -61,16 +78,16 @@ def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Cast:
-    """The attractors of a dataset as figures show them.
+    """The sets of a dataset as figures show them.
 
     Attributes
     ----------
     colours : dict
-        Colour by id.
+        Colour by id; of a set that attracts nowhere the grey of its stability.
     names : dict
         Name by id, such as ``A: period 1, left``.
     main : tuple of int
-        Ids with a colour of their own.
+        Ids with a colour of their own: attractors.
     """
 
     colours: dict[int, str]
@@ -79,7 +96,7 @@ class Cast:
 
 
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
-    """Give the attractors of a dataset their colours and names.
+    """Give the sets of a dataset their colours and names.
 
     Parameters
     ----------
@@ -89,18 +106,28 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     part
         What the names are to describe; by default all of it.
     """
-    cells = attractors["n_cells"].sum([d for d in attractors["n_cells"].dims if d != "attractor"]).values
-    ranked = np.lexsort((np.arange(cells.size), -cells))[: len(COLOURS)].tolist()
-    colours = {**dict.fromkeys(range(cells.size), OTHERS), **dict(zip(ranked, COLOURS, strict=False))}
+    dims = [d for d in attractors["n_cells"].dims if d != "attractor"]
+    attracts = attractors["stability"] == ATTRACTS
+    cells = attractors["n_cells"].where(attracts, 0).sum(dims).values
+    own = np.flatnonzero(attracts.any(dims).values)
+    ranked = own[np.lexsort((own, -cells[own]))][: len(COLOURS)].tolist()
+    colours = {i: _grey_of(attractors["stability"].isel(attractor=i)) for i in range(cells.size)}
+    colours |= dict.fromkeys(own.tolist(), OTHERS) | dict(zip(ranked, COLOURS, strict=False))
     described = attractors if part is None else part
     names = {i: f"{letter(i)}: {describe(described.isel(attractor=i))}" for i in range(cells.size)}
     return Cast(colours, names, tuple(sorted(ranked)))
 
 
-def describe(one: xr.Dataset) -> str:
-    """Describe a set: periods or kinds and motions where it is present, turns if it rotates, and its stability.
+def _grey_of(stability: xr.DataArray) -> str:
+    """Grey of a set that attracts nowhere: that of what it is most often."""
+    codes = stability.values[np.isin(stability.values, list(GREY_OF))]
+    return GREY_OF[int(np.bincount(codes).argmax())] if codes.size else OTHERS
 
-    That it attracts is not said.
+
+def describe(one: xr.Dataset) -> str:
+    """Describe a set: periods or kinds, motions, turns if it rotates, and its stability unless it attracts.
+
+    It is described where it is present.
     """
     present = one["kind"].values.ravel() > 0
     if not present.any():
@@ -113,8 +140,6 @@ def describe(one: xr.Dataset) -> str:
 
 def _stability(one: xr.Dataset) -> str:
     """What has been shown of a set that does not attract everywhere."""
-    if "stability" not in one:
-        return ""
     found = sorted({int(code) for code in one["stability"].values.ravel()} - {ABSENT, ATTRACTS})
     words = " or ".join(STABILITIES[code].replace("_", " ") for code in found)
     return f"{words} in parts" if words and (one["stability"].values == ATTRACTS).any() else words

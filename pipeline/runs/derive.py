@@ -222,7 +222,8 @@ def most_evidence(run: Run, options: Options) -> Options:
     if not isinstance(options, IdentifyOptions):
         return options
     own = IdentifyOptions(**options.part(IdentifyOptions))
-    return options.with_effort(max([own.effort, *(e for told, e in _kept_efforts(run) if told == _aside(own))]))
+    kept = [effort for told, effort in _kept_efforts(run) if told == _aside(own)]
+    return options.with_effort(max([own.effort, *kept]))
 
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], float]]:

@@ -33,8 +33,14 @@ INSIDE, REACHED = 0.9, 3.0
 
 
 def thinned(points: np.ndarray, n: int) -> np.ndarray:
-    """At most `n` points of a sample, evenly spaced."""
-    return points if len(points) <= n else points[np.linspace(0, len(points) - 1, n).astype(np.int64)]
+    """At most `n` points of a sample, in the order of time.
+
+    They are drawn at random, always the same: every second one of a set in two pieces is one piece.
+    """
+    if len(points) <= n:
+        return points
+    drawn = np.random.default_rng(len(points)).choice(len(points), n, replace=False)
+    return np.asarray(points[np.sort(drawn)])
 
 
 def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0) -> float:
@@ -63,8 +69,8 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0)
 
 def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float) -> float:
     """Share of the later half of `own` whose nearest neighbour lies in `other`."""
-    # every other point of the other sample, so that all of its time is there
-    trees = [geometry.tree(points) for points in (own[:n], other[::2][:n])]
+    # points from all of the other sample's time
+    trees = [geometry.tree(points) for points in (own[:n], thinned(other, n))]
     near = [np.maximum(tree.query(geometry.scaled(own[n : 2 * n]), p=np.inf)[0], least) for tree in trees]
     # points that are near both count half
     return float((near[1] < near[0]).mean() + 0.5 * (near[1] == near[0]).mean())
@@ -142,9 +148,10 @@ class Cloud:
     def of(cls, samples: Sequence[np.ndarray], geometry: Geometry, least: float) -> Cloud:
         """Cloud of the points of some cells, its spacing `least` or more."""
         points = _pooled(samples)
-        # of the one half to the other, as far as it reaches: the whole is twice as dense
-        half = geometry.tree(points[::2])
-        away = half.query(geometry.scaled(points[1::2]), p=np.inf)[0] if len(points) > 1 else np.zeros(1)
+        # from the one half to the other: the whole is twice as dense
+        order = np.random.default_rng(0).permutation(len(points))
+        half, rest = np.array_split(points[order], 2)
+        away = geometry.tree(half).query(geometry.scaled(rest), p=np.inf)[0] if len(rest) else np.zeros(1)
         return cls(geometry.tree(points), max(float(np.quantile(away, 0.99)), least))
 
     def distances(self, section: np.ndarray, geometry: Geometry) -> np.ndarray:

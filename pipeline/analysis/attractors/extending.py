@@ -215,9 +215,9 @@ def extend(
         if not chosen:
             break
         work.courses += chosen
-        if not work.has_budget:
+        if work.ran_out:
             break
-        yield from work.run()
+        yield from (work.run() if work.budget else work.conclude())
         loose = work.left_of(loose)
         n_sample *= 2
     if any(course.goes_on for course in work.courses):
@@ -248,7 +248,7 @@ class _Extension:
     def sample(self, loose: np.ndarray, n: int) -> list[Course]:
         """Next `n` cells by rising hash of their sections, of each box of last sections one."""
         known = {course.key for course in self.courses}
-        best: dict[int, tuple[int, int, np.ndarray]] = {}
+        best: dict[int, tuple[int, int, np.ndarray, float]] = {}
         is_loose = np.zeros(self.point.n_cells, bool)
         is_loose[loose] = True
         for block in self.point.blocks():
@@ -257,11 +257,12 @@ class _Extension:
             keys, marks = keys_of(section, self.settings.closure, self.geometry), marks_of(section)
             for row, key, mark in zip(rows, keys.tolist(), marks.tolist(), strict=True):
                 if key not in known and (key not in best or mark < best[key][0]):
-                    best[key] = mark, int(row) + block.cells.start, block.section[row]
+                    step = 0.0 if block.step is None else float(np.nan_to_num(block.step[row]))
+                    best[key] = mark, int(row) + block.cells.start, block.section[row], step
             if len(best) > 4 * n:  # those of least hash are enough
                 best = dict(sorted(best.items(), key=lambda item: item[1][0])[: 2 * n])
         chosen = sorted(best.items(), key=lambda item: item[1][0])[:n]
-        return [Course(cell, key, kept, kept[-1]) for key, (_, cell, kept) in chosen]
+        return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
         """Cells that are on no set that was found to stay, nor beside a sampled one."""
@@ -271,8 +272,12 @@ class _Extension:
         return loose[~done[loose]]
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Loose cells that lie on sets that attract or are neutral, and the numbers of these."""
-        final = [i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL)]
+        """Loose cells that lie on sets that need no further look, and the numbers of these."""
+        final = [
+            i
+            for i, one in enumerate(self.sets)
+            if one.stability in (ATTRACTS, NEUTRAL) or not self.budget
+        ]
         clouds = [one for i in final if (one := self.sets[i].cloud) is not None]
         is_loose = np.zeros(self.point.n_cells, bool)
         is_loose[loose] = True

@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     from pipeline.analysis.attractors.cycles import Cycle
     from pipeline.analysis.attractors.equilibria import Equilibrium
 
+_READ = (
+    "section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size",
+)  # fmt: skip
+"""Variables of a cube that are read."""
+
 BUDGET = 256 * 2**20
 """Bytes of sections held at once."""
 
@@ -193,13 +198,13 @@ class Point:
             seconds = values("return_time", "period_index")
         else:
             seconds = np.full(section.shape[:2], 1.0 / self.frequency)
-        return Block(cells, section, status, values("orbit_period"), turns, rest, seconds)
+        step = values("step_size") if "step_size" in part else None
+        return Block(cells, section, status, values("orbit_period"), turns, rest, seconds, step)
 
 
 def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
     """Parameter points, some at a time: what fits is loaded at once, since chunks span many points."""
-    names = [n for n in ("section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods")
-             if n in ds]  # fmt: skip
+    names = [name for name in _READ if name in ds]
     cube = ds[names].reset_coords(drop=True) if FREQUENCY_DIM in ds.dims else ds[names]
     dims, start_dims = split_dims(ds["status"])
     shape = [ds.sizes[d] for d in dims]
