@@ -36,7 +36,6 @@ class IdentifyOptions(Options):
     n_sample: int = option(32, "Cells of the first sample that is extended.", ge=1)
     confidence: float = option(0.95, "Level of the intervals of lifetimes.", gt=0.0, lt=1.0)
 
-
     @property
     def effort(self) -> float:
         """Budget of the extension, 0 without one: of two results that differ in it, the larger knows more."""
@@ -70,7 +69,7 @@ ATTRACTORS = Analysis(
     """Find the attractors at every parameter point, show that they attract, and follow them along the axes.
 
     A table per parameter point, or with more than six points a line per attractor with the range in
-    which it exists. Cells that no orbit accounts for are extended, for as long as the run itself took at most.
+    which it exists. Cells that no orbit accounts for are extended, at most for as long as the run took.
     Shares are those of the cells that end on attractors, with 95 % intervals.""",
     AttractorOptions,
     compute=f"{_ROOM}:attractors",

@@ -1,19 +1,19 @@
-"""Coexisting attractors: found at every parameter point, shown to attract, described, followed along the sweep.
+"""Coexisting attractors: found at every parameter point, shown to attract, and followed along the sweep.
 
     ds = pipeline.open_run(directory)
     found = identify(ds)                 # integrates: Newton's method, and samples of what has not settled
     named = match(found, threshold=0.3)  # follows orbits along the axes; repeat it with other options
 
-The way of a parameter point: `equilibria` and `cycles` of flows, `searching` for orbits, `extending` of what no
-orbit accounts for, `labelling` of cells and sets. `hysteresis.hysteresis` says where a continuation in both
+The way of a parameter point: `equilibria` and `cycles` of flows, `searching` for orbits, `extending` of what
+no orbit accounts for, `labelling` of cells and sets. `hysteresis.hysteresis` says where a continuation in both
 directions meets other attractors.
 
 Schema
 ------
 `identify` and `match` return a Dataset of the same form. Dims: the *parameter dims* of the cube
 (``frequency`` and others, in the order of the cube; none if nothing is swept), its *start dims*
-(``initial_condition``, the grid's ``<state>_0``, or ``branch``), and ``attractor``, ``destination``, ``point``,
-``state``, ``multiplier``, and the dim of the model's angles. Coordinates are those of the cube.
+(``initial_condition``, the grid's ``<state>_0``, or ``branch``), and ``attractor``, ``destination``,
+``point``, ``state``, ``multiplier``, and the dim of the model's angles. Coordinates are those of the cube.
 
 ======================== ===================================== ============ ==================================
 variable                 dims                                  dtype, fill  meaning
@@ -55,8 +55,8 @@ variable                 dims                                  dtype, fill  mean
 ``eigenvalue_imag``                                                         falling real part
 ``n_sampled``            parameter dims, attractor             int64, 0     its cells that were extended
 ``n_left``               parameter dims, attractor             int64, 0     of these, that left it
-``n_leaving``            parameter dims, attractor             int64, 0     extended cells that were near their
-                                                                            end from the start
+``n_leaving``            parameter dims, attractor             int64, 0     extended cells near their end
+                                                                            from the start
 ``n_to``                 parameter dims, attractor,            int64, 0     cells that left, by the id of the
                          destination                                        set that they ended on
 ``time_at_risk``         parameter dims, attractor             float64, NaN of all together [drive periods]
@@ -83,14 +83,15 @@ dims, attractor): what the id rests on there; `matching` says what an id is.
 What is listed is a *set* that cells are on. Only a set with the stability ``attracts`` is an attractor; what
 shows it is in `stability`. `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the
 orbit, 3 approaching the orbit, 4 one of the set, 5 ended there when it was extended, 6 at rest (see
-`equilibria`), 7 diverged when it was extended (no id); `deciding.decide` has the criteria. A cell that is not
-bounded (diverged, step limit, pending, unreached, or without a return and yet not at rest) has the id -1, and
-its own `status`; a bounded one that belongs to nothing found has the id -1 and `decision` 0: it is not settled.
+`equilibria`), 7 diverged when it was extended (no id); `deciding.decide` has the criteria. A cell that is
+not bounded (diverged, step limit, pending, unreached, or without a return and yet not at rest) has the id -1
+and its own `status`; a bounded one that belongs to nothing found has the id -1 and `decision` 0: it is not
+settled.
 
 A run with a loose `closure_tolerance` (1e-3 and more) is short, and its closed cells say little: sections
 recur within a few per cent near unstable orbits too, and near a period doubling with half the period.
-There a cell belongs only to a polished orbit that attracts, if it is near enough or spirals in; all others are
-run on (`orbits.run_on`) until they close within 1e-5, or stay undecided. So no attractor is made of a
+There a cell belongs only to a polished orbit that attracts, if it is near enough or spirals in; all others
+are run on (`orbits.run_on`) until they close within 1e-5, or stay undecided. So no attractor is made of a
 loose closure alone, and the periods are the orbits' own.
 """
 
@@ -250,7 +251,7 @@ def _filled(
 
 
 def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
-    """Take the largest exponent of sets that do not close from the cube, the mean over cells, if it is there."""
+    """Take the largest exponent of sets that do not close from the cube if it has one, the mean over cells."""
     if "lyapunov" not in ds:
         return result
     dims, signs = result["attractor_id"].dims, ChaosOptions()
@@ -265,7 +266,7 @@ def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
             # in rising order, so that the last bit does not depend on that of the cells
             order = np.argsort(rate[point][which], kind="stable")
             own, errors = rate[point][which][order], error[point][which][order]
-            mean, stderr, _ = pooled_mean(own[None], errors[None], np.ones((1, own.size), bool))
+            _, stderr, _ = pooled_mean(own[None], errors[None], np.ones((1, own.size), bool))
             for end, sign in (("max", 0.0), ("low", -signs.n_sigma), ("high", signs.n_sigma)):
                 result[f"lyapunov_{end}"].values[tuple(index)] = own.mean() + sign * stderr[0]
     return result
@@ -308,7 +309,7 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "mean_lifetime": ((), "float64", np.nan, "1", "mean lifetime in drive periods"),
     "lifetime_low": ((), "float64", np.nan, "1", "lower end of the interval, drive periods"),
     "lifetime_high": ((), "float64", np.nan, "1", "upper end of the interval, drive periods"),
-    "closes_above": ((), "int32", 0, "1", "period that cells seem to close with, above the longest looked for"),
+    "closes_above": ((), "int32", 0, "1", "period of cells that seem to close above the longest looked for"),
 }  # fmt: skip
 """Own dims, dtype, fill, units and long name of the variables per attractor."""
 

@@ -83,7 +83,7 @@ class Equilibrium:
 
     @cached_property
     def stability(self) -> int:
-        """By the real parts of the eigenvalues and their error, or by trajectories beside it; see `stability`."""
+        """By the eigenvalues' real parts and their error, or by trajectories beside it; see `stability`."""
         found = by_margin(float(self.eigenvalues.real[0]), 0.0, self.eigenvalue_error)
         return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
 

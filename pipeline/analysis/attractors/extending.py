@@ -13,24 +13,25 @@ Budget: `options.budget` times the periods that the run itself integrated at the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from magpend_core.status import Status
 from pipeline.analysis.attractors import stability
+from pipeline.analysis.attractors.bounded_sets import BoundedSet, describe, left_behind, were_on
 from pipeline.analysis.attractors.cells import Block, ClosedCells, Guesses, marks_of
-from pipeline.analysis.attractors.clouds import OTHER, Cloud, group, is_stationary, members, mixing, thinned
+from pipeline.analysis.attractors.clouds import group, members
+from pipeline.analysis.attractors.courses import AT_REST, DIVERGED, FAILED, Course
 from pipeline.analysis.attractors.deciding import REACH, decide
 from pipeline.analysis.attractors.equilibria import approaching, rest_near, rest_of_orbit
-from pipeline.analysis.attractors.growth import Growth, growth_of, kind_of
 from pipeline.analysis.attractors.lifetimes import lifetime_interval
 from pipeline.analysis.attractors.orbits import Orbit, number_of
 from pipeline.analysis.attractors.points import Point
-from pipeline.analysis.attractors.requests import LEG, Extended, Leg, Polish, Settings, Slopes, Work
+from pipeline.analysis.attractors.requests import LEG, Extended, Leg, Polish, Settings, Work
 from pipeline.analysis.attractors.spirals import keys_of, leap, near_closed
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TRANSIENT
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED
 
 LEAST_BUDGET = 16_384
 """Periods of a parameter point that may be integrated whatever the run itself took."""
@@ -44,125 +45,8 @@ DOUBLINGS = 3
 ROUNDS = 6
 """Most samples of a parameter point; each is twice as large as the one before."""
 
-MOST_SLOPES = 4096
-"""Most derivatives of the section map for the exponents of a set."""
-
-LEAST_SEEN = 8
-"""Fewest section points of a cell on a set that it left."""
-
 LOOK_BACK = 4
 """Legs in which a period is looked for: those of up to twice as many sections as a leg has are seen."""
-
-ON_SET, FAILED, DIVERGED, AT_REST = -1, -2, -3, -4
-"""Ends of extended cells that are no orbits; `AT_REST` minus a number is an equilibrium."""
-
-
-@dataclass
-class Course:
-    """A sampled cell on its way.
-
-    Attributes
-    ----------
-    cell : int
-        Its place among the cells of the point.
-    key : int
-        Box of its last kept section.
-    kept : ndarray, (n, state)
-        Sections of the run.
-    state, step
-        With which it goes on.
-    legs : list of ndarray
-        Sections since.
-    end : int
-        Number of an orbit, or one of the codes above.
-    periods : float
-        Drive periods or returns from its last kept section until it came near where it ended.
-    is_leaving : bool
-        Whether it was near there from the start.
-    """
-
-    cell: int
-    key: int
-    kept: np.ndarray
-    state: np.ndarray
-    step: float = 0.0
-    legs: list[np.ndarray] = field(default_factory=list)
-    end: int = ON_SET
-    periods: float = 0.0
-    is_leaving: bool = False
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether it has not ended."""
-        return self.end == ON_SET
-
-    @property
-    def extension(self) -> np.ndarray:
-        """All sections since, shape (n, state)."""
-        return np.concatenate([self.kept[:0], *self.legs])
-
-    @property
-    def stayed(self) -> np.ndarray:
-        """Section points on the set: of a cell that goes on its extension, of one that left what was before."""
-        if self.goes_on:
-            return self.extension if self.legs else self.kept
-        return np.asarray(self.extension[: int(self.periods)])
-
-    @property
-    def length(self) -> int:
-        """Sections since."""
-        return sum(len(leg) for leg in self.legs)
-
-
-def rest_number(end: int) -> int | None:
-    """Number of the equilibrium that an end stands for, None if it is another end."""
-    return AT_REST - end if end <= AT_REST else None
-
-
-@dataclass(frozen=True, eq=False)
-class BoundedSet:
-    """A set that does not close, and what was shown of it.
-
-    Attributes
-    ----------
-    cells : ndarray of int64
-        Sampled cells that are on it at the end.
-    cloud : Cloud or None
-    points : ndarray, (n, state)
-        Some of its section points.
-    kind, stability, evidence : int
-    growth : Growth or None
-        None if there are not enough sections.
-    n_sampled, n_left, n_leaving : int
-        Cells that were extended, that left it, and that were near their end from the start.
-    time_at_risk : float
-        Of all sampled cells together [drive periods or returns].
-    ended : dict
-        Where cells that left it went: numbers of cells by `Course.end`.
-    closes_above : int
-        Period that it may close with, above the longest looked for; 0 if none is seen.
-    """
-
-    cells: np.ndarray
-    cloud: Cloud | None
-    points: np.ndarray
-    kind: int
-    stability: int
-    evidence: int
-    growth: Growth | None
-    n_sampled: int
-    n_left: int
-    n_leaving: int
-    time_at_risk: float
-    ended: dict[int, int]
-    closes_above: int = 0
-
-    @classmethod
-    def neutral(cls) -> BoundedSet:
-        """Everything in a flow that preserves volume."""
-        none = np.zeros(0, np.int64)
-        evidence = stability.BY_VOLUME
-        return cls(none, None, none, BOUNDED_SET, NEUTRAL, evidence, None, 0, 0, 0, 0.0, {})
 
 
 @dataclass
@@ -223,7 +107,9 @@ def extend(
     if any(course.goes_on for course in work.courses):
         yield from work.conclude()
     work.add_transient()
-    return Outcome(work.orbits, work.courses, work.sets, work.spent, work.ran_out)
+    n_leaving = sum(course.is_leaving for course in work.courses)
+    sets = [replace(one, n_leaving=n_leaving) for one in work.sets]
+    return Outcome(work.orbits, work.courses, sets, work.spent, work.ran_out)
 
 
 class _Extension:
@@ -269,14 +155,12 @@ class _Extension:
         done = np.zeros(self.point.n_cells, bool)
         done[self.told(loose)[0]] = True
         done[[course.cell for course in self.courses]] = True
-        return loose[~done[loose]]
+        return np.asarray(loose[~done[loose]])
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Loose cells that lie on sets that need no further look, and the numbers of these."""
         final = [
-            i
-            for i, one in enumerate(self.sets)
-            if one.stability in (ATTRACTS, NEUTRAL) or not self.budget
+            i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget
         ]
         clouds = [one for i in final if (one := self.sets[i].cloud) is not None]
         is_loose = np.zeros(self.point.n_cells, bool)
@@ -291,25 +175,9 @@ class _Extension:
 
     def add_transient(self) -> None:
         """Add the set that cells have left, if that is none of those on which others stayed."""
-        left = [c for c in self.courses if self._was_on_a_set(c)]
-        if not left or any(one.n_left for one in self.sets):
-            return
-        ended: dict[int, int] = {}
-        for course in left:
-            ended[course.end] = ended.get(course.end, 0) + 1
-        paths = [course.stayed for course in left]
-        at_risk = float(sum(course.periods for course in left))
-        n_leaving = sum(course.is_leaving for course in self.courses)
-        none = np.zeros(0, np.int64)
-        self.sets.append(BoundedSet(
-            none, Cloud.of(paths, self.geometry, self.settings.closure), np.concatenate(paths), BOUNDED_SET,
-            TRANSIENT, stability.BY_LEAVING, None, len(left), len(left), n_leaving, at_risk, ended,
-        ))  # fmt: skip
-
-    @staticmethod
-    def _was_on_a_set(course: Course) -> bool:
-        """Whether a cell that ended stayed elsewhere for some time before."""
-        return not course.goes_on and not course.is_leaving and len(course.stayed) >= LEAST_SEEN
+        left = [course for course in self.courses if course.has_left]
+        if left and not any(one.n_left for one in self.sets):
+            self.sets.append(left_behind(left, self.settings))
 
     # ---- legs ----------------------------------------------------------------------------------
 
@@ -466,98 +334,25 @@ class _Extension:
         going = [course for course in self.courses if course.goes_on]
         has_stayed = bool(going[0].legs) and self._has_stayed(going, LEAST_STAY)
         numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
-        self.sets, in_doubt = [], not is_sure
-        gone = [course for course in self.courses if self._was_on_a_set(course)]
-        members_of = [
+        groups = [
             [course for course, n in zip(going, numbers, strict=True) if n == k]
             for k in range(int(numbers.max()) + 1)
         ]
-        if not has_stayed:
-            members_of = self._with_those_left(members_of, gone)
-        for own in members_of:
-            one = yield from self._describe(own, gone, has_stayed)
+        gone = [] if has_stayed else [course for course in self.courses if course.has_left]
+        self.sets, in_doubt = [], not is_sure
+        for own, left in self._with_those_left(groups, gone):
+            one = yield from describe(own, left, self.point, self.settings, has_stayed)
             self.sets.append(one)
             in_doubt |= one.stability == NOT_SETTLED or one.kind == BOUNDED_SET
         return in_doubt
 
     def _with_those_left(
-        self, members_of: Sequence[list[Course]], gone: Sequence[Course]
-    ) -> list[list[Course]]:
-        """Join the sets that cells have left: what is on its way through a transient set is no set of its own."""
-        is_left = [
-            any(self._were_on(course, np.concatenate([c.stayed for c in own])) for course in gone)
-            for own in members_of
-        ]
-        joined = [course for own, left in zip(members_of, is_left, strict=True) if left for course in own]
-        others = [own for own, left in zip(members_of, is_left, strict=True) if not left]
-        return [joined, *others] if joined else others
-
-    def _describe(self, own: Sequence[Course], gone: Sequence[Course], has_stayed: bool) -> Work[BoundedSet]:
-        """Kind, stability and lifetimes of the set that some cells are on."""
-        paths = [course.stayed for course in own]
-        pooled = np.concatenate(paths)
-        growth = yield from self._growth(own)
-        kind = kind_of(growth, thinned(pooled, 1024), self.geometry) if growth is not None else BOUNDED_SET
-        left = [c for c in gone if self._were_on(c, pooled)] if not has_stayed else []
-        at_risk = float(sum(c.length for c in own) + sum(c.periods for c in left))
-        verdict, evidence = self._verdict(own, left, growth, has_stayed)
-        ended: dict[int, int] = {}
-        for course in left:
-            ended[course.end] = ended.get(course.end, 0) + 1
-        return BoundedSet(
-            np.array([c.cell for c in own], np.int64),
-            Cloud.of(paths, self.geometry, self.settings.closure), pooled, kind, verdict, evidence, growth,
-            len(own) + len(left), len(left), sum(c.is_leaving for c in self.courses), at_risk, ended,
-            self._closes_above(own, growth),
-        )  # fmt: skip
-
-    def _were_on(self, course: Course, points: np.ndarray) -> bool:
-        """Whether a cell that left was on the set before."""
-        share = mixing(course.stayed, points, self.geometry, self.settings.closure)
-        return bool(share >= OTHER)
-
-    def _verdict(
-        self, own: Sequence[Course], left: Sequence[Course], growth: Growth | None, has_stayed: bool
-    ) -> tuple[int, int]:
-        if growth is not None and growth.preserves_volume:
-            return NEUTRAL, stability.BY_VOLUME
-        if left:
-            return TRANSIENT, stability.BY_LEAVING
-        if not has_stayed or growth is None or growth.contracts:
-            return NOT_SETTLED, stability.BY_NOTHING
-        least = self.settings.closure
-        if not all(is_stationary(course.stayed, self.geometry, least) for course in own):
-            return NOT_SETTLED, stability.BY_NOTHING
-        return ATTRACTS, stability.BY_STAYING
-
-    def _growth(self, own: Sequence[Course]) -> Work[Growth | None]:
-        """Exponents of the section map along the extended cells of a set; None if they are too short."""
-        n = min(course.length for course in own)
-        if n < LEG:
-            return None
-        n_states = self.geometry.n_states
-        most = min(MOST_SLOPES, max(256, 20_000_000 // n_states**2))
-        n_cells = max(1, min(len(own), most // min(n, most)))
-        n = min(n, most // n_cells)
-        # the last ones: transients are over
-        paths = np.stack([course.extension[-n:] for course in own[:n_cells]])
-        before, after = paths[:, :-1].reshape(-1, n_states), paths[:, 1:].reshape(-1, n_states)
-        slopes: np.ndarray = yield Slopes(before)
-        self.spent += 2 * n * n_cells
-        volumes = self.point.volumes(slopes, before, after).reshape(n_cells, n - 1)
-        derivatives = slopes.reshape(n_cells, n - 1, n_states, n_states)
-        whole = np.isfinite(derivatives).all(axis=(1, 2, 3))
-        if not whole.any():
-            return None
-        scales = np.asarray(self.geometry.scales)
-        return growth_of(derivatives[whole] * scales / scales[:, None], self.point.n_neutral, volumes[whole])
-
-    def _closes_above(self, own: Sequence[Course], growth: Growth | None) -> int:
-        """Least period above the longest looked for that the cells of a contracting set come back after."""
-        if growth is None or not growth.contracts:
-            return 0
-        path = min((c.extension for c in own), key=len)
-        for p in range(self.settings.longest + 1, len(path) // 2):
-            if (self.geometry.distance(path[-p:], path[-2 * p : -p]) <= 100.0 * self.settings.closure).all():
-                return p
-        return 0
+        self, groups: Sequence[list[Course]], gone: Sequence[Course]
+    ) -> list[tuple[list[Course], list[Course]]]:
+        """Groups with the cells that left each; those that were left by any are one set."""
+        left = [[course for course in gone if were_on(course, own, self.settings)] for own in groups]
+        joined = [course for own, some in zip(groups, left, strict=True) if some for course in own]
+        found = [(own, some) for own, some in zip(groups, left, strict=True) if not some]
+        if joined:
+            found.insert(0, (joined, [c for c in gone if any(c is x for some in left for x in some)]))
+        return found

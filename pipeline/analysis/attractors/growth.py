@@ -8,7 +8,8 @@ crossings, and neither is the phase of a drive; of a flow looked at in even time
   exp(`GROWN`) at least: a shear alone lets them grow with the time, too.
 * A *torus* has a largest exponent of 0, by weighted Birkhoff averages, which converge faster than any power
   on it (Das, Saiki, Sander and Yorke, Nonlinearity 30, 4111, 2017), and a section on closed curves.
-* A flow *preserves volume* if the logarithm of the change of a volume is 0 in the mean: then nothing attracts.
+* A flow *preserves volume* if the logarithm of the change of a volume is 0 in the mean:
+  then nothing attracts.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ NEIGHBOURS, THIN, ON_CURVE = 10, 0.2, 0.95
 Rates = Callable[[np.ndarray], np.ndarray]
 
 LOST, LOST_ERROR = 1e-6, 1e-3
-"""Largest mean change of the logarithm of a volume [per section] that counts as none; and the largest error of
-a mean that is 0 within its interval."""
+"""Largest mean change of the logarithm of a volume [per section] that counts as none; and the largest error
+of a mean that is 0 within its interval."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""All that is found at one parameter point: cells labelled, sets described, with what shows their stability."""
+"""All that is found at one parameter point: cells labelled, sets described with their evidence."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import numpy as np
 from magpend_core.multipliers import orbit_exponents
 from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors import stability
+from pipeline.analysis.attractors.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.cells import Block, marks_of
 from pipeline.analysis.attractors.clouds import members
+from pipeline.analysis.attractors.courses import DIVERGED, rest_number
 from pipeline.analysis.attractors.deciding import (
     APPROACHING,
     AT_REST,
@@ -23,13 +25,7 @@ from pipeline.analysis.attractors.deciding import (
     decide,
 )
 from pipeline.analysis.attractors.equilibria import put_at_rest
-from pipeline.analysis.attractors.extending import (
-    DIVERGED,
-    BoundedSet,
-    Outcome,
-    extend,
-    rest_number,
-)
+from pipeline.analysis.attractors.extending import Outcome, extend
 from pipeline.analysis.attractors.features import Cells, Features
 from pipeline.analysis.attractors.lifetimes import lifetime_interval
 from pipeline.analysis.attractors.orbits import Orbit, raw_orbit
@@ -43,7 +39,7 @@ from pipeline.analysis.sides import UNKNOWN
 from pipeline.layout.vocabulary import BOUNDED_SET, NEUTRAL, PERIODIC_ORBIT
 
 PRESERVED, VOLUME_RTOL = 1e-7, 1e-11
-"""Largest logarithm of the change of a volume over a period that counts as none, and the tolerance it takes."""
+"""Largest logarithm of the change of a volume over a period that counts as none, and the tolerance for it."""
 
 MOST_PROBES = 8
 """Most degenerate orbits or equilibria of a point beside which trajectories are started."""
@@ -75,7 +71,7 @@ class Found:
 
 @dataclass
 class _Labels:
-    """Labels of the cells while they are given: orbits, raw orbits, sets, equilibria, cycles, in this order."""
+    """Labels of the cells while they are given: orbits, raw orbits, sets, equilibria, cycles, in order."""
 
     label: np.ndarray
     decision: np.ndarray

@@ -33,7 +33,7 @@ def portraits(
     n_samples: int = 256,
     n_periods: int = 20,
 ) -> xr.Dataset:
-    """Integrate each attractor of a parameter point: one period of an orbit, some of a set that does not close.
+    """Integrate each set of a parameter point: one period of an orbit, some periods of another set.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ LEGS, FALL = 32, 0.7
 
 
 def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
-    """Return the scaled distance from which trajectories on both sides come nearer to an orbit, 0 for none."""
+    """Return the scaled distance from which trajectories on both sides come nearer to an orbit, or 0."""
     matrix = scaled_derivative(orbit, geometry)
     values, vectors = np.linalg.eig(matrix)
     critical = vectors[:, np.abs(np.abs(values) - 1.0) <= orbit.multiplier_error]

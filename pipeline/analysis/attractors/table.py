@@ -41,8 +41,8 @@ def attractors_table(ds: xr.Dataset) -> Table:
 def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence: float = 0.95) -> list[Row]:
     """Return a row per set and parameter point.
 
-    `fraction` is that of the cells that end on attractors or diverge, with its interval: NaN of a set that does
-    not attract. A continuation's branches are no sample of initial conditions, so they have none.
+    `fraction` is that of the cells that end on attractors or diverge, with its interval: NaN of a set that
+    does not attract. A continuation's branches are no sample of initial conditions, so they have none.
     """
     dims, start_dims = split_dims(ds["attractor_id"])
     words = words_of(ds["decision"])
@@ -104,7 +104,7 @@ def _attractor(one: xr.Dataset) -> Row:
 
 def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the table per parameter point if there are few, otherwise a line per attractor."""
-    dims, start_dims = split_dims(ds["attractor_id"])
+    dims, _ = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
     attracts = (ds["stability"] == ATTRACTS).any(dims) if dims else ds["stability"] == ATTRACTS
     n, others = int(attracts.sum()), int((~attracts).sum())
@@ -123,7 +123,7 @@ def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
 
 
 def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """What a reader must know beside the table: no attractors at all, periods not looked for, budgets spent."""
+    """What a reader must know beside the table: conservative, periods not looked for, budgets spent."""
     lines = []
     if any(row["evidence"] == "volume" for row in rows):
         lines.append("the flow preserves volume: a conservative system has no attractors")
@@ -133,8 +133,8 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     if above:
         text = ", ".join(map(str, above))
         lines.append(
-            f"cells come back after {text} periods, above the longest looked for: --max-orbit-period {above[-1]} "
-            f"(now {longest}) finds such orbits"
+            f"cells come back after {text} periods, above the longest looked for: --max-orbit-period "
+            f"{above[-1]} (now {longest}) finds such orbits"
         )
     elif any(row["kind"] == "bounded_set" and row["lyapunov_high"] < 0.0 for row in unsettled):
         lines.append(
@@ -184,8 +184,8 @@ def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
 
 
 _SHOWN_BY = {
-    "none": "-", "eigenvalues": "eigenvalues", "multipliers": "multipliers", "approach": "both sides come nearer",
-    "volume": "volume preserved",
+    "none": "-", "eigenvalues": "eigenvalues", "multipliers": "multipliers",
+    "approach": "both sides come nearer", "volume": "volume preserved",
 }  # fmt: skip
 
 

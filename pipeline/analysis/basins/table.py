@@ -52,7 +52,8 @@ def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     seen = [row for row in rows if row["n_cells"]]
     confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
     lines = [
-        f"fractions of the cells that end on attractors or diverge, {ds.attrs['basin_interval']}, {confidence}"
+        f"fractions of the cells that end on attractors or diverge, {ds.attrs['basin_interval']}, "
+        f"{confidence}"
     ]
     if n_points > FEW_POINTS:
         lines += summary(ds, seen, dims, _label_summary)

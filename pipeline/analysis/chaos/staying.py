@@ -43,7 +43,7 @@ def section_dimension(
     Dataset
         On the parameter dims and `attractor` (those that a point of the selection has): the variables of
         `pipeline.analysis.chaos.dimensions.correlation_dimension`; `n_cells`, `share`, `kind`; `reason`, why
-        there is no dimension (`REASONS`); `stability`, `n_sampled`, `n_left` and `lifetime_low` of `identify`.
+        there is no dimension (`REASONS`); `stability`, `n_sampled`, `n_left`, `lifetime_low` of `identify`.
 
     Raises
     ------
