@@ -204,12 +204,11 @@ def _attractors(shown: Shown) -> Iterator[Block]:
         yield Note(str(error))
         return
     command = command_of("analyse attractors", options, shown.directory)
-    rows = list(function_of(ANALYSES["attractors"].table)(found).rows)
-    yield Grid(
-        *_attractor_grid(found, rows, shown.axes),
-        _counted(rows, sentence(found)),
-        command,
-    )
+    table, told = function_of(ANALYSES["attractors"].table)(found), sentence(found)
+    rows = list(table.rows)
+    yield Grid(*_attractor_grid(found, rows, shown.axes), _counted(rows, told), command)
+    for remark in table.lines[table.lines.index(told) + 1 :]:
+        yield Note(f"{remark[:1].upper()}{remark[1:]}.")
     if len(shown.axes) == 1 and shown.cube.sizes[shown.axes[0]] > 1:
         yield from _drawn(shown, "attractors", "All coexisting attractors", **options)
         if "fraction" in (rows or [{}])[0]:
@@ -221,8 +220,11 @@ def _attractors(shown: Shown) -> Iterator[Block]:
         yield from _drawn(shown, "regimes", "How many attractors coexist", **options, show="number")
     if rows:
         where = _richest(rows, shown.axes)
-        told = ", ".join(f"{name} = {value:g}" for name, value in where.items())
-        words = f"Attractors at {told}, where most coexist" if told else "Attractors"
+        place = ", ".join(f"{name} = {value:g}" for name, value in where.items())
+        if any(row["stability"] == "attracts" for row in rows):
+            words = f"Attractors at {place}, where most coexist" if place else "Attractors"
+        else:
+            words = f"Sets that cells are on at {place}" if place else "Sets that cells are on"
         yield from _drawn(shown, "gallery", words, **options, at=where)
 
 
@@ -230,8 +232,8 @@ def _counted(rows: list[dict[str, Any]], told: str) -> str:
     """Numbers of attractors and of other sets, and what the cells end on."""
     attract = {r["attractor_id"] for r in rows if r["stability"] == "attracts"}
     others = {r["attractor_id"] for r in rows} - attract
-    more = f", {len(others)} other sets" if others else ""
-    return f"{len(attract)} attractors{more}; {told}"
+    more = f", {len(others)} other set{'s' * (len(others) != 1)}" if others else ""
+    return f"{len(attract)} attractor{'s' * (len(attract) != 1)}{more}; {told}"
 
 
 def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, float]:
@@ -255,7 +257,8 @@ def _attractor_grid(
     for i in sorted({row["attractor_id"] for row in rows}):
         own = [row for row in rows if row["attractor_id"] == i]
         line = [letter(i)]
-        line += [distinct(r[key].replace("_", " ") for r in own) for key in ("kind", "stability", "evidence")]
+        line += [distinct(r[key].replace("_", " ") for r in own) for key in ("kind", "stability")]
+        line.append(distinct(r["evidence"] for r in own if r["evidence"] != "none") or "-")
         line.append(distinct(r["orbit_period"] for r in own if r["orbit_period"]) or "-")
         line += [distinct(r["side"] for r in own)] if motion else []
         line += [axis_ranges(ds, d, own, alone=len(axes) == 1) for d in axes]
@@ -268,6 +271,8 @@ def _attractor_grid(
 def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
     """Return the largest share of an attractor, with its interval and where that is."""
     best = max(rows, key=lambda row: float(np.nan_to_num(row["fraction"], nan=-1.0)))
+    if not np.isfinite(best["fraction"]):  # it attracts nowhere
+        return "-"
     where = ", ".join(f"{name} {best[name]:g}" for name in axes)
     share = (
         f"{number(best['fraction'], '.3f')} ({number(best['low'], '.3f')} to {number(best['high'], '.3f')})"

@@ -228,8 +228,11 @@ def most_evidence(run: Run, options: Options) -> Options:
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], float]]:
     """Other options and effort of each kept search for attractors of these cells by this code."""
-    folder = run.info.files.below(DERIVED)
-    places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith("identified-")]
+    try:
+        kept_here = products_in(run.info.files.below(DERIVED))
+    except NotADirectoryError:
+        return []
+    places = [p for p in kept_here if p.name.rpartition("/")[2].startswith("identified-")]
     if not places:
         return []
     current = {"cube_digest": run.digest, "analysis_version": code_version("identified")}

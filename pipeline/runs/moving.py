@@ -106,10 +106,10 @@ def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[i
     by_share = np.argsort(-here["share"].values, kind="stable").tolist()
     ranked = [k for k in by_share if wanted[k]][:MOST_MOTIONS]
     left = {
-        "more attractors" if attract.any() else "more sets": int(wanted.sum()) - len(ranked),
+        "attractors" if attract.any() else "sets": int(wanted.sum()) - len(ranked),
         "sets that do not attract": int((~wanted).sum()),
     }
-    more = [f"{n} {what} are not shown; choose with --attractor LETTER" for what, n in left.items() if n]
+    more = [f"not shown: {n} of the {what}; choose with --attractor LETTER" for what, n in left.items() if n]
     return sorted(there[k] for k in ranked), more
 
 

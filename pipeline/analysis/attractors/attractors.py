@@ -4,7 +4,7 @@
     found = identify(ds)                 # integrates: Newton's method, and samples of what has not settled
     named = match(found, threshold=0.3)  # follows orbits along the axes; repeat it with other options
 
-The way of a parameter point: `equilibria` and `cycles` of flows, `searching` for orbits, `extending` of what
+The way of a parameter point: `equilibria` and `cycles` of flows, `searching` for orbits, `extending` what
 no orbit accounts for, `labelling` of cells and sets. `hysteresis.hysteresis` says where a continuation in both
 directions meets other attractors.
 

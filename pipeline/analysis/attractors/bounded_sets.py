@@ -15,8 +15,8 @@ from pipeline.analysis.attractors.points import Point
 from pipeline.analysis.attractors.requests import LEG, Settings, Slopes, Work
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TRANSIENT
 
-MOST_SLOPES = 4096
-"""Most derivatives of the section map for the exponents of a set."""
+SLOPES = (1024, 4096)
+"""Most derivatives of the section map for the exponents of a set: at first, and where these decide nothing."""
 
 MOST_SHAPED = 1024
 """Most section points by which a torus is told."""
@@ -74,10 +74,14 @@ def describe(
     """Kind, stability and lifetimes of the set that some cells are on, and that others have left."""
     paths = [course.stayed for course in own]
     pooled = np.concatenate(paths)
-    growth = yield from _growth(own, point, settings)
-    kind = BOUNDED_SET
-    if growth is not None:
+    growth, kind = None, BOUNDED_SET
+    for most in SLOPES if has_stayed else ():
+        growth = yield from _growth(own, point, settings, most)
+        if growth is None:
+            break
         kind = kind_of(growth, thinned(pooled, MOST_SHAPED), settings.geometry)
+        if kind != BOUNDED_SET or growth.contracts or growth.preserves_volume:
+            break
     verdict, evidence = _verdict(own, left, growth, has_stayed, settings)
     return BoundedSet(
         np.array([c.cell for c in own], np.int64), Cloud.of(paths, settings.geometry, settings.closure),
@@ -126,13 +130,13 @@ def _verdict(
     return ATTRACTS, stability.BY_STAYING
 
 
-def _growth(own: Sequence[Course], point: Point, settings: Settings) -> Work[Growth | None]:
+def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) -> Work[Growth | None]:
     """Exponents of the section map along the extended cells of a set; None if they are too short."""
     n = min(course.length for course in own)
     if n < LEG:
         return None
     n_states = settings.geometry.n_states
-    most = min(MOST_SLOPES, max(256, 20_000_000 // n_states**2))
+    most = min(most, max(256, 20_000_000 // n_states**2))
     n_cells = max(1, min(len(own), most // min(n, most)))
     n = min(n, most // n_cells)
     # the last ones: transients are over

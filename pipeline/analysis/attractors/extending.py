@@ -29,9 +29,9 @@ from pipeline.analysis.attractors.lifetimes import lifetime_interval
 from pipeline.analysis.attractors.orbits import Orbit, number_of
 from pipeline.analysis.attractors.points import Point
 from pipeline.analysis.attractors.requests import LEG, Extended, Leg, Polish, Settings, Work
-from pipeline.analysis.attractors.spirals import keys_of, leap, near_closed
+from pipeline.analysis.attractors.spirals import closes_in, keys_of, leap, near_closed
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
 
 LEAST_BUDGET = 16_384
 """Periods of a parameter point that may be integrated whatever the run itself took."""
@@ -277,6 +277,7 @@ class _Extension:
             rows = [i for i, d in zip(rest, depths, strict=True) if d == depth and block.is_bounded[i]]
             if rows:
                 section = np.stack([np.concatenate(own[i].legs[-depth:]) for i in rows])
+                section = section[closes_in(section, self.settings.longest, self.geometry)]
                 found = found.joined(near_closed(section, self.settings.longest, self.geometry))
         new = [i for i, key in enumerate(found.key.tolist()) if key not in self._tried]
         self._tried.update(found.key[new].tolist())
@@ -343,7 +344,7 @@ class _Extension:
         for own, left in self._with_those_left(groups, gone):
             one = yield from describe(own, left, self.point, self.settings, has_stayed)
             self.sets.append(one)
-            in_doubt |= one.stability == NOT_SETTLED or one.kind == BOUNDED_SET
+            in_doubt |= one.stability == NOT_SETTLED
         return in_doubt
 
     def _with_those_left(

@@ -22,6 +22,9 @@ from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
 SAME_ORBIT = 1e-7
 """Polished orbits at most this far apart are one, on top of the error that their residuals allow."""
 
+PLACE_ERROR = 30.0
+"""Error of a multiplier beside a fold in units of the residual's root: twice the root of the map's curvature."""
+
 RUN_ON_PERIODS, RUN_ON_TOLERANCE, RUN_ON_RTOL = 2000, 1e-5, 1e-8
 """How `run_on` integrates: drive periods at most, closure tolerance, tolerance of the steps."""
 
@@ -71,7 +74,7 @@ class Orbit:
         root of the residual.
         """
         of_matrix = MATRIX_ERROR * float(np.abs(self.derivative).max(initial=1.0))
-        return largest_error(self.derivative, of_matrix) + 3.0 * float(np.sqrt(self.residual))
+        return largest_error(self.derivative, of_matrix) + PLACE_ERROR * float(np.sqrt(self.residual))
 
     @cached_property
     def stability(self) -> int:

@@ -39,6 +39,12 @@ MAX_GUESSES = 64
 SLOWLY, BESIDE = 1.2, (0.005, 0.01, 0.02, 0.04, 0.08)
 """Largest multiplier of an unstable orbit beside which others are looked for, and scaled distances there."""
 
+CHEAP = 4
+"""Longest period of which every recurrence is a guess: chaos passes many orbits, and long ones are dear."""
+
+CLOSES_IN = 0.9
+"""Share of the distance between recurring sections that is left in the later half, at most."""
+
 LEAP, LINEAR = 2.0, 0.1
 """How far a cell that leaves an unstable orbit leaps, in its distance, and the error of the linear map that
 this allows, in units of the growth."""
@@ -94,7 +100,8 @@ def _recurring(section: np.ndarray, max_period: int, geometry: Geometry) -> tupl
 def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     n, k, n_states = section.shape
     period, centre = np.zeros(n, np.int64), section[:, -1].copy()
-    for p in range(1, min(max_period, k // (N_PARTS * PER_PHASE)) + 1):
+    # of long periods one shrinks by chance
+    for p in range(1, min(max_period, CHEAP, k // (N_PARTS * PER_PHASE)) + 1):
         m = k // (N_PARTS * p)
         rest = np.flatnonzero(period == 0)
         own = section[rest, k - N_PARTS * m * p :].reshape(len(rest), N_PARTS, m, p, n_states)
@@ -117,7 +124,8 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Gue
     """
     found = Recurrence.of(section, max_period, geometry)
     marks = marks_of(section)
-    recurring, contracting = np.flatnonzero(found.period), np.flatnonzero(found.centred)
+    worth = (found.period > 0) & ((found.period <= CHEAP) | closes_in(section, max_period, geometry))
+    recurring, contracting = np.flatnonzero(worth), np.flatnonzero(found.centred)
     spirals = _guesses(
         found.period[recurring], found.lag[recurring], marks[recurring], section[recurring, -1], geometry
     )
@@ -127,6 +135,19 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Gue
         found.centred[contracting], away, marks[contracting], found.centre[contracting], geometry
     )
     return spirals.joined(means)
+
+
+def closes_in(section: np.ndarray, max_period: int, geometry: Geometry) -> np.ndarray:
+    """Cells that come nearer to themselves: what passes an orbit of a chaotic set is worth no Newton step."""
+    found = Recurrence.of(section, max_period, geometry)
+    closes = found.centred > 0
+    half = section.shape[1] // 2
+    for p in np.unique(found.period[found.period > 0]).tolist():
+        rows = np.flatnonzero(found.period == p)
+        lag = geometry.distance(section[rows, p:], section[rows, :-p])
+        early, late = lag[:, : half - p // 2].max(axis=1), lag[:, half - p // 2 :].max(axis=1)
+        closes[rows] |= late <= CLOSES_IN * early
+    return np.asarray(closes)
 
 
 def _guesses(

@@ -29,6 +29,7 @@ NUMBERS = (
     "multiplier_error", "lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low",
     "lifetime_high",
 )  # fmt: skip
+COUNTS = ("n_sampled", "n_left", "closes_above")
 
 SPIRALS = """
 kind = "sweep"
@@ -160,8 +161,8 @@ def test_settling__says_what_stays(main, chaotic, tmp_path):
     assert 4 <= int(row["n_sampled"]) == int(one["n_sampled"])
     assert int(row["n_left"]) == 0
     assert float(row["lifetime_low"]) == float(one["lifetime_low"]) > 100
-    names = ("id", "kind", "stability", "cells", "extended", "near an orbit", "left later", "mean lifetime", "to")
-    assert re.search(rf"amplitude m/s2 +{' +'.join(names)}\n", out)
+    names = "id +kind +stability +cells +extended +near an orbit +left later +mean lifetime +to"
+    assert re.search(rf"amplitude m/s2 +{names}\n", out)
     assert f"above {float(row['lifetime_low']):.0f}" in out
     # the same is said of it in the table of attractors
     _, out, _ = main("analyse", "attractors", chaotic, "--n-sample", "4")
@@ -284,7 +285,7 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
             "multiplier_imag": (("frequency", "attractor", "multiplier"), nan[..., None]),
             "n_cells": (("frequency", "attractor"), np.stack([(cells == i).sum(1) for i in (0, 1)], 1)),
             **{name: (("frequency", "attractor"), nan) for name in NUMBERS},
-            **{name: (("frequency", "attractor"), 0 * kind) for name in ("n_sampled", "n_left", "closes_above")},
+            **{name: (("frequency", "attractor"), 0 * kind) for name in COUNTS},
             "mirror_partner": (("frequency", "attractor"), -kind),
             "mirror_distance": (("frequency", "attractor"), nan),
         },
@@ -293,9 +294,7 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
     lines = attractors_table(ds).lines
     assert lines[0] == f"2 attractors at {n} parameter points"
     assert lines[1].split()[:4] == ["id", "kind", "stability", "periods"]
-    assert re.search(
-        r"^  0 +periodic orbit +attracts +1 +unknown +2 to 5 +7 +56 .*1\.0000 at 2 Hz", lines[2]
-    )
+    assert re.search(r"^  0 +periodic orbit +attracts +1 +unknown +2 to 5 +7 +56 .*1\.0000 at 2 Hz", lines[2])
     assert re.search(
         r"^  1 +periodic orbit +attracts +2 +unknown +4 to 5 +3 +14 .*0\.8000 at 4\.5 Hz", lines[3]
     )
