@@ -2,11 +2,12 @@
 
     python tests/bench/same_set.py [--cells 24]
 
-prints the rate of errors of `clouds.mixing`, which decides this, for systems with one chaotic attractor each:
-as many sections as a run keeps (20, 60, 300), and as many as a cell has at least after its extension. Pairs that
-must be one set are cells of the system. Pairs that must be two are such cells, one of them shifted along the first
-state that varies, until a gap of 2 % of the set's extent is between them. `groups` is the number of sets that all
-cells together make; right is 1. Sets that are interwoven more finely than their points lie are one in any case.
+prints the rate of errors of `clouds.mixing`, which decides this, for systems with one chaotic attractor
+each: as many sections as a run keeps (20, 60, 300), and as many as a cell has at least after its extension.
+Pairs that must be one set are cells of the system. Pairs that must be two are such cells, one of them shifted
+along the first state that varies, until a gap of 2 % of the set's extent is between them. `groups` is the
+number of sets that all cells together make; right is 1. Sets that are interwoven more finely than their
+points are one in any case.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ GAP = 0.02
 
 @dataclass(frozen=True)
 class Case:
-    """A system with one chaotic attractor, its parameters, the drive's frequency or a section, and starts."""
+    """A system with one chaotic attractor: parameters, the drive's frequency or a section, starts."""
 
     model: Any
     changes: dict[str, float]
@@ -66,7 +67,7 @@ class Rates:
 
 
 def cells_of(case: Case, n: int) -> tuple[np.ndarray, Geometry]:
-    """Sections (cell, section, state) on the attractor of a case; cells that do not get there are left out."""
+    """Sections (cell, section, state) on the attractor of a case, of cells that get there."""
     model = load_model(case.model)
     parameters = model.load(**case.changes)
     starts = 0.1 + case.spread * np.random.default_rng(1).uniform(-1.0, 1.0, (n, len(model.states)))
@@ -88,7 +89,9 @@ def rates_of(cells: np.ndarray, geometry: Geometry) -> Iterator[Rates]:
         same = [mixing(own[a], own[b], geometry) for a, b in pairs]
         two = [mixing(own[a], own[b] + shift, geometry) for a, b in pairs]
         groups = int(group(list(own), geometry)[0].max()) + 1
-        yield Rates(float(np.mean(np.less(same, OTHER))), float(np.mean(np.greater_equal(two, OTHER))), groups)
+        yield Rates(
+            float(np.mean(np.less(same, OTHER))), float(np.mean(np.greater_equal(two, OTHER))), groups
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -208,11 +208,13 @@ def _judge_other(row: Row, known: Sequence[Known], answer: Answer, verdict: Verd
     """Judge a row that is said not to attract."""
     stability = row["stability"]
     same = [k for k in known if not mismatch(k, row, geometry)]
-    if any(k.stability == stability or k.stability == "semistable" for k in same):
+    if any(k.stability in (stability, "semistable") for k in same):
         verdict.n_right += 1
         _judge_lifetime(row, [k for k in same if k.stability == stability], verdict)
     elif stability == "neutral" and any(k.or_neutral for k in same):
         verdict.n_right += 1
+    elif any(k.stability == "semistable" for k in known):
+        verdict.n_undecided += 1
     elif stability in answer.also or (
         stability == "unstable" and row["kind"] in ("periodic_orbit", "equilibrium")
     ):

@@ -4,8 +4,8 @@
     found = identify(ds)                 # integrates: Newton's method, and samples of what has not settled
     named = match(found, threshold=0.3)  # follows orbits along the axes; repeat it with other options
 
-The way of a parameter point: `equilibria` and `cycles` of flows, `searching` for orbits, `extending` what
-no orbit accounts for, `labelling` of cells and sets. `hysteresis.hysteresis` says where a continuation in both
+The way of a parameter point: `equilibria` and `cycles` of flows, `searching` for orbits, `extending` what no
+orbit accounts for, `labelling` cells and sets. `hysteresis.hysteresis` says where a continuation in both
 directions meets other attractors.
 
 Schema
@@ -251,7 +251,7 @@ def _filled(
 
 
 def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
-    """Take the largest exponent of sets that do not close from the cube if it has one, the mean over cells."""
+    """Take the largest exponent of sets that do not close from the cube, where it has one."""
     if "lyapunov" not in ds:
         return result
     dims, signs = result["attractor_id"].dims, ChaosOptions()

@@ -16,7 +16,7 @@ from pipeline.analysis.attractors.requests import LEG, Settings, Slopes, Work
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TRANSIENT
 
 SLOPES = (1024, 4096)
-"""Most derivatives of the section map for the exponents of a set: at first, and where these decide nothing."""
+"""Most derivatives of the section map for the exponents of a set: first, and where these decide nothing."""
 
 MOST_SHAPED = 1024
 """Most section points by which a torus is told."""

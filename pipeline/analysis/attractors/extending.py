@@ -45,6 +45,9 @@ DOUBLINGS = 3
 ROUNDS = 6
 """Most samples of a parameter point; each is twice as large as the one before."""
 
+SEARCH_EACH = 32
+"""Orbits are looked for after 1, 2, 4, ... legs and after each multiple of this: Newton steps are dear."""
+
 LOOK_BACK = 4
 """Legs in which a period is looked for: those of up to twice as many sections as a leg has are seen."""
 
@@ -245,7 +248,9 @@ class _Extension:
             slice(0, 0), leg.section[rows], leg.status[rows], leg.orbit_period[rows], leg.turns[rows]
         )
         own = [going[i] for i in rows.tolist()]
-        yield from self._search(own, block)
+        n = len(own[0].legs)
+        if n.bit_count() == 1 or n % SEARCH_EACH == 0:
+            yield from self._search(own, block)
         label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
         for course, number in zip(own, label.tolist(), strict=True):
             if number >= 0 and self.orbits[number].is_stable:

@@ -23,7 +23,7 @@ SAME_ORBIT = 1e-7
 """Polished orbits at most this far apart are one, on top of the error that their residuals allow."""
 
 PLACE_ERROR = 30.0
-"""Error of a multiplier beside a fold in units of the residual's root: twice the root of the map's curvature."""
+"""Error of a multiplier beside a fold over the residual's root: twice the root of the map's curvature."""
 
 RUN_ON_PERIODS, RUN_ON_TOLERANCE, RUN_ON_RTOL = 2000, 1e-5, 1e-8
 """How `run_on` integrates: drive periods at most, closure tolerance, tolerance of the steps."""

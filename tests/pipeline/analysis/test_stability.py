@@ -72,9 +72,7 @@ def pitchfork(tmp_path_factory):
 def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
     """+-sqrt(r) with the multiplier exp(-2 r), half of the cells each; 0 with exp(r); all cells at r = 0."""
     rows = attractors_table(derive(pitchfork, "attractors")).rows
-    told = {
-        (row["r"], row["stability"], row["n_cells"], round(row["multiplier_modulus"], 4)) for row in rows
-    }
+    told = {(row["r"], row["stability"], row["n_cells"], round(row["multiplier_modulus"], 4)) for row in rows}
     assert told == {
         (0.0, "attracts", 5, 1.0),
         (0.001, "attracts", 2, 0.998), (0.001, "unstable", 1, 1.001),
