@@ -11,10 +11,10 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.attractors.deciding import DIVERGES as DIVERGED_LATER
 from pipeline.analysis.basins.numbers import binomial_interval
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED, TRANSIENT, UNSTABLE, split_dims
+from pipeline.layout.vocabulary import DIVERGES as DIVERGED_LATER
 
 DIVERGED = -2
 """Label of the cells that diverged: an outcome like an attractor. -1 is no outcome."""

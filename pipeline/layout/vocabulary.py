@@ -44,6 +44,10 @@ _, ATTRACTS, UNSTABLE, TRANSIENT, NOT_SETTLED, NEUTRAL = range(len(STABILITIES))
 EVIDENCE = ("none", "eigenvalues", "multipliers", "approach", "stayed", "left", "volume")
 """Values of `evidence`: what the stability of a set rests on."""
 
+DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "extended", "at_rest", "diverges")
+UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES = range(len(DECISIONS))
+"""How a cell was decided: values of `decision`."""
+
 PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED, NO_RETURN = Status
 
 FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, NO_RETURN)

@@ -34,7 +34,7 @@ class IdentifyOptions(Options):
         ge=0.0,
     )
     n_sample: int = option(32, "Cells of the first sample that is extended.", ge=1)
-    confidence: float = option(0.95, "Level of the intervals of lifetimes.", gt=0.0, lt=1.0)
+    lifetime_confidence: float = option(0.95, "Level of the intervals of lifetimes.", gt=0.0, lt=1.0)
 
     @property
     def effort(self) -> float:

@@ -203,7 +203,7 @@ def report() -> None:
             "coulomb", w, _census(lambda s, w=w: coulomb_map(s, w, 1.0, 0.2)[0], [-2.0, -2.0], [2.0, 2.0], 20)
         )
     rng = np.random.default_rng(1)
-    ends = [belt_motion(*s, 150.0) for s in rng.uniform([-1.0, -2.0], [3.0, 2.0], (400, 2))]
+    ends = [belt_motion(*s, 150.0) for s in rng.uniform([-1.0, -2.0], [3.0, 2.0], (200, 2))]
     rest = _friction(BELT["belt"])
     print("belt: rest at", rest, "share", np.mean([abs(e[0][0] - rest) < 0.05 for e in ends]))
     print(

@@ -109,8 +109,7 @@ def judged(answer: Answer, ds: Any, rows: list[dict[str, Any]]) -> Verdict:
 
 def _cells(one: Any) -> tuple[int, int]:
     """Cells of a parameter point that did not diverge, and those of them that belong to no set."""
-    from pipeline.analysis.attractors.deciding import DIVERGES
-    from pipeline.layout.vocabulary import DIVERGED
+    from pipeline.layout.vocabulary import DIVERGED, DIVERGES
 
     gone = (one["status"].values == DIVERGED) | (one["decision"].values == DIVERGES)
     return int(np.count_nonzero(~gone)), int(np.count_nonzero((one["attractor_id"].values < 0) & ~gone))

@@ -106,7 +106,6 @@ import xarray as xr
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.cycles import tell_cycles
-from pipeline.analysis.attractors.deciding import DECISIONS, DIVERGES
 from pipeline.analysis.attractors.equilibria import tell_rest
 from pipeline.analysis.attractors.features import ENERGY, Features
 from pipeline.analysis.attractors.labelling import Found, analyse
@@ -116,7 +115,17 @@ from pipeline.analysis.attractors.requests import Settings, answer_all
 from pipeline.analysis.attractors.searching import Search
 from pipeline.analysis.chaos.lyapunov import on_attractor, pooled_mean
 from pipeline.analysis.sides import flags_of
-from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, DIVERGED, EVIDENCE, KINDS, STABILITIES, split_dims
+from pipeline.layout.vocabulary import (
+    APERIODIC,
+    ATTRACTS,
+    DECISIONS,
+    DIVERGED,
+    DIVERGES,
+    EVIDENCE,
+    KINDS,
+    STABILITIES,
+    split_dims,
+)
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.chaos import ChaosOptions
 

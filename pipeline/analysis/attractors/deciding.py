@@ -11,6 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from pipeline.analysis.attractors.cells import Block
 from pipeline.analysis.attractors.orbits import Orbit, scaled_derivative
 from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 
 REACH = 0.3
 """Scaled distance from an orbit within which spiralling in is looked for."""
@@ -20,10 +21,6 @@ STRICT = 1e-3
 
 LOOSE_SHARE = 0.1
 """Share of a tolerance above `STRICT` within which a closed cell counts as on an orbit at once."""
-
-DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "extended", "at_rest", "diverges")
-UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES = range(len(DECISIONS))
-"""How a cell was decided: values of `decision`."""
 
 
 @dataclass(frozen=True)

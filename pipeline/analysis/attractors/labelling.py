@@ -14,16 +14,7 @@ from pipeline.analysis.attractors.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.cells import Block, marks_of
 from pipeline.analysis.attractors.clouds import members
 from pipeline.analysis.attractors.courses import DIVERGED, rest_number
-from pipeline.analysis.attractors.deciding import (
-    APPROACHING,
-    AT_REST,
-    CLOSED,
-    DIVERGES,
-    EXTENDED,
-    SAME_SET,
-    UNDECIDED,
-    decide,
-)
+from pipeline.analysis.attractors.deciding import decide
 from pipeline.analysis.attractors.equilibria import put_at_rest
 from pipeline.analysis.attractors.extending import Outcome, extend
 from pipeline.analysis.attractors.features import Cells, Features
@@ -36,7 +27,18 @@ from pipeline.analysis.attractors.searching import Search, State, search_orbits
 from pipeline.analysis.attractors.spirals import keys_of
 from pipeline.analysis.sets import Geometry, order_by_points
 from pipeline.analysis.sides import UNKNOWN
-from pipeline.layout.vocabulary import BOUNDED_SET, NEUTRAL, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import (
+    APPROACHING,
+    AT_REST,
+    BOUNDED_SET,
+    CLOSED,
+    DIVERGES,
+    EXTENDED,
+    NEUTRAL,
+    PERIODIC_ORBIT,
+    SAME_SET,
+    UNDECIDED,
+)
 
 PRESERVED, VOLUME_RTOL = 1e-7, 1e-11
 """Largest logarithm of the change of a volume over a period that counts as none, and the tolerance for it."""
@@ -373,7 +375,7 @@ def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Feat
         found.time_at_risk = one.time_at_risk
         found.mean_lifetime = one.time_at_risk / one.n_left if one.n_left else np.nan
         found.lifetime_low, found.lifetime_high = lifetime_interval(
-            one.n_left, one.time_at_risk, search.options.confidence
+            one.n_left, one.time_at_risk, search.options.lifetime_confidence
         )
     if one.growth is not None:
         # the exponent along a flow seen at crossings is 0 and not among those of the section map

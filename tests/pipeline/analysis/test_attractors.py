@@ -14,8 +14,7 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.attractors import identify, match
-from pipeline.analysis.attractors.deciding import EXTENDED
-from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import ATTRACTS, EXTENDED, PERIODIC_ORBIT
 
 ORBITS = json.loads((Path(__file__).parents[2] / "core" / "data" / "orbits.json").read_text("utf-8"))
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]

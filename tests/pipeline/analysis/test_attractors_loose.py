@@ -9,10 +9,10 @@ import xarray as xr
 from magpend_core import load_preset, sections
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.attractors.cells import Block
-from pipeline.analysis.attractors.deciding import CLOSED, EXTENDED, UNDECIDED, decide
+from pipeline.analysis.attractors.deciding import decide
 from pipeline.analysis.attractors.orbits import Orbit
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import ATTRACTS, CLOSED, EXTENDED, PERIODIC_ORBIT, UNDECIDED
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 

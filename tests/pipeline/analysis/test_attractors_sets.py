@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.cells import Block
-from pipeline.analysis.attractors.deciding import APPROACHING, CERTAIN, CLOSED, UNDECIDED, decide
+from pipeline.analysis.attractors.deciding import decide
 from pipeline.analysis.attractors.orbits import Orbit, raw_orbit
 from pipeline.analysis.attractors.spirals import near_closed
 from pipeline.analysis.sets import Geometry, groups, hashes, mean_distance, nearest_distances
+from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 
 GEOMETRY = Geometry((True, True, False, False), (1.0, 1.0, 10.0, 10.0))
 PLANE = Geometry((True, False), (1.0, 10.0))
