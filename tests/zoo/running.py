@@ -109,7 +109,9 @@ def judged(answer: Answer, ds: Any, rows: list[dict[str, Any]]) -> Verdict:
 
 def _cells(one: Any) -> tuple[int, int]:
     """Cells of a parameter point that did not diverge, and those of them that belong to no set."""
-    from pipeline.layout.vocabulary import DIVERGED, DIVERGES
 
-    gone = (one["status"].values == DIVERGED) | (one["decision"].values == DIVERGES)
+    def shows(name: str, word: str) -> np.ndarray:
+        return np.asarray(one[name].values == one[name].attrs["flag_meanings"].split().index(word))
+
+    gone = shows("status", "diverged") | shows("decision", "diverges")
     return int(np.count_nonzero(~gone)), int(np.count_nonzero((one["attractor_id"].values < 0) & ~gone))
