@@ -27,12 +27,15 @@ class Equilibria:
         Scaled length of the Newton step from there: the distance from the equilibrium to first order.
     converged : ndarray of bool, (n,)
         Whether that is within the tolerance.
+    jacobians : ndarray, (n, n_states, n_states)
+        At these states [1/s per unit of the states].
     """
 
     states: np.ndarray
     eigenvalues: np.ndarray
     residual: np.ndarray
     converged: np.ndarray
+    jacobians: np.ndarray
 
     @property
     def is_stable(self) -> np.ndarray:
@@ -107,4 +110,4 @@ def find_equilibria(
     for row in np.flatnonzero(converged):
         values = np.linalg.eigvals(jacobians[row])
         eigenvalues[row] = values[np.lexsort((values.imag, -values.real))]
-    return Equilibria(found, eigenvalues, residual, converged)
+    return Equilibria(found, eigenvalues, residual, converged, jacobians)

@@ -72,7 +72,7 @@ ANALYSES = {
     "attractors": ("sweep", []),
     "basins": ("sweep", ["--box", "2", "--resamples", "20"]),
     "hysteresis": ("walk", []),
-    "settling": ("sweep", ["--n-sample", "4", "--n-periods", "64"]),
+    "settling": ("sweep", ["--n-sample", "4"]),
     "chaos": ("sweep", []),
     "dimension": ("sweep", ["--n-max", "2000"]),
     "branches": ("walk", ["--period", "1"]),

@@ -41,6 +41,11 @@ class Geometry:
         return cls(owner.is_angle, owner.scales)
 
     @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return len(self.scales)
+
+    @property
     def circumference(self) -> np.ndarray:
         """Scaled length of each component's circle, 0 for those on a line."""
         return np.where(self.is_angle, TWO_PI / np.asarray(self.scales), 0.0)
@@ -132,11 +137,6 @@ def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
     """
     there, back = nearest_distances(a, b, geometry), nearest_distances(b, a, geometry)
     return float(max(there.mean(), back.mean()))
-
-
-def hausdorff_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
-    """Largest distance of a state of either set from the other set."""
-    return float(max(nearest_distances(a, b, geometry).max(), nearest_distances(b, a, geometry).max()))
 
 
 def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:

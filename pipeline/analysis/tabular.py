@@ -66,6 +66,8 @@ def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str
 def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> str:
     """Largest fraction and where it is."""
     best = max(rows, key=lambda row: (np.nan_to_num(row["fraction"], nan=-1.0),))
+    if not np.isfinite(best["fraction"]):
+        return "-"
     where = ", ".join(f"{best[d]:g}{unit_of(ds, d)}" for d in dims)
     return f"{number(best['fraction'], '.4f')} at {where}"
 
@@ -88,24 +90,6 @@ def aligned(rows: Sequence[Mapping[str, str]]) -> list[str]:
     widths = [max(len(line[k]) for line in cells) for k in range(len(names))]
     lines = ["  ".join(w.ljust(n) for w, n in zip(line, widths, strict=True)).rstrip() for line in cells]
     return [f"  {line}" for line in lines] if rows else []
-
-
-def cell_counts(ds: xr.Dataset, start_dims: Sequence[str]) -> list[str]:
-    """Return a line on the cells without an attractor, if there are any."""
-    unknown = ds["attractor_id"].values < 0
-    status = ds["status"].values
-    names = str(ds["status"].attrs["flag_meanings"]).split()
-    codes = [int(c) for c in ds["status"].attrs["flag_values"]]
-    counts: dict[str, int] = {}
-    for code, name in zip(codes, names, strict=True):
-        n = int((unknown & (status == code)).sum())
-        what = "undecided" if name in ("periodic", "bounded", "inferred") else name
-        if n:
-            counts[what] = counts.get(what, 0) + n
-    if not counts:
-        return [f"all {unknown.size} cells belong to an attractor"]
-    texts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items())
-    return [f"{int((~unknown).sum())} of {unknown.size} cells belong to an attractor; {texts}"]
 
 
 def with_error(value: float, error: float, most: int = 6) -> str:

@@ -2,10 +2,11 @@
 
 Where the run's attractors are kept in ``derived/``, those of the point are taken from there with their ids,
 and a trajectory is matched as `pipeline.analysis.attractors` matches the cube's cells: closed or on its way
-to a polished orbit (`deciding.decide`), at an equilibrium, on a limit cycle, or one of a bounded set by the
-boxes that its sections occupy. What closes elsewhere is polished and becomes an entry of its own, without
-an id: so live trajectories are told apart by the same rules where no analysis was made. There is no search
-for bounded sets then; bounded cells have one entry for each motion that the model's classifier tells.
+to a polished orbit (`deciding.decide`), at an equilibrium, on a limit cycle, or on a set that does not close
+by the section points that it shares with it (`clouds.members`). What closes elsewhere is polished and
+becomes an entry of its own, without an id: so live trajectories are told apart by the same rules where no
+analysis was made. There is no search for sets that do not close then: cells that do not close have one entry
+for each motion that the model's classifier tells, and are not settled.
 """
 
 from __future__ import annotations
@@ -21,18 +22,26 @@ import xarray as xr
 from magpend_core.models.model import Model
 from magpend_core.status import Status
 from pipeline.analysis.attractors import features
-from pipeline.analysis.attractors.bounded import Clouds, Rule, Sets, assign, find_sets
 from pipeline.analysis.attractors.cells import Block
+from pipeline.analysis.attractors.clouds import Cloud, members
 from pipeline.analysis.attractors.cycles import tell_cycles
 from pipeline.analysis.attractors.deciding import STRICT, decide
 from pipeline.analysis.attractors.equilibria import tell_rest
 from pipeline.analysis.attractors.orbits import Orbit, number_of, polish, raw_orbit
 from pipeline.analysis.attractors.points import Point
 from pipeline.analysis.attractors.spirals import Recurrence
-from pipeline.analysis.sets import Geometry, mean_distance
+from pipeline.analysis.sets import Geometry
 from pipeline.explorer.series import orbit_series
 from pipeline.explorer.settling import Place
-from pipeline.layout.vocabulary import ABSENT, BOUNDED_SET, CLOSED_ORBIT, EQUILIBRIUM, split_dims
+from pipeline.layout.vocabulary import (
+    ABSENT,
+    APERIODIC,
+    ATTRACTS,
+    EQUILIBRIUM,
+    NOT_SETTLED,
+    PERIODIC_ORBIT,
+    split_dims,
+)
 from pipeline.products.attractors import IdentifyOptions
 
 MOST_ENTRIES = 64
@@ -67,6 +76,8 @@ class Entry:
         Section points; none of a class of cells.
     seconds : float
         Period of a limit cycle; NaN else.
+    stability : int
+        Of `vocabulary.STABILITIES`; 0 of a class of cells that ended.
     """
 
     number: int
@@ -77,6 +88,7 @@ class Entry:
     status: int
     points: np.ndarray
     seconds: float = np.nan
+    stability: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +141,7 @@ class Catalog:
         self.entries: list[Entry] = []
         self._orbits: list[Orbit] = []
         self._orbit_entries: list[int] = []
-        self._sets: list[tuple[Entry, Sets]] = []
+        self._sets: list[tuple[Entry, Cloud]] = []
         self.n_ids = 0 if known.attractors is None else known.attractors.sizes["attractor"]
         if here is not None and known.cells is not None:
             self._take(here, known.cells)
@@ -141,7 +153,7 @@ class Catalog:
         present = np.flatnonzero(here["kind"].values != ABSENT)
         points = {int(i): _finite(here["attractor_points"].values[i]) for i in present}
         periods = here["orbit_period"].values
-        closed = [i for i in points if here["kind"].values[i] == CLOSED_ORBIT and periods[i] > 0]
+        closed = [i for i in points if here["kind"].values[i] == PERIODIC_ORBIT and periods[i] > 0]
         orbits = self._polished(
             np.array([points[i][0] for i in closed]), np.array([periods[i] for i in closed], np.int64)
         )
@@ -150,28 +162,24 @@ class Catalog:
             kind = int(here["kind"].values[i])
             side = int(here["side"].values[i]) if "side" in here else 0
             seconds = float(here["period_s"].values[i])
-            entry = Entry(i, i, kind, int(periods[i]), side, 0, own, seconds)
+            stability = int(here["stability"].values[i])
+            entry = Entry(i, i, kind, int(periods[i]), side, 0, own, seconds, stability)
             self.entries.append(entry)
             if i in found:
                 self._add_orbit(found[i] or raw_orbit(own, self._geometry), entry)
-            elif kind == BOUNDED_SET:
-                clouds = self._clouds_of(here, cells, i)
-                if clouds is not None:
-                    self._sets.append((entry, find_sets(clouds, self._geometry, self._rule)))
+            elif kind in APERIODIC:
+                cloud = self._cloud_of(here, cells, i)
+                if cloud is not None:
+                    self._sets.append((entry, cloud))
 
-    @property
-    def _rule(self) -> Rule:
-        return Rule.of(self.options)
-
-    def _clouds_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Clouds | None:
-        """Clouds of the cube's cells that are on a bounded set."""
+    def _cloud_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Cloud | None:
+        """Cloud of the cube's cells that are on a set that does not close."""
         block = self._point(cells).whole()
         ids = here["attractor_id"].transpose(*split_dims(cells["status"])[1]).values.ravel()
         own = np.flatnonzero((ids == number) & block.is_bounded)
         if not len(own):
             return None
-        clouds = Clouds.of(block.section[own], block.turns[own], self._geometry, self._rule)
-        return clouds.first(self._rule.n_anchors)
+        return Cloud.of(list(block.section[own]), self._geometry, self.tolerance)
 
     def _polished(self, points: np.ndarray, period: np.ndarray) -> list[Orbit | None]:
         n = len(points)
@@ -235,7 +243,7 @@ class Catalog:
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):
             here = self._entry_near(EQUILIBRIUM, found.state)
-            entry = here or self._new(EQUILIBRIUM, 0, found.state[None])
+            entry = here or self._new(EQUILIBRIUM, 0, found.state[None], stability=found.stability)
             assert point.at_rest is not None
             numbers[point.at_rest == k] = entry.number
         if self.model.crossing is None:
@@ -246,7 +254,7 @@ class Catalog:
                 own = point.on_cycle == k
                 last = block.section[own][0, -1:]
                 entry = self._entry_of_seconds(cycle.seconds) or self._new(
-                    CLOSED_ORBIT, 0, last, seconds=cycle.seconds
+                    PERIODIC_ORBIT, 0, last, seconds=cycle.seconds, stability=ATTRACTS
                 )
                 numbers[own] = entry.number
         status = np.where(numbers >= 0, np.int8(Status.NO_RETURN), block.status)
@@ -268,22 +276,20 @@ class Catalog:
         with self._lock:
             if number_of(orbit, self._orbits, self._geometry) == len(self._orbits):
                 motion = self._motion_of(orbit)
-                entry = self._new(CLOSED_ORBIT, orbit.period, orbit.points, motion, seconds=orbit.seconds)
+                entry = self._new(
+                    PERIODIC_ORBIT, orbit.period, orbit.points, motion,
+                    seconds=orbit.seconds, stability=orbit.stability,
+                )  # fmt: skip
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Tell which of the run's bounded sets the other bounded cells are in, in place."""
+        """Tell which of the run's sets that do not close the other bounded cells are on, in place."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return
-        clouds = Clouds.of(block.section[rows], block.turns[rows], self._geometry, self._rule)
-        inside = np.stack([assign(clouds, sets, self._rule) >= 0 for _, sets in self._sets], axis=1)
-        for row, own in zip(rows, inside, strict=True):
-            candidates = [self._sets[k][0] for k in np.flatnonzero(own)]
-            if len(candidates) > 1:
-                candidates.sort(key=lambda e: mean_distance(block.section[row], e.points, self._geometry))
-            if candidates:
-                numbers[row] = candidates[0].number
+        own = members(block.section[rows], [cloud for _, cloud in self._sets], self._geometry)
+        for row, k in zip(rows[own >= 0], own[own >= 0].tolist(), strict=True):
+            numbers[row] = self._sets[k][0].number
 
     # ---- entries -------------------------------------------------------------------------------
 
@@ -293,11 +299,11 @@ class Catalog:
 
     def _new(
         self, kind: int, period: int, points: np.ndarray, motion: int = 0, status: int = 0,
-        seconds: float = np.nan,
+        seconds: float = np.nan, stability: int = 0,
     ) -> Entry:  # fmt: skip
         with self._lock:
             number = max([self.n_ids, *(e.number + 1 for e in self.entries)])
-            entry = Entry(number, None, kind, period, motion, status, points, seconds)
+            entry = Entry(number, None, kind, period, motion, status, points, seconds, stability)
             self.entries.append(entry)
             return entry
 
@@ -314,7 +320,7 @@ class Catalog:
     def _entry_of_seconds(self, seconds: float) -> Entry | None:
         for entry in self.entries:
             same = abs(entry.seconds - seconds) <= SAME_SECONDS * seconds
-            if entry.kind == CLOSED_ORBIT and not entry.period and same:
+            if entry.kind == PERIODIC_ORBIT and not entry.period and same:
                 return entry
         return None
 
@@ -329,7 +335,8 @@ class Catalog:
             for entry in self.entries:
                 if entry.kind == ABSENT and (entry.period, entry.motion, entry.status) == key:
                     return entry
-            return self._new(ABSENT, period, block.section[row][:0], motion, key[2])
+            stability = NOT_SETTLED if alive else 0
+            return self._new(ABSENT, period, block.section[row][:0], motion, key[2], stability=stability)
 
     # ---- motions -------------------------------------------------------------------------------
 
@@ -355,6 +362,7 @@ class Catalog:
         return _WholePoint(
             cells, split_dims(cells["status"])[1], self.place.frequency, self._packed, self.place.parameters,
             sum(self._geometry.is_angle), cells["status"].size, self.model.system,
+            is_flow=self.model.crossing is not None, can_rest=self.model.autonomous,
         )  # fmt: skip
 
 

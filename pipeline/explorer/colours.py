@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magpend_core.status import Status
-from pipeline.layout.vocabulary import BRANCH
+from pipeline.analysis.outcomes import outcomes
+from pipeline.layout.vocabulary import BRANCH, split_dims
 from pipeline.plots import palette, style
 from pipeline.plots.motions import motion_codes, motions_of
 
@@ -93,12 +94,11 @@ def _schemes(run: ExploredRun) -> Iterator[Scheme]:
             lambda block: _told(motion_codes(block)), ("section", "turns"),
         )  # fmt: skip
     if (found := run.kept("attractors")) is not None:
-        cast = palette.cast_of(found)
-        ids = found["attractor_id"]
+        cast, (codes, others) = palette.cast_of(found), _ends(found)
         yield Scheme(
             "attractor", "attractor",
-            tuple(Category(i, cast.names[i], rgb(cast.colours[i])) for i in sorted(cast.names)),
-            lambda block: ids.isel({d: block[f"_{d}"].values for d in ids.dims}),
+            (*(Category(i, cast.names[i], rgb(cast.colours[i])) for i in sorted(cast.names)), *others),
+            lambda block: codes.isel({d: block[f"_{d}"].values for d in codes.dims}),
         )  # fmt: skip
     if BRANCH in run.plan.dims:
         present = [d for d in _DIRECTIONS if d in set(cube["direction"].values.tolist())]
@@ -139,6 +139,23 @@ def _seeds(run: ExploredRun) -> Iterator[Scheme]:
         return number
 
     yield Scheme("seed", "initial state", categories, codes)
+
+
+def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
+    """Code of what each cell ends on: the id of an attractor, or a grey beyond all ids; and these greys.
+
+    Cells that diverged, failed or are pending have none.
+    """
+    codes = outcomes(found).astype(np.int32)
+    codes = codes.where(codes >= 0, -1)
+    dims, starts = split_dims(codes)
+    table, others = codes.transpose(*dims, *starts), []
+    for name, which in palette.other_cells(found).items():
+        if name in palette.SETS:
+            number = found.sizes["attractor"] + list(palette.GREYS).index(name)
+            table = table.where(~which, number)
+            others.append(Category(number, name, rgb(palette.GREYS[name])))
+    return table, tuple(others)
 
 
 def _told(codes: xr.DataArray) -> xr.DataArray:

@@ -28,7 +28,7 @@ from pipeline.explorer.messages import CellPoint, FollowRequest, RequestError
 from pipeline.explorer.series import fixed_points, orbit_series
 from pipeline.explorer.settling import Place, system_at
 from pipeline.layout.cells import parameter_axes
-from pipeline.layout.vocabulary import CLOSED_ORBIT, axis_name
+from pipeline.layout.vocabulary import PERIODIC_ORBIT, axis_name
 
 if TYPE_CHECKING:
     from pipeline.explorer.live import LiveRun
@@ -233,7 +233,7 @@ def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
         return 0
     here = attractors.isel({d: i for d, i in at.items() if d in attractors["attractor_id"].dims})
     number = int(here["attractor_id"].values)
-    if number < 0 or int(here["kind"].isel(attractor=number).values) != CLOSED_ORBIT:
+    if number < 0 or int(here["kind"].isel(attractor=number).values) != PERIODIC_ORBIT:
         return 0
     return int(here["orbit_period"].isel(attractor=number).values)
 

@@ -9,9 +9,10 @@ import xarray as xr
 
 from magpend_core.status import Status
 from pipeline.explorer.catalog import Catalog, Entry
-from pipeline.layout.vocabulary import ABSENT, EQUILIBRIUM
+from pipeline.explorer.colours import rgb
+from pipeline.layout.vocabulary import ABSENT, ATTRACTS, EQUILIBRIUM, STABILITIES
 from pipeline.plots.motions import COLOURS as MOTION_COLOURS
-from pipeline.plots.palette import COLOURS, GREYS, OTHERS, UNASSIGNED, cast_of
+from pipeline.plots.palette import COLOURS, GREY_OF, GREYS, OTHERS, cast_of
 
 
 class Legend:
@@ -46,7 +47,7 @@ class Legend:
         found: list[dict[str, Any]] = []
         for entry in sorted(list(self._catalog.entries), key=lambda e: e.number):
             colour = self._colour(entry, new)
-            new += entry.attractor is None and entry.kind != ABSENT
+            new += entry.attractor is None and entry.kind != ABSENT and entry.stability == ATTRACTS
             name = self.name(entry)
             again = sum(line["label"].partition(" #")[0] == name for line in found)
             found.append({
@@ -74,7 +75,7 @@ class Legend:
         else:
             told = "not periodic"
         motion = self.motion(entry.motion)
-        text = f"{told}, {motion}" if motion else told
+        text = ", ".join(filter(None, (told, motion, _shown(entry.stability))))
         return f"not among the run's: {text}" if self._known and entry.kind != ABSENT else text
 
     def motion(self, code: int) -> str:
@@ -85,26 +86,32 @@ class Legend:
         return classifier.words[code]
 
     def _colour(self, entry: Entry, new: int) -> str:
+        if entry.status:
+            return rgb(GREYS.get(_status_word(entry.status), GREYS["failed"]))
+        if entry.kind != ABSENT and entry.stability in GREY_OF:
+            return rgb(GREY_OF[entry.stability])
         if entry.attractor is not None:
             return self._colours[entry.attractor]
-        if entry.status:
-            return _grey(_status_word(entry.status))
         if entry.kind != ABSENT:
             return self._free[new % len(self._free)]
         motion = self.motion(entry.motion)
         # paler than any attractor's: a class of cells is none
         return (
-            _pale(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)]) if motion else _grey("undecided")
+            _pale(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)])
+            if motion
+            else rgb(GREYS["not settled"])
         )
 
 
 def _status_word(status: int) -> str:
-    return next((word for word, codes in UNASSIGNED.items() if status in codes), Status(status).name.lower())
+    if status in (Status.STEP_LIMIT, Status.STEP_UNDERFLOW, Status.UNREACHED):
+        return "failed"
+    return Status(status).name.lower().replace("_", " ")
 
 
-def _grey(word: str) -> str:
-    level = round(255 * float(GREYS.get(word, GREYS["failed"])))
-    return f"#{level:02x}{level:02x}{level:02x}"
+def _shown(stability: int) -> str:
+    """What has been shown of something that does not attract; of what attracts nothing is said."""
+    return "" if stability in (0, ATTRACTS) else STABILITIES[stability].replace("_", " ")
 
 
 def _pale(colour: str) -> str:

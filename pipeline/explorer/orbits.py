@@ -11,11 +11,20 @@ import xarray as xr
 
 from magpend_core.models.parameters import Parameters
 from magpend_core.status import Status
-from pipeline.analysis.basins.numbers import binomial_interval
+from pipeline.analysis.outcomes import share_interval
 from pipeline.explorer.arrays import pack_arrays
 from pipeline.explorer.explored import ExploredRun, ExplorerError
 from pipeline.explorer.series import fixed_points, orbit_series
-from pipeline.layout.vocabulary import BRANCH, PENDING, grid_dim
+from pipeline.layout.vocabulary import (
+    ATTRACTS,
+    BRANCH,
+    EVIDENCE,
+    KINDS,
+    PENDING,
+    STABILITIES,
+    UNSTABLE,
+    grid_dim,
+)
 from pipeline.plots.motions import motion_codes, motions_of
 from pipeline.store.run import Run
 
@@ -181,8 +190,8 @@ def _attrs(run: ExploredRun, cell: Cell, told: dict[str, Any], linearised: bool)
         "status": cell.status.name.lower().replace("_", " "),
         "status_meaning": cell.status.sentence,
         "motion": names.words[code] if names.told and code > 0 else None,
-        **{key: told[key] for key in ("attractor", "share", "low", "high")},
-        "stable": None if multipliers is None else bool(np.abs(multipliers).max() < 1.0),
+        **{key: told[key] for key in _TOLD},
+        "stable": _is_stable(told["stability"], multipliers),
         "multipliers": None if multipliers is None else [[float(m.real), float(m.imag)] for m in multipliers],
         "note": "its multipliers are not ready yet: choose it again in a moment" if awaited else None,
         "exponents": exponents,
@@ -194,12 +203,33 @@ def _attrs(run: ExploredRun, cell: Cell, told: dict[str, Any], linearised: bool)
     }
 
 
+_TOLD = ("attractor", "share", "low", "high", "kind", "stability", "evidence")
+"""What the page is told of the set that a cell is on."""
+
+
+def _is_stable(stability: str | None, multipliers: np.ndarray | None) -> bool | None:
+    """Whether an orbit attracts: as the analysis has shown, else by its multipliers; None if nobody knows."""
+    if stability is not None:
+        return {STABILITIES[ATTRACTS]: True, STABILITIES[UNSTABLE]: False}.get(stability)
+    return None if multipliers is None else bool(np.abs(multipliers).max() < 1.0)
+
+
+def shown(one: xr.Dataset) -> dict[str, str | None]:
+    """Kind and stability of a set at a parameter point, and what the stability rests on, None for nothing."""
+    evidence = int(one["evidence"])
+    return {
+        "kind": KINDS[int(one["kind"])].replace("_", " "),
+        "stability": STABILITIES[int(one["stability"])].replace("_", " "),
+        "evidence": EVIDENCE[evidence] if evidence else None,
+    }
+
+
 def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
-    """What the run's attractors say of the one that a cell is on; nothing where they are not known.
+    """What the run's attractors say of the set that a cell is on; nothing where they are not known.
 
     A cell whose sections do not close may be on its way to a closed orbit all the same.
     """
-    nothing: dict[str, Any] = dict.fromkeys(("attractor", "share", "low", "high", "multipliers", "seconds"))
+    nothing: dict[str, Any] = dict.fromkeys((*_TOLD, "multipliers", "seconds"))
     nothing["period"] = 0
     found = run.kept("attractors")
     if found is None:
@@ -208,11 +238,10 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
     if number < 0:
         return nothing
     here = found.isel({**_parameter_index(run, cell), "attractor": number})
-    n_starts = int(np.prod([found.sizes[d] for d in run.start_dims], dtype=np.int64))
-    told = {**nothing, "attractor": number, "share": finite(here["share"])}
+    told = {**nothing, "attractor": number, "share": finite(here["share"]), **shown(here)}
     if BRANCH not in run.start_dims:  # walks are no sample of initial states
-        low, high = binomial_interval(np.array([int(here["n_cells"])]), n_starts)
-        told |= {"low": float(low[0]), "high": float(high[0])}
+        low, high = share_interval(np.array([int(here["n_cells"])]), np.array([float(here["share"])]))
+        told |= {"low": finite(low[0]), "high": finite(high[0])}
     multipliers = here["multiplier_real"].values + 1j * here["multiplier_imag"].values
     period = int(here["orbit_period"])
     told["period"] = period

@@ -12,16 +12,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.numbers import binomial_interval
 from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.dataset import CRITICALITIES
+from pipeline.analysis.outcomes import share_interval
 from pipeline.explorer.colours import rgb
 from pipeline.explorer.explored import ExploredRun
-from pipeline.explorer.orbits import finite
+from pipeline.explorer.orbits import finite, shown
 from pipeline.explorer.verticals import vertical
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import BRANCH, CLOSED_ORBIT, FREQUENCY_DIM, model_of
-from pipeline.layout.vocabulary import KINDS as ATTRACTOR_KINDS
+from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, PERIODIC_ORBIT, model_of
 from pipeline.layout.words import periods_of
 from pipeline.plots import palette
 from pipeline.plots.branches import NAMES, SHORT, pieces
@@ -105,8 +104,7 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
     if found is None:
         return
     cast = palette.cast_of(found)
-    part = found[["share", "n_cells", "lyapunov_max", "kind"]].isel(place)
-    n_starts = math.prod(found.sizes[d] for d in run.start_dims)
+    part = found[["share", "n_cells", "lyapunov_max", "kind", "stability"]].isel(place)
     walked = BRANCH in run.start_dims
     for number in range(part.sizes["attractor"]):
         one = part.isel(attractor=number)
@@ -120,10 +118,12 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
                 "name": f"exponent {letter(number)}", "title": f"largest exponent of {name}", "unit": "1/s",
                 "group": "exponents", "colour": colour, "attractor": number, "y": exponent,
             }  # fmt: skip
-        shares: dict[str, Any] = {"y": np.atleast_1d(one["share"].values)}
+        share = np.atleast_1d(one["share"].values)
+        if not (np.atleast_1d(one["stability"].values) == ATTRACTS).any():
+            continue
+        shares: dict[str, Any] = {"y": share}
         if not walked:  # walks are no sample of initial states: their shares have no interval
-            counts = np.atleast_1d(one["n_cells"].values)
-            low, high = binomial_interval(counts, n_starts)
+            low, high = share_interval(np.atleast_1d(one["n_cells"].values), share)
             shares |= {"low": low, "high": high}
         yield {
             "name": f"share {letter(number)}", "title": f"share of {name}", "unit": "1", "group": "fractions",
@@ -244,7 +244,7 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
 
 
 def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return the attractors that coexist at a parameter point, the largest share first.
+    """Return the attractors that coexist at a parameter point, the largest share first, then its other sets.
 
     Parameters
     ----------
@@ -281,19 +281,18 @@ def _attractor(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cas
     points = one["attractor_points"].transpose("point", "state").values
     points = points[np.isfinite(points).all(axis=1)][:MOST_SECTION]
     multipliers = one["multiplier_real"].values + 1j * one["multiplier_imag"].values
-    closed = int(one["kind"]) == CLOSED_ORBIT and np.isfinite(multipliers).all()
-    n_starts = math.prod(run.plan.shape[run.plan.dims.index(d)] for d in run.start_dims)
+    closed = int(one["kind"]) == PERIODIC_ORBIT and np.isfinite(multipliers).all()
     count = int(one["n_cells"])
     interval: tuple[float | None, float | None] = (None, None)
     if BRANCH not in run.start_dims:
-        low, high = binomial_interval(np.array([count]), n_starts)
-        interval = (float(low[0]), float(high[0]))
+        low, high = share_interval(np.array([count]), np.array([float(one["share"])]))
+        interval = (finite(low[0]), finite(high[0]))
     exponent = finite(one["lyapunov_max"])
     return {
         "id": number,
         "name": cast.names[number],
         "letter": letter(number),
-        "kind": ATTRACTOR_KINDS[int(one["kind"])].replace("_", " "),
+        **shown(one),
         "period": int(one["orbit_period"]) or None,
         "period_s": finite(one["period_s"]),
         "periods": periods_of(run.model),
@@ -303,7 +302,6 @@ def _attractor(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cas
         "high": interval[1],
         "n_starts": count,
         "colour": rgb(cast.colours[number]),
-        "stable": None if int(one["is_stable"]) < 0 else bool(one["is_stable"]),
         "multipliers": [[float(m.real), float(m.imag)] for m in multipliers] if closed else None,
         "exponents": None if exponent is None else [exponent],
         "section": points.tolist(),

@@ -16,7 +16,6 @@ from magpend_core.models.parameters import Parameters
 from magpend_core.status import Status
 from pipeline.analysis.attractors.cells import Block
 from pipeline.analysis.attractors.orbits import RUN_ON_RTOL, RUN_ON_TOLERANCE
-from pipeline.analysis.attractors.spirals import RUN_ON_LEGS
 from pipeline.explorer.messages import RequestError
 from pipeline.spec.tables import Integration
 
@@ -221,6 +220,9 @@ def taken(block: Block, rows: np.ndarray) -> Block:
         block.turns[rows], rest,
     )  # fmt: skip
 
+
+RUN_ON_LEGS = 32
+"""How long cells that come back near are run on, in legs of `RUN_ON_LEG` periods."""
 
 RUN_ON_LEG = 64
 """Periods between two looks at cells that are run on."""

@@ -127,6 +127,9 @@ def _branches(run: ExploredRun, asked: Asked) -> xr.Dataset:
     return _of_rows(rows, names).assign_attrs(_place(run, x, asked["at"]))
 
 
+_SHOWN = ("kind", "stability", "evidence")
+
+
 def _orbit(run: ExploredRun, asked: Asked) -> xr.Dataset:
     arrays, attrs = unpack_arrays(orbit(run, _needed(asked, "cell"), _needed(asked, "point")))
     ds = xr.Dataset({"time": ("row", arrays["time"], {"units": "s"})})
@@ -134,7 +137,7 @@ def _orbit(run: ExploredRun, asked: Asked) -> xr.Dataset:
         ds[state.name] = ("row", arrays["states"][:, k], {"units": state.unit})
     for k, quantity in enumerate(run.model.quantities):
         ds[quantity.name] = ("row", arrays["quantities"][:, k], {"units": quantity.unit})
-    plain = ("cell", "point", "frequency", "status", "period", "motion", "attractor")
+    plain = ("cell", "point", "frequency", "status", "period", "motion", "attractor", *_SHOWN)
     return ds.assign_attrs(
         {key: attrs[key] for key in plain if attrs[key] is not None}
         | {f"parameter_{name}": value for name, value in attrs["parameters"].items()}
@@ -162,16 +165,19 @@ def _plane(run: ExploredRun, asked: Asked) -> xr.Dataset:
     return ds.assign_attrs({**_place(run, "", asked["at"]), **fixed})
 
 
+_OF_SET = ("id", "name", *_SHOWN, "period", "motion", "share", "low", "high")
+
+
 def _attractors(run: ExploredRun, asked: Asked) -> xr.Dataset:
     states = run.model.state_names
     rows = []
     for one in attractors(run, asked["at"])["attractors"]:
-        plain = {key: one[key] for key in ("id", "name", "kind", "period", "motion", "share", "low", "high")}
+        plain = {key: one[key] for key in _OF_SET}
         rows += [
             {**plain, "point": k, **dict(zip(states, row, strict=True))}
             for k, row in enumerate(one["section"])
         ]
-    names = ("id", "name", "kind", "period", "motion", "share", "low", "high", "point", *states)
+    names = (*_OF_SET, "point", *states)
     return _of_rows(rows, names).assign_attrs(_place(run, "", asked["at"]))
 
 

@@ -30,9 +30,23 @@ FREQUENCY_DIM = "frequency"
 BRANCH, START = "branch", "initial_condition"
 """Dims of a continuation's walks, and of starts that are no grid."""
 
-KINDS = ("absent", "closed_orbit", "bounded_set", "equilibrium")
-ABSENT, CLOSED_ORBIT, BOUNDED_SET, EQUILIBRIUM = range(len(KINDS))
+KINDS = ("absent", "equilibrium", "periodic_orbit", "torus", "chaotic_set", "bounded_set")
+ABSENT, EQUILIBRIUM, PERIODIC_ORBIT, TORUS, CHAOTIC_SET, BOUNDED_SET = range(len(KINDS))
 """Values of `kind`, see `pipeline.analysis.attractors`."""
+
+APERIODIC = (TORUS, CHAOTIC_SET, BOUNDED_SET)
+"""Kinds of sets that sections fill without closing."""
+
+STABILITIES = ("absent", "attracts", "unstable", "transient", "not_settled", "neutral")
+_, ATTRACTS, UNSTABLE, TRANSIENT, NOT_SETTLED, NEUTRAL = range(len(STABILITIES))
+"""Values of `stability`: what has been shown of a set; see `pipeline.analysis.attractors.stability`."""
+
+EVIDENCE = ("none", "eigenvalues", "multipliers", "approach", "stayed", "left", "volume")
+"""Values of `evidence`: what the stability of a set rests on."""
+
+DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "extended", "at_rest", "diverges")
+UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES = range(len(DECISIONS))
+"""How a cell was decided: values of `decision`."""
 
 PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED, NO_RETURN = Status
 

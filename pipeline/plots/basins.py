@@ -11,8 +11,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
+from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.vocabulary import CLOSED_ORBIT, INFERRED, grid_dim, model_of
+from pipeline.layout.vocabulary import INFERRED, PERIODIC_ORBIT, grid_dim, model_of
 from pipeline.layout.words import periods_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
@@ -51,8 +52,9 @@ def plot_basins(
     Returns
     -------
     DataFigure
-        Cells without an attractor are grey. The legend gives each basin's share of the
-        cells drawn. Its `data` hold ``attractor_id`` and ``status`` of these, and ``n_periods`` if drawn.
+        Cells that end on no attractor are grey, with the reason. The legend gives each basin's share of the
+        cells drawn. Its `data` hold ``attractor_id``, ``status`` and ``outcome`` of these, and
+        ``n_periods`` if drawn.
 
     Raises
     ------
@@ -63,11 +65,12 @@ def plot_basins(
     axes = _axes(attractors, at)
     part = choose(attractors, at, axes, f"an image of basins has the axes {' and '.join(axes)}")
     data = part[["attractor_id", "status"]].transpose(*reversed(axes))
+    data["outcome"] = outcomes(part).transpose(*reversed(axes)).assign_attrs(units="1", long_name="outcome")
     if n_periods is not None:
         times = choose(n_periods.to_dataset(name="attractor_id"), at, axes, "an image has two axes")
         data["n_periods"] = times["attractor_id"].transpose(*reversed(axes))
     cast = palette.cast_of(attractors, part)
-    codes, counts = _codes(data, cast)
+    codes, counts = _codes(data, part, axes, cast)
     fig, ax = palette.new_panel(_stored(data, part, cast), _entries(cast, counts, codes.size), frame, 4.7)
     scale = _scale(data, part)
     ax.imshow(
@@ -119,21 +122,26 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
     return chosen[0], chosen[1]
 
 
-def _codes(data: xr.Dataset, cast: palette.Cast) -> tuple[np.ndarray, dict[int, int]]:
+def _codes(
+    data: xr.Dataset, part: xr.Dataset, axes: tuple[str, str], cast: palette.Cast
+) -> tuple[np.ndarray, dict[int, int]]:
     """Code of each cell (id, or `_OTHERS`, or a grey from `_FIRST_GREY` down), and cells of each code."""
-    ids, status = data["attractor_id"].values, data["status"].values
+    ids, dims = np.maximum(data["outcome"].values, -1), part["attractor_id"].dims
     table = np.full(len(cast.names) + 1, _OTHERS, np.int32)
     table[list(cast.main)] = cast.main
     codes = table[ids]
-    for k, chosen in enumerate(palette.UNASSIGNED.values()):
-        codes[(ids < 0) & np.isin(status, chosen)] = _FIRST_GREY - k
+    others = palette.other_cells(part)
+    for k, name in enumerate(palette.GREYS):
+        if name in others:
+            which = xr.DataArray(others[name], dims=dims).transpose(*reversed(axes))
+            codes[which.values] = _FIRST_GREY - k
     found, counts = np.unique(codes, return_counts=True)
     return codes, dict(zip(found.tolist(), counts.tolist(), strict=True))
 
 
 def _colour_table(cast: palette.Cast) -> np.ndarray:
     """RGB by code, shape (codes, 3): ids first, so that negative codes index from the end."""
-    greys = [palette.GREYS[name] for name in reversed(palette.UNASSIGNED)]
+    greys = list(reversed(palette.GREYS.values()))
     colours = [*(cast.colours[i] for i in range(len(cast.names))), *greys, palette.OTHERS]
     return np.array([to_rgb(c) for c in colours], dtype=np.float32)
 
@@ -153,8 +161,9 @@ def _painted(
 
 def _timed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
     """Integrated cells on closed orbits: the time that others took is no time to converge."""
-    closed = np.append(part["kind"].values == CLOSED_ORBIT, False)
-    return np.asarray(closed[data["attractor_id"].values] & (data["status"].values != INFERRED))
+    closed = np.append(part["kind"].values == PERIODIC_ORBIT, False)
+    ids = np.maximum(data["outcome"].values, -1)
+    return np.asarray(closed[ids] & (data["status"].values != INFERRED))
 
 
 def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
@@ -201,7 +210,7 @@ def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[
     if _OTHERS in counts:
         n = len(cast.names) - len(cast.main)
         entries.append((f"{n} others, {palette.percent(counts[_OTHERS] / total)}", palette.OTHERS))
-    for k, name in enumerate(palette.UNASSIGNED):
+    for k, name in enumerate(palette.GREYS):
         if (code := _FIRST_GREY - k) in counts:
             entries.append((f"{name}, {palette.percent(counts[code] / total)}", palette.GREYS[name]))
     return entries

@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 
 from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.letters import letter
+from pipeline.layout.vocabulary import ATTRACTS, STABILITIES
 from pipeline.plots import labels, palette, style
 from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
 from pipeline.plots.fractions import swept_parameter
@@ -54,8 +55,9 @@ def plot_coexisting(
     DataFigure
         In a sweep the area of the points of an attractor shares out its basin fraction. In a
         continuation in both directions small dark points are met upwards, large light ones downwards.
-        A bounded set is drawn by the points of it that are stored. Its `data` hold ``value`` and what
-        decides the look of each point: ``share``, or ``present`` for each direction.
+        A set that does not close is drawn by the points of it that are stored. Where a set does not attract,
+        it is drawn in small grey points. Its `data` hold ``value`` and what decides the look of each point:
+        ``stability`` and ``share``, or ``present`` for each direction.
 
     Raises
     ------
@@ -76,6 +78,7 @@ def plot_coexisting(
         ax.axvspan(low, high, gid="loop", zorder=0.5, **_SPAN)
     for number in sorted(range(len(cast.names)), key=lambda i: float(data["share"].isel(attractor=i).sum())):
         (_draw_directions if both else _draw_weighted)(ax, data.isel(attractor=number), parameter, cast)
+    _draw_others(ax, data, parameter)
     ax.margins(y=0.05)
     style.limits(ax, frame, style.span(data[parameter].values))
     labels.angle_ticks(ax, measure)
@@ -93,6 +96,7 @@ def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> xr.Dat
         {
             "value": shown.assign_attrs(units=measure.unit, long_name=f"{measure.name} at the section"),
             "share": part["share"].transpose(parameter, "attractor"),
+            "stability": part["stability"].transpose(parameter, "attractor"),
         }
     )
     if "branch" in part["attractor_id"].dims and "direction" in part.coords:
@@ -146,6 +150,23 @@ def _draw_weighted(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast
     )  # fmt: skip
 
 
+def _draw_others(ax: Axes, data: xr.Dataset, parameter: str) -> None:
+    """Draw sets where they do not attract, in the grey of what they are."""
+    for code, grey in palette.GREY_OF.items():
+        chosen = (data["stability"].values == code)[..., None] & np.isfinite(data["value"].values)
+        row, *_ = np.nonzero(chosen)
+        if row.size:
+            x, y = data[parameter].values[row].astype(np.float64), data["value"].values[chosen]
+            ax.plot(
+                x, y, linestyle="none", marker="o", markersize=_UP_PT, markeredgewidth=0.0, color=grey,
+                zorder=1.5, rasterized=True, gid=f"points:{_word(code)}",
+            )  # fmt: skip
+
+
+def _word(stability: int) -> str:
+    return STABILITIES[stability].replace("_", " ")
+
+
 def _diameter(share: Any) -> Any:
     """Diameter of a point [pt]: its area grows with the basin fraction that falls to it."""
     return np.sqrt(_LEAST_PT**2 + _GROWTH_PT**2 * np.asarray(share))
@@ -155,7 +176,7 @@ def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Ca
     """Draw large light points below small dark ones, so that both are seen where they coincide."""
     number = int(one["attractor"])
     for word in one["direction"].values[::-1]:
-        chosen = one["present"].sel(direction=word).values > 0
+        chosen = (one["present"].sel(direction=word).values > 0) & (one["stability"].values == ATTRACTS)
         x, y, _ = _spread(one, parameter, chosen)
         up = word == "up"
         ax.plot(
@@ -168,10 +189,12 @@ def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Ca
 def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> list[palette.Entry]:
     total = data["share"].values.sum(axis=0)
     ranked = sorted((i for i in cast.main if total[i] > 0), key=lambda i: (-total[i], i))
+    met = {int(code) for code in np.unique(data["stability"].values)}
     entries: list[palette.Entry] = [(cast.names[i], cast.colours[i]) for i in ranked]
     rest = sum(total[i] > 0 for i in cast.names if i not in cast.main)
     if rest:
         entries.append((f"{rest} others", palette.OTHERS))
+    entries += [(_word(code), grey) for code, grey in palette.GREY_OF.items() if code in met]
     if both:
         entries += [style.dot("up", "0.0", _UP_PT), style.dot("down", style.tinted("0.0", _TINT), _DOWN_PT)]
     else:

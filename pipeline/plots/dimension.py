@@ -80,7 +80,9 @@ def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
     others = [d for d in ds["n_points"].dims if d != "attractor"]
     cells = ds["n_cells"].where(ds["n_points"] > 0, 0).sum(others)
     if not int(cells.max() if cells.size else 0):
-        raise ValueError("there is no correlation sum to draw: no bounded set stays at this point")
+        raise ValueError(
+            "there is no correlation sum to draw: no attractor at this point is without a period"
+        )
     return ds.isel(attractor=int(cells.values.argmax()))
 
 

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import binomial_interval
+from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.letters import letter
 from pipeline.plots import labels, palette, style
@@ -95,12 +96,12 @@ def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what
 def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Dataset:
     """Share of each attractor and of each kind of cell without one, per value of the parameter."""
     n = part.sizes[parameter]
-    ids = part["attractor_id"].transpose(parameter, ...).values.reshape(n, -1)
-    status = part["status"].transpose(parameter, ...).values.reshape(n, -1)
-    kinds = list(palette.UNASSIGNED)
+    ids = outcomes(part).transpose(parameter, ...).values.reshape(n, -1)
+    kinds, others = list(palette.GREYS), palette.other_cells(part)
     codes = ids.astype(np.int64)
-    for k, chosen in enumerate(palette.UNASSIGNED.values()):
-        codes[(ids < 0) & np.isin(status, chosen)] = len(cast.names) + k
+    for k, name in enumerate(kinds):
+        if name in others:
+            codes[others[name].reshape(n, -1)] = len(cast.names) + k
     width = len(cast.names) + len(kinds)
     counts = np.array([np.bincount(row, minlength=width) for row in codes])
     labels = [*(letter(i) for i in range(len(cast.names))), *kinds]
@@ -162,7 +163,7 @@ def _bands(data: xr.Dataset, cast: palette.Cast) -> list[_Band]:
     bands = [_Band(cast.names[i], cast.colours[i], share[:, i], i) for i in own]
     if rest:
         bands.append(_Band(f"{len(rest)} others", palette.OTHERS, share[:, rest].sum(axis=1)))
-    for k, name in enumerate(palette.UNASSIGNED):
+    for k, name in enumerate(palette.GREYS):
         if share[:, n + k].any():
             bands.append(_Band(name, palette.GREYS[name], share[:, n + k]))
     return bands

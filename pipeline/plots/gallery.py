@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import model_of, parameters_of, told_by
+from pipeline.layout.vocabulary import ATTRACTS, model_of, parameters_of, told_by
 from pipeline.layout.words import once
 from pipeline.plots import labels, palette, style
 from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
@@ -43,7 +43,8 @@ def plot_gallery(
     DataFigure
         Lines are the motion, dots its section. The portrait of an angle that turns over is
         drawn on the circle, from -pi to pi. The `MAX_ROWS` attractors with the largest share are
-        drawn, in the order of their ids. Its `data` are the portraits of these.
+        drawn, in the order of their ids; where there are fewer, also sets that do not attract, in grey. Its
+        `data` are the portraits of these.
 
     Raises
     ------
@@ -131,12 +132,13 @@ def _draw_one(
     motion = Motion(
         {name: one["orbit"].sel(state=name).values for name in model.state_names},
         {name: one["attractor_points"].sel(state=name).values for name in model.state_names},
-        cast.colours[number], letter(number),
+        palette.GREY_OF.get(int(one["stability"]), cast.colours[number]), letter(number),
     )  # fmt: skip
     axes = [layout.axes(fig, k, column) for column in range(layout.each)]
-    share = palette.percent(float(one["share"]))
+    attracts = int(one["stability"]) == ATTRACTS
+    share = f", share {palette.percent(float(one['share']))}" if attracts else ""
     axes[0].text(
-        0.0, 1.04, f"{cast.names[number]}, {share} of the cells", transform=axes[0].transAxes,
+        0.0, 1.04, f"{cast.names[number]}{share}", transform=axes[0].transAxes,
         fontsize=fig.look.legend, va="bottom",
     )  # fmt: skip
     for ax, pair in zip(axes, model.portraits, strict=False):
@@ -162,7 +164,7 @@ def _head(fig: style.DataFigure, data: xr.Dataset, portraits: xr.Dataset, n: int
     text = labels.caption(portraits.assign_attrs(data.attrs), with_start=False)
     if (rest := n - data.sizes["attractor"]) > 0:
         share = palette.percent(float(portraits["share"].sum() - data["share"].sum()))
-        text += f"; {rest} more attractors, {share} of the cells, are not shown"
+        text += f"; {rest} more sets, with a share of {share}, are not shown"
     size = fig.look.legend
     room = width - 0.2 if fig.frame.compact else 0.62 * width
     fig.text(0.08 / width, 1.0 - 0.06 / height, style.folded(text, room, size), fontsize=size, va="top")

@@ -20,9 +20,23 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.layout import vocabulary
+from pipeline.analysis import outcomes
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import BOUNDED_SET, CLOSED_ORBIT, EQUILIBRIUM, model_of
+from pipeline.layout.vocabulary import (
+    ABSENT,
+    ATTRACTS,
+    BOUNDED_SET,
+    CHAOTIC_SET,
+    EQUILIBRIUM,
+    NEUTRAL,
+    NOT_SETTLED,
+    PERIODIC_ORBIT,
+    STABILITIES,
+    TORUS,
+    TRANSIENT,
+    UNSTABLE,
+    model_of,
+)
 from pipeline.plots import style
 
 COLOURS = (
@@ -31,30 +45,49 @@ COLOURS = (
 )  # fmt: skip
 OTHERS = "#C8E6C0"
 
-UNASSIGNED: dict[str, tuple[int, ...]] = {
-    "undecided": (vocabulary.PERIODIC, vocabulary.BOUNDED, vocabulary.INFERRED),
-    "diverged": (vocabulary.DIVERGED,),
-    "failed": tuple(code for code in vocabulary.FAILED if code != vocabulary.NO_RETURN),
-    "no return": (vocabulary.NO_RETURN,),
-    "pending": (vocabulary.PENDING,),
-}
-"""What a cell without an attractor is called, by its status."""
+GREYS = {
+    "not settled": "0.7", "on a transient set": "0.82", "on an unstable orbit or equilibrium": "#6b5d4f",
+    "on a neutral set": "#acbfd2", "diverged": "0.0", "failed": "0.45", "no return": "0.17",
+    "pending": "0.95",
+}  # fmt: skip
+"""Cells that do not end on an attractor, with their greys; see `pipeline.analysis.outcomes`.
 
-GREYS = {"undecided": "0.75", "diverged": "0.0", "failed": "0.45", "no return": "0.17", "pending": "0.95"}
+Two are tinted: between twelve colours there are not eight greys that can be told apart.
+"""
+
+SETS = {
+    "not settled": NOT_SETTLED, "on a transient set": TRANSIENT,
+    "on an unstable orbit or equilibrium": UNSTABLE, "on a neutral set": NEUTRAL,
+}  # fmt: skip
+"""Stability of the sets that such cells are on."""
+
+GREY_OF = {code: GREYS[name] for name, code in SETS.items()}
+"""Grey of a set that does not attract, by its stability."""
+
+_FAILED = ("step limit", "step underflow", "unreached")
+
+
+def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
+    """Cells that do not end on an attractor by the names of `GREYS`, on parameter dims, then start dims."""
+    found: dict[str, np.ndarray] = {}
+    for name, which in outcomes.other_cells(part).items():
+        own = "failed" if name in _FAILED else name
+        found[own] = found.get(own, np.zeros(which.shape, bool)) | which
+    return found
 
 
 @dataclass(frozen=True)
 class Cast:
-    """The attractors of a dataset as figures show them.
+    """The sets of a dataset as figures show them.
 
     Attributes
     ----------
     colours : dict
-        Colour by id.
+        Colour by id; of a set that attracts nowhere the grey of its stability.
     names : dict
         Name by id, such as ``A: period 1, left``.
     main : tuple of int
-        Ids with a colour of their own.
+        Ids with a colour of their own: attractors.
     """
 
     colours: dict[int, str]
@@ -62,13 +95,8 @@ class Cast:
     main: tuple[int, ...]
 
 
-def colour_of(attractors: xr.Dataset) -> dict[int, str]:
-    """Colour by id, for tables and other figures of the same run; see `cast_of`."""
-    return cast_of(attractors).colours
-
-
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
-    """Give the attractors of a dataset their colours and names.
+    """Give the sets of a dataset their colours and names.
 
     Parameters
     ----------
@@ -78,23 +106,43 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     part
         What the names are to describe; by default all of it.
     """
-    cells = attractors["n_cells"].sum([d for d in attractors["n_cells"].dims if d != "attractor"]).values
-    ranked = np.lexsort((np.arange(cells.size), -cells))[: len(COLOURS)].tolist()
-    colours = {**dict.fromkeys(range(cells.size), OTHERS), **dict(zip(ranked, COLOURS, strict=False))}
+    dims = [d for d in attractors["n_cells"].dims if d != "attractor"]
+    attracts = attractors["stability"] == ATTRACTS
+    cells = attractors["n_cells"].where(attracts, 0).sum(dims).values
+    own = np.flatnonzero(attracts.any(dims).values)
+    ranked = own[np.lexsort((own, -cells[own]))][: len(COLOURS)].tolist()
+    colours = {i: _grey_of(attractors["stability"].isel(attractor=i)) for i in range(cells.size)}
+    colours |= dict.fromkeys(own.tolist(), OTHERS) | dict(zip(ranked, COLOURS, strict=False))
     described = attractors if part is None else part
     names = {i: f"{letter(i)}: {describe(described.isel(attractor=i))}" for i in range(cells.size)}
     return Cast(colours, names, tuple(sorted(ranked)))
 
 
+def _grey_of(stability: xr.DataArray) -> str:
+    """Grey of a set that attracts nowhere: that of what it is most often."""
+    codes = stability.values[np.isin(stability.values, list(GREY_OF))]
+    return GREY_OF[int(np.bincount(codes).argmax())] if codes.size else OTHERS
+
+
 def describe(one: xr.Dataset) -> str:
-    """Describe an attractor: its periods and motions where it is present, and its turns if it rotates."""
+    """Describe a set: periods or kinds, motions, turns if it rotates, and its stability unless it attracts.
+
+    It is described where it is present.
+    """
     present = one["kind"].values.ravel() > 0
     if not present.any():
         return "absent"
     words = _words(one, one["side"].values.ravel()[present]) if "side" in one else ""
     kinds, periods = (one[name].values.ravel()[present] for name in ("kind", "orbit_period"))
     told = _periods(periods, kinds, model_of(one).autonomous) + _seconds(one)
-    return style.join([told, (words + _turns(one, present)).lstrip("\u00a0")])
+    return style.join([told, (words + _turns(one, present)).lstrip("\u00a0"), _stability(one)])
+
+
+def _stability(one: xr.Dataset) -> str:
+    """What has been shown of a set that does not attract everywhere."""
+    found = sorted({int(code) for code in one["stability"].values.ravel()} - {ABSENT, ATTRACTS})
+    words = " or ".join(STABILITIES[code].replace("_", " ") for code in found)
+    return f"{words} in parts" if words and (one["stability"].values == ATTRACTS).any() else words
 
 
 def _seconds(one: xr.Dataset) -> str:
@@ -115,7 +163,9 @@ def _periods(periods: np.ndarray, kinds: np.ndarray, is_flow: bool) -> str:
         listed = ", ".join(map(str, closed)) if len(closed) < 4 else f"{closed[0]} to {closed[-1]}"
         parts.append(f"period {listed}")
     for kind, text in (
-        (CLOSED_ORBIT, "limit cycle" if is_flow else "not periodic"),
+        (PERIODIC_ORBIT, "limit cycle" if is_flow else "not periodic"),
+        (TORUS, "quasi-periodic"),
+        (CHAOTIC_SET, "chaotic"),
         (BOUNDED_SET, "not periodic"),
         (EQUILIBRIUM, "at rest"),
     ):

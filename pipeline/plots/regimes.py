@@ -14,10 +14,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex, to_rgb
 from matplotlib.lines import Line2D
 
-from pipeline.analysis.basins.basins import outcomes
-from pipeline.analysis.basins.numbers import basin_fractions, binomial_interval
+from pipeline.analysis.basins.numbers import basin_fractions
+from pipeline.analysis.outcomes import outcomes, share_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.letters import letter
+from pipeline.layout.vocabulary import ATTRACTS
 from pipeline.plots import labels, palette, style
 from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import RegimeOptions
@@ -183,7 +184,7 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 
 def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
     """Regime of each point, the most frequent first."""
-    present = part["kind"].transpose(y, x, "attractor").values > 0
+    present = part["stability"].transpose(y, x, "attractor").values == ATTRACTS
     periods = part["orbit_period"].transpose(y, x, "attractor").values
     values = np.empty(present.shape[:2], object)
     for index in np.ndindex(values.shape):
@@ -192,7 +193,7 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
     names = sorted(counts, key=lambda name: (-counts[name], name))
     if show == "number":
         names.sort(key=int)
-    without = (part["attractor_id"] < 0).mean(start_dims(part)).transpose(y, x)
+    without = (outcomes(part) < 0).mean(start_dims(part)).transpose(y, x)
     number = {name: i for i, name in enumerate(names)}
     regime = np.array([number[label] for label in values.ravel()], np.int32).reshape(values.shape)
     attrs = {"units": "1", "long_name": "regime, an index of label"}
@@ -234,11 +235,13 @@ def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
     """Share of each attractor, its interval, and the bound on what was not seen."""
     dims = (y, x, "attractor")
     share = part["share"].transpose(*dims).values
-    numbers: dict[str, Any] = {"share": (dims, share, {"units": "1", "long_name": "share of all cells"})}
+    numbers: dict[str, Any] = {
+        "share": (dims, share, {"units": "1", "long_name": "share of the cells with an outcome"})
+    }
     if "branch" in start_dims(part):
         return numbers
     fractions = basin_fractions(outcomes(part), dims=start_dims(part), ids=part["attractor"].values.tolist())
-    low, high = binomial_interval(part["n_cells"].transpose(*dims).values, fractions["n_cells"].max().item())
+    low, high = share_interval(part["n_cells"].transpose(*dims).values, share)
     unseen = fractions["unseen_high"].transpose(y, x).values
     return numbers | {
         "low": (dims, low, {"units": "1", "long_name": "95 % interval of the share, low end"}),

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model
+from pipeline.analysis.outcomes import outcomes
 from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.layout.words import section_name
 from pipeline.plots import labels, palette, pixels, style
@@ -152,17 +153,19 @@ def _handles(view: View, found: set[int]) -> list[Any]:
 
 
 def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
-    """Colour points by the attractor of their cell; code 0 is a cell without one."""
+    """Colour points by the attractor that their cell ends on; other cells have the grey of what they are."""
     chosen = attractors
     for dim in split_dims(attractors["attractor_id"])[0]:
         chosen = chosen.sel({dim: float(part[dim])})
     cast = palette.cast_of(attractors, chosen)
-    ids = sorted(cast.names)
+    ids, greys = sorted(cast.names), list(palette.GREYS)
     motions = Motions(
-        ("no attractor", *(cast.names[i] for i in ids)), (style.GREY, *(cast.colours[i] for i in ids)),
-        (*(i + 1 for i in ids), 0),
+        (*greys, *(cast.names[i] for i in ids)), (*palette.GREYS.values(), *(cast.colours[i] for i in ids)),
+        (*(i + len(greys) for i in ids), *range(len(greys))),
     )  # fmt: skip
-    codes = (chosen["attractor_id"].clip(-1) + 1).astype(np.int32)
+    codes = outcomes(chosen).transpose(*split_dims(chosen["status"])[1]).astype(np.int32) + len(greys)
+    for name, which in palette.other_cells(chosen).items():
+        codes = codes.where(~which, greys.index(name))
     marked = part.assign_coords(_kind=(codes.dims, codes.values))
     return replace(view, ds=marked, motions=motions)
 

@@ -1,6 +1,8 @@
-"""Attractors, where going up and down differ, and which bounded sets stay."""
+"""Attractors, where going up and down differ, and which sets stay."""
 
 from __future__ import annotations
+
+from typing import Self
 
 from pipeline.products.product import Analysis, Options, option
 
@@ -19,17 +21,29 @@ class IdentifyOptions(Options):
     polish: bool = option(True, "Refine orbits by Newton's method, which integrates a point per orbit.")
     residual: float = option(1e-10, "Scaled residual that Newton's method is to reach.", gt=0.0)
     max_orbit_period: int = option(
-        16, "Longest period guessed for cells that are not closed.", unit="drive periods or returns", ge=1
+        32, "Longest period looked for in cells that are not closed.", unit="drive periods or returns", ge=1
     )
     n_points: int = option(64, "Section points stored per attractor.", ge=1)
     mirror_threshold: float = option(0.3, "Largest distance of a mirror partner from the image.", gt=0.0)
-    rule_box: float = option(0.1, "Bounded sets: scaled side of the boxes that are compared.", gt=0.0)
-    rule_same_share: float = option(0.5, "Bounded sets: least share of boxes in common.", gt=0.0, le=1.0)
-    rule_rotation: float = option(
-        0.2, "Bounded sets: largest difference of rotation.", unit="turns per period", ge=0.0
+    extend: bool = option(
+        True, "Extend samples of the cells that no orbit accounts for, to show what they are on."
     )
-    rule_n_anchors: int = option(192, "Bounded sets: cells compared with each other in a round.", ge=1)
-    rule_n_rounds: int = option(4, "Bounded sets: rounds.", ge=1)
+    budget: float = option(
+        1.0,
+        "Longest extension at a parameter point, in units of what the run itself integrated there.",
+        ge=0.0,
+    )
+    n_sample: int = option(32, "Cells of the first sample that is extended.", ge=1)
+    lifetime_confidence: float = option(0.95, "Level of the intervals of lifetimes.", gt=0.0, lt=1.0)
+
+    @property
+    def effort(self) -> float:
+        """Budget of the extension, 0 without one: of two results that differ in it, the larger knows more."""
+        return self.budget if self.extend else 0.0
+
+    def with_effort(self, effort: float) -> Self:
+        """Return the same options with another budget of the extension."""
+        return self.model_copy(update={"extend": effort > 0.0, "budget": effort or self.budget})
 
 
 class AttractorOptions(IdentifyOptions):
@@ -43,16 +57,6 @@ class AttractorOptions(IdentifyOptions):
     )
 
 
-class SettlingOptions(AttractorOptions):
-    """How bounded sets are run on."""
-
-    n_sample: int = option(32, "Cells of each bounded set that are run on.", ge=1)
-    n_periods: int = option(1024, "Time that they are run on.", unit="drive periods or returns", ge=1)
-    confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
-    rtol: float = option(0.0, "Relative tolerance; 0 takes that of the run.", ge=0.0)
-    atol: float = option(0.0, "Absolute tolerance; 0 takes that of the run.", ge=0.0)
-
-
 IDENTIFIED = Analysis(
     "identified",
     "Attractors of each parameter point by itself.",
@@ -62,10 +66,11 @@ IDENTIFIED = Analysis(
 
 ATTRACTORS = Analysis(
     "attractors",
-    """Find the attractors at every parameter point, and follow them along the axes.
+    """Find the attractors at every parameter point, show that they attract, and follow them along the axes.
 
     A table per parameter point, or with more than six points a line per attractor with the range in
-    which it exists. Shares are those of the cells whose outcome is known, with 95 % intervals.""",
+    which it exists. Cells that no orbit accounts for are extended, at most for as long as the run took.
+    Shares are those of the cells that end on attractors, with 95 % intervals.""",
     AttractorOptions,
     compute=f"{_ROOM}:attractors",
     table="pipeline.analysis.attractors.table:attractors_table",
@@ -86,10 +91,11 @@ HYSTERESIS = Analysis(
 
 SETTLING = Analysis(
     "settling",
-    """Run a sample of every bounded set on: does it stay, or was it a transient, and where does it go?
+    """Print what was shown of each set that does not close: does it stay, or do its cells leave, where to?
 
-    This integrates, for minutes if there are many sets. Lifetimes are in drive periods or returns.""",
-    SettlingOptions,
+    With --budget a larger sample of it is integrated for longer; what is found then holds for all analyses of
+    the run. Lifetimes are in drive periods or returns.""",
+    AttractorOptions,
     compute="pipeline.analysis.attractors.settling_product:settling",
     table="pipeline.analysis.attractors.settling_table:settling_table",
     builds_on=("attractors",),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.products.attractors import AttractorOptions, SettlingOptions
+from pipeline.products.attractors import AttractorOptions
 from pipeline.products.product import Analysis, option
 
 _ROOM = "pipeline.analysis.chaos.product"
@@ -23,7 +23,7 @@ class ChaosOptions(AttractorOptions):
     )
 
 
-class DimensionOptions(SettlingOptions):
+class DimensionOptions(AttractorOptions):
     """How a correlation dimension is fitted."""
 
     at: dict[str, float] = option({}, "Value of a swept parameter; by default all its values.")

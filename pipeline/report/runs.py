@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.tabular import axis_ranges, distinct, number
 from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
@@ -51,8 +52,8 @@ _CAPTIONS = {
     "branches": "Located bifurcations",
     "curves": "Curves of bifurcations",
     "chaos": "What kind of motion each attractor is",
-    "dimension": "Correlation dimensions of the bounded sets that stay",
-    "settling": "Bounded sets that were run on",
+    "dimension": "Correlation dimensions of the attractors that do not close",
+    "settling": "Sets that do not close, and what their extended cells showed",
 }
 
 
@@ -203,12 +204,11 @@ def _attractors(shown: Shown) -> Iterator[Block]:
         yield Note(str(error))
         return
     command = command_of("analyse attractors", options, shown.directory)
-    rows = list(function_of(ANALYSES["attractors"].table)(found).rows)
-    yield Grid(
-        *_attractor_grid(found, rows, shown.axes),
-        f"{len({r['attractor_id'] for r in rows})} attractors",
-        command,
-    )
+    table, told = function_of(ANALYSES["attractors"].table)(found), sentence(found)
+    rows = list(table.rows)
+    yield Grid(*_attractor_grid(found, rows, shown.axes), _counted(rows, told), command)
+    for remark in table.lines[table.lines.index(told) + 1 :]:
+        yield Note(f"{remark[:1].upper()}{remark[1:]}.")
     if len(shown.axes) == 1 and shown.cube.sizes[shown.axes[0]] > 1:
         yield from _drawn(shown, "attractors", "All coexisting attractors", **options)
         if "fraction" in (rows or [{}])[0]:
@@ -220,9 +220,20 @@ def _attractors(shown: Shown) -> Iterator[Block]:
         yield from _drawn(shown, "regimes", "How many attractors coexist", **options, show="number")
     if rows:
         where = _richest(rows, shown.axes)
-        told = ", ".join(f"{name} = {value:g}" for name, value in where.items())
-        words = f"Attractors at {told}, where most coexist" if told else "Attractors"
+        place = ", ".join(f"{name} = {value:g}" for name, value in where.items())
+        if any(row["stability"] == "attracts" for row in rows):
+            words = f"Attractors at {place}, where most coexist" if place else "Attractors"
+        else:
+            words = f"Sets that cells are on at {place}" if place else "Sets that cells are on"
         yield from _drawn(shown, "gallery", words, **options, at=where)
+
+
+def _counted(rows: list[dict[str, Any]], told: str) -> str:
+    """Numbers of attractors and of other sets, and what the cells end on."""
+    attract = {r["attractor_id"] for r in rows if r["stability"] == "attracts"}
+    others = {r["attractor_id"] for r in rows} - attract
+    more = f", {len(others)} other set{'s' * (len(others) != 1)}" if others else ""
+    return f"{len(attract)} attractor{'s' * (len(attract) != 1)}{more}; {told}"
 
 
 def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, float]:
@@ -230,7 +241,7 @@ def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, flo
     counts: dict[tuple[float, ...], int] = {}
     for row in rows:
         place: tuple[float, ...] = tuple(row[name] for name in axes)
-        counts[place] = counts.get(place, 0) + 1
+        counts[place] = counts.get(place, 0) + (row["stability"] == "attracts")
     best = max(counts, key=counts.__getitem__)
     return dict(zip(axes, best, strict=True))
 
@@ -240,12 +251,14 @@ def _attractor_grid(
 ) -> tuple[list[str], list[list[str]]]:
     """Return a line per attractor: kind, period, motion, where it exists, largest share with its interval."""
     motion, sampled = any("side" in r for r in rows), any("fraction" in r for r in rows)
-    names = ["", "kind", "period", *(["motion"] if motion else []), *axes, "cells"]
+    names = ["", "kind", "stability", "shown by", "period", *(["motion"] if motion else []), *axes, "cells"]
     names += ["share (95 % interval)"] if sampled else []
     lines = []
     for i in sorted({row["attractor_id"] for row in rows}):
         own = [row for row in rows if row["attractor_id"] == i]
-        line = [letter(i), distinct(r["kind"].replace("_", " ") for r in own)]
+        line = [letter(i)]
+        line += [distinct(r[key].replace("_", " ") for r in own) for key in ("kind", "stability")]
+        line.append(distinct(r["evidence"] for r in own if r["evidence"] != "none") or "-")
         line.append(distinct(r["orbit_period"] for r in own if r["orbit_period"]) or "-")
         line += [distinct(r["side"] for r in own)] if motion else []
         line += [axis_ranges(ds, d, own, alone=len(axes) == 1) for d in axes]
@@ -258,6 +271,8 @@ def _attractor_grid(
 def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
     """Return the largest share of an attractor, with its interval and where that is."""
     best = max(rows, key=lambda row: float(np.nan_to_num(row["fraction"], nan=-1.0)))
+    if not np.isfinite(best["fraction"]):  # it attracts nowhere
+        return "-"
     where = ", ".join(f"{name} {best[name]:g}" for name in axes)
     share = (
         f"{number(best['fraction'], '.3f')} ({number(best['low'], '.3f')} to {number(best['high'], '.3f')})"

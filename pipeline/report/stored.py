@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pipeline.products.registry import ANALYSES
+from pipeline.runs.derive import is_outdone
 from pipeline.runs.versions import code_version
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED
@@ -39,6 +40,7 @@ def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
             attrs.get("derived_product") == name
             and attrs.get("cube_digest") == run.digest
             and attrs.get("analysis_version") == code_version(name)
+            and not is_outdone(run, attrs)
         ):
             found.append(settled_options(name, attrs))
     return sorted(found, key=lambda options: (len(options), json.dumps(options, sort_keys=True)))

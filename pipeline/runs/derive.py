@@ -10,6 +10,10 @@ Each is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``, readable by
 (``state``, ``direction``) as codes with the attribute ``words``. Two processes may derive at once: both
 compute, one of the two equal results stays.
 
+What was shown of a set by a longer extension holds for every analysis from then on: options that ask for less
+are raised to the largest budget with which attractors are kept (`most_evidence`), so that no two results
+contradict each other.
+
 To add an analysis see `pipeline.products.product`.
 """
 
@@ -24,6 +28,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.naming import named
@@ -163,7 +168,7 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
     for place in places:
         with contextlib.suppress(DamagedError, FileNotFoundError):
             attrs = read_product_attrs(place)
-            if all(attrs.get(key) == value for key, value in current.items()):
+            if all(attrs.get(key) == value for key, value in current.items()) and not is_outdone(run, attrs):
                 found.append((_changed_options(run, name, attrs), place.name, place))
     for _, _, place in sorted(found, key=lambda entry: entry[:2]):
         with contextlib.suppress(DamagedError, FileNotFoundError):
@@ -205,7 +210,54 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
         if product.needs:
             function_of(product.needs)(run, options)
         settle = getattr(product, "settle", "")
-        return function_of(settle)(run, options) if settle else options
+        options = function_of(settle)(run, options) if settle else options
+    return most_evidence(run, options)
+
+
+def most_evidence(run: Run, options: Options) -> Options:
+    """Return options with the largest budget of extension among the kept attractors that they would find.
+
+    Options without such a budget are returned as they are.
+    """
+    if not isinstance(options, IdentifyOptions):
+        return options
+    own = IdentifyOptions(**options.part(IdentifyOptions))
+    kept = [effort for told, effort in _kept_efforts(run) if told == _aside(own)]
+    return options.with_effort(max([own.effort, *kept]))
+
+
+def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], float]]:
+    """Other options and effort of each kept search for attractors of these cells by this code."""
+    try:
+        kept_here = products_in(run.info.files.below(DERIVED))
+    except NotADirectoryError:
+        return []
+    places = [p for p in kept_here if p.name.rpartition("/")[2].startswith("identified-")]
+    if not places:
+        return []
+    current = {"cube_digest": run.digest, "analysis_version": code_version("identified")}
+    found = []
+    for place in places:
+        with contextlib.suppress(DamagedError, FileNotFoundError, ValueError):
+            attrs = read_product_attrs(place)
+            if all(attrs.get(key) == value for key, value in current.items()):
+                kept = IdentifyOptions.model_validate(json.loads(str(attrs["derived_options"])))
+                found.append((_aside(kept), kept.effort))
+    return found
+
+
+def _aside(options: IdentifyOptions) -> dict[str, Any]:
+    """Options aside from the effort."""
+    return {name: value for name, value in options.plain().items() if name not in ("extend", "budget")}
+
+
+def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
+    """Whether a kept result rests on less evidence than is kept by now."""
+    name, given = str(attrs.get("derived_product")), json.loads(str(attrs.get("derived_options", "{}")))
+    if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
+        return False
+    own = IdentifyOptions.model_validate({k: given[k] for k in IdentifyOptions.model_fields if k in given})
+    return bool(most_evidence(run, own) != own)
 
 
 @contextlib.contextmanager
@@ -280,7 +332,7 @@ def _stale(run: Run) -> list[Files]:
         name = str(attrs.get("derived_product"))
         if name not in ANALYSES or attrs.get("cube_digest") != run.digest:
             return True
-        return bool(attrs.get("analysis_version") != code_version(name))
+        return bool(attrs.get("analysis_version") != code_version(name)) or is_outdone(run, attrs)
 
     products = [place for place in products_in(folder) if is_stale(place)]
     return products + leftover_products(folder, older_than=_LEFTOVER_SECONDS)

@@ -15,8 +15,9 @@ import numpy as np
 from magpend_core.models.sectioned import of_flow
 from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import (
-    CLOSED_ORBIT,
+    ATTRACTS,
     EQUILIBRIUM,
+    PERIODIC_ORBIT,
     frequency_of,
     parameters_of,
     start_dims,
@@ -46,7 +47,8 @@ def of_attractors(
     options
         With the axes in the run's own names.
     letters
-        Which, by letter; by default those with the largest shares.
+        Which, by letter; by default the attractors with the largest shares, or other sets where there is
+        none.
 
     Raises
     ------
@@ -72,8 +74,9 @@ def of_attractors(
         points = one["attractor_points"].transpose("point", "state").values
         moving.append(
             Moving(
-                cast.names[number], cast.colours[number], parameters, frequency, points[0],
-                 points[np.isfinite(points).all(axis=1)], _period(one, parameters, frequency),
+                cast.names[number], palette.GREY_OF.get(int(one["stability"]), cast.colours[number]),
+                parameters, frequency, points[0],
+                points[np.isfinite(points).all(axis=1)], _period(one, parameters, frequency),
             )
         )  # fmt: skip
     return moving, [*notes, *more]
@@ -98,10 +101,16 @@ def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[i
                 [f"--attractor: {len(chosen)} are asked for; at most {MOST_MOTIONS} fit a frame."]
             )
         return chosen, []
-    ranked = np.argsort(-here["share"].values, kind="stable")[:MOST_MOTIONS]
-    left = len(there) - ranked.size
-    more = [f"{left} more attractors are not shown; choose with --attractor LETTER"] if left > 0 else []
-    return sorted(there[i] for i in ranked), more
+    attract = here["stability"].values == ATTRACTS
+    wanted = attract if attract.any() else ~attract
+    by_share = np.argsort(-here["share"].values, kind="stable").tolist()
+    ranked = [k for k in by_share if wanted[k]][:MOST_MOTIONS]
+    left = {
+        "attractors" if attract.any() else "sets": int(wanted.sum()) - len(ranked),
+        "sets that do not attract": int((~wanted).sum()),
+    }
+    more = [f"not shown: {n} of the {what}; choose with --attractor LETTER" for what, n in left.items() if n]
+    return sorted(there[k] for k in ranked), more
 
 
 def _at_point(ds: xr.Dataset, here: xr.Dataset) -> tuple[Parameters, float]:
@@ -113,11 +122,11 @@ def _at_point(ds: xr.Dataset, here: xr.Dataset) -> tuple[Parameters, float]:
 
 
 def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
-    """Period of an attractor [s]: of what rests any, of a bounded set none."""
+    """Period of a set [s]: of what rests any, of a set that does not close none."""
     kind, periods = int(one["kind"]), int(one["orbit_period"])
     if kind == EQUILIBRIUM:
         return 0.0
-    if kind != CLOSED_ORBIT:
+    if kind != PERIODIC_ORBIT:
         return math.nan
     if parameters.model.crossing is None and periods and not parameters.model.autonomous:
         return periods / frequency

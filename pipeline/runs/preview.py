@@ -117,7 +117,8 @@ def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int |
     compiled = (
         f"; the kernel was compiled for it in {duration(found.compiled_s)}" if found.compiled_s > 1 else ""
     )
+    whole = duration(found.core_seconds)
     return (
         f"time: {bound} {duration(seconds)} of one core, {duration(seconds / cores)} on {cores} "
-        f"({found.how}{compiled})"
+        f"({found.how}{compiled}); analyse attractors may extend cells for up to {whole} of one core after it"
     )

@@ -205,3 +205,11 @@ def test_scaling__ceiling(bench, capsys):
     lines = [line.split() for line in printed.splitlines() if "busy" in line and "task" not in line]
     assert len(lines) == 2
     assert all(0 < float(line[-1]) <= 1 for line in lines)
+
+
+def test_same_set__prints_a_line_for_each_number_of_sections(bench, capsys):
+    same_set = bench("same_set")
+    same_set.main(["--cells", "6", "--cases", "Ueda"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in lines[1:]] == ["20", "60", "300", "512"]
+    assert lines[-1].split()[-1] == "1"

@@ -1,30 +1,37 @@
-"""Coexisting attractors: found at every parameter point, described, followed along the sweep.
+"""Coexisting attractors: found at every parameter point, shown to attract, and followed along the sweep.
 
     ds = pipeline.open_run(directory)
-    found = identify(ds)                 # integrates: Newton's method on one point per orbit
-    named = match(found, threshold=0.3)  # does not; repeat it with other options
+    found = identify(ds)                 # integrates: Newton's method, and samples of what has not settled
+    named = match(found, threshold=0.3)  # follows orbits along the axes; repeat it with other options
 
-What more there is to say of them is told by `hysteresis.hysteresis` (a continuation in both directions) and
-`lifetimes.lifetimes` (integrates: which bounded sets are transients, and how long).
+The way of a parameter point: `equilibria` and `cycles` of flows, `searching` for orbits, `extending` what no
+orbit accounts for, `labelling` cells and sets. `hysteresis.hysteresis` says where a continuation in both
+directions meets other attractors.
 
 Schema
 ------
 `identify` and `match` return a Dataset of the same form. Dims: the *parameter dims* of the cube
 (``frequency`` and others, in the order of the cube; none if nothing is swept), its *start dims*
-(``initial_condition``, the grid's ``<state>_0``, or ``branch``), and ``attractor``, ``point``, ``state``,
-``multiplier``, and the dim of the model's angles. Coordinates are those of the cube.
+(``initial_condition``, the grid's ``<state>_0``, or ``branch``), and ``attractor``, ``destination``,
+``point``, ``state``, ``multiplier``, and the dim of the model's angles. Coordinates are those of the cube.
 
 ======================== ===================================== ============ ==================================
 variable                 dims                                  dtype, fill  meaning
 ======================== ===================================== ============ ==================================
-``attractor_id``         parameter dims, start dims            int32, -1    which attractor; -1: see `status`
+``attractor_id``         parameter dims, start dims            int32, -1    which set; -1: see `status`
 ``decision``             parameter dims, start dims            int8, 0      how it was decided, see below
 ``status``               parameter dims, start dims            int8         as in the cube
-``kind``                 parameter dims, attractor             int8, 0      0 absent, 1 closed orbit,
-                                                                            2 bounded set, 3 equilibrium
-``orbit_period``         parameter dims, attractor             int32, 0     drive periods; 0 absent or bounded
+``ran_out``              parameter dims                        int8, 0      1 if the budget of the extension
+                                                                            ended before all was told
+``kind``                 parameter dims, attractor             int8, 0      `vocabulary.KINDS`
+``stability``            parameter dims, attractor             int8, 0      `vocabulary.STABILITIES`
+``evidence``             parameter dims, attractor             int8, 0      what the stability rests on:
+                                                                            `vocabulary.EVIDENCE`
+``orbit_period``         parameter dims, attractor             int32, 0     drive periods; 0 if not periodic
 ``n_cells``              parameter dims, attractor             int64, 0     cells
-``share``                parameter dims, attractor             float64, 0   of all cells of the point
+``share``                parameter dims, attractor             float64, 0   of the cells of the point that end
+                                                                            on attractors or diverge; 0 of a
+                                                                            set that does not attract
 ``attractor_points``     parameter dims, attractor, point,     float64, NaN section points, below
                          state
 ``rotation``             parameter dims, attractor, angle      float64, NaN mean turns per drive period
@@ -33,48 +40,58 @@ variable                 dims                                  dtype, fill  mean
 ``state_max``
 ``energy_min``,          parameter dims, attractor             float64, NaN range of the model's energy, below
 ``energy_max``
-``mirror_partner``       parameter dims, attractor             int32, -1    attractor that is its image
-``mirror_distance``      parameter dims, attractor             float64, NaN nearest attractor to the image
+``mirror_partner``       parameter dims, attractor             int32, -1    set that is its image
+``mirror_distance``      parameter dims, attractor             float64, NaN nearest set to the image
 ``multiplier_real``,     parameter dims, attractor, multiplier float64, NaN Floquet multipliers over the
 ``multiplier_imag``                                                         orbit's period, by falling modulus
+``multiplier_error``     parameter dims, attractor             float64, NaN error of the largest modulus
 ``residual``             parameter dims, attractor             float64, NaN certificate of Newton's method
-``is_stable``            parameter dims, attractor             int8, -1     0 no, 1 yes, -1 not known
 ``is_polished``          parameter dims, attractor             int8, 0      1 if Newton's method converged
-``lyapunov_max``         parameter dims, attractor             float64, NaN largest exponent [1/s]; of bounded
-                                                                            sets if the cube has the product
-                                                                            ``lyapunov``
+``lyapunov_max``,        parameter dims, attractor             float64, NaN largest exponent [1/s], and its
+``lyapunov_low``,                                                           interval of 3 standard errors
+``lyapunov_high``
 ``period_s``             parameter dims, attractor             float64, NaN period of a polished orbit [s]
 ``eigenvalue_real``,     parameter dims, attractor, multiplier float64, NaN of an equilibrium [1/s], by
 ``eigenvalue_imag``                                                         falling real part
+``n_sampled``            parameter dims, attractor             int64, 0     its cells that were extended
+``n_left``               parameter dims, attractor             int64, 0     of these, that left it
+``n_leaving``            parameter dims, attractor             int64, 0     extended cells near their end
+                                                                            from the start
+``n_to``                 parameter dims, attractor,            int64, 0     cells that left, by the id of the
+                         destination                                        set that they ended on
+``time_at_risk``         parameter dims, attractor             float64, NaN of all together [drive periods]
+``mean_lifetime``,       parameter dims, attractor             float64, NaN lifetime and its interval, or its
+``lifetime_low``,                                                           lower bound and infinity [drive
+``lifetime_high``                                                           periods]; see `lifetimes`
+``closes_above``         parameter dims, attractor             int32, 0     period that cells seem to close
+                                                                            with, above the longest looked for
 ======================== ===================================== ============ ==================================
 
-`attractor_points` are NaN beyond the attractor's own: a closed orbit's points in the order of time, or a
-sample of a bounded set. What the model does not have (angles, a classifier, an energy, a symmetry) has no
+`attractor_points` are NaN beyond the set's own: an orbit's points in the order of time, or a sample of
+another set. What the model does not have (angles, a classifier, an energy, a symmetry) has no
 variable. Ranges of a polished orbit are those over its full period, angles as they run on from the first
 point and -pi to pi for one that rotates; all others are those of the kept sections, and
-the energy of a bounded set that of its stored points.
+the energy of other sets that of their stored points.
 
 Distances are in units of the states' scales (1 rad, 10 rad/s for the pendulum), angles on their circle;
 states are in the units of the coordinate ``state_units``.
-From `identify` an id numbers the attractors of one parameter point (attribute ``matched`` 0), in
-lexicographic order of the least section point; from `match` it follows an attractor (``matched`` 1), and
-where that attractor is absent its row holds the fill values. `match` adds ``match_basis`` (int8, parameter
+From `identify` an id numbers the sets of one parameter point (attribute ``matched`` 0), in
+lexicographic order of the least section point; from `match` it follows a set (``matched`` 1), and
+where that set is absent its row holds the fill values. `match` adds ``match_basis`` (int8, parameter
 dims, attractor): what the id rests on there; `matching` says what an id is.
 
-`decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the orbit, 3 approaching the
-orbit, 4 one of the set, 5 ended on the orbit when it was run on, 6 at rest (see `equilibria`);
-`deciding.decide` has the criteria. A cell that is not bounded (diverged, step limit, pending,
-unreached, or without a return and yet not at rest) has the id -1, and its own `status`; a bounded one that
-belongs to nothing found (see `bounded.Rule`) has the id -1 and `decision` 0. Before a
-bounded set is named, the cells that come back near (`spirals`) and that no orbit accounts for are run on,
-2048 drive periods at most: a slow spiral is its orbit's, no set. A chaotic transient looks like a bounded
-set here: what it becomes takes a longer run, or `lifetimes`. An unstable orbit (`is_stable` 0) is listed
-only if a cell closed on it.
+What is listed is a *set* that cells are on. Only a set with the stability ``attracts`` is an attractor; what
+shows it is in `stability`. `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the
+orbit, 3 approaching the orbit, 4 one of the set, 5 ended there when it was extended, 6 at rest (see
+`equilibria`), 7 diverged when it was extended (no id); `deciding.decide` has the criteria. A cell that is
+not bounded (diverged, step limit, pending, unreached, or without a return and yet not at rest) has the id -1
+and its own `status`; a bounded one that belongs to nothing found has the id -1 and `decision` 0: it is not
+settled.
 
 A run with a loose `closure_tolerance` (1e-3 and more) is short, and its closed cells say little: sections
 recur within a few per cent near unstable orbits too, and near a period doubling with half the period.
-There a cell belongs only to a polished stable orbit, if it is near enough or spirals in; all others are
-run on (`orbits.run_on`) until they close within 1e-5, or stay undecided. So no attractor is made of a
+There a cell belongs only to a polished orbit that attracts, if it is near enough or spirals in; all others
+are run on (`orbits.run_on`) until they close within 1e-5, or stay undecided. So no attractor is made of a
 loose closure alone, and the periods are the orbits' own.
 """
 
@@ -89,20 +106,33 @@ import xarray as xr
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.cycles import tell_cycles
-from pipeline.analysis.attractors.deciding import DECISIONS
 from pipeline.analysis.attractors.equilibria import tell_rest
 from pipeline.analysis.attractors.features import ENERGY, Features
-from pipeline.analysis.attractors.labelling import Found, conclude
+from pipeline.analysis.attractors.labelling import Found, analyse
 from pipeline.analysis.attractors.matching import match
 from pipeline.analysis.attractors.points import BUDGET, Dynamics, slabs
-from pipeline.analysis.attractors.searching import Search, search_all
-from pipeline.analysis.chaos.lyapunov import on_attractor
+from pipeline.analysis.attractors.requests import Settings, answer_all
+from pipeline.analysis.attractors.searching import Search
+from pipeline.analysis.chaos.lyapunov import on_attractor, pooled_mean
 from pipeline.analysis.sides import flags_of
-from pipeline.layout.vocabulary import BOUNDED_SET, KINDS, split_dims
+from pipeline.layout.vocabulary import (
+    APERIODIC,
+    ATTRACTS,
+    DECISIONS,
+    DIVERGED,
+    DIVERGES,
+    EVIDENCE,
+    KINDS,
+    STABILITIES,
+    split_dims,
+)
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.chaos import ChaosOptions
 
 __all__ = ["identify", "match"]
+
+CLOSURE = 1e-5
+"""Scaled distance at which extended cells count as closed."""
 
 
 def identify(
@@ -153,7 +183,11 @@ def identify(
         raise ValueError(f"The dataset has no {', '.join(missing)}; give the dataset of pipeline.open_run.")
     tolerance = options.tolerance or max(1e-4, 10.0 * float(ds.attrs.get("closure_tolerance", 1e-5)))
     dynamics = Dynamics.of(ds, parameters, system, needed=options.polish)
-    search = Search(options, tolerance, dynamics)
+    settings = Settings.of(
+        ds, dynamics.system, dynamics.geometry,
+        closure=CLOSURE, longest=options.max_orbit_period, residual=options.residual,
+    )  # fmt: skip
+    search = Search(options, tolerance, dynamics, settings)
     found: dict[tuple[int, ...], Found] = {}
     for points in slabs(ds, dynamics, block_bytes):
         if dynamics.can_rest:
@@ -162,8 +196,8 @@ def identify(
             tell_cycles(
                 points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry
             )
-        states = search_all(points, search)
-        found |= {index: conclude(points[index], states[index], search) for index in points}
+        works = {index: analyse(point, search) for index, point in points.items()}
+        found |= answer_all(works, points, settings, "finding attractors")
     return _with_exponents(_dataset(ds, found, search), ds)
 
 
@@ -181,12 +215,16 @@ def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Sea
     shape = tuple(ds.sizes[d] for d in dims)
     table = _filled(ds, dims, shape, found, search)
     result = xr.Dataset(table.variables())
+    result["ran_out"] = (
+        dims, np.zeros(shape, np.int8), {"units": "1", "long_name": "whether the extension's budget ended"}
+    )  # fmt: skip
     cell_dims = (*dims, *start_dims)
     cell_shape = (*shape, *(ds.sizes[d] for d in start_dims))
     ids, decisions = np.empty(cell_shape, np.int32), np.empty(cell_shape, np.int8)
     for index, one in found.items():
         ids[index] = one.label.reshape(cell_shape[len(dims) :])
         decisions[index] = one.decision.reshape(cell_shape[len(dims) :])
+        result["ran_out"].values[index] = one.ran_out
     result["attractor_id"] = (cell_dims, ids, {"units": "1", "long_name": "attractor of the cell, -1 none"})
     how = {"units": "1", "long_name": "how the cell was decided", **_flags(" ".join(DECISIONS))}
     result["decision"] = (cell_dims, decisions, how)
@@ -210,34 +248,45 @@ def _filled(
     longest = max((len(x.points) for f in found.values() for x in f.features), default=0)
     n_states = ds.sizes["state"]
     sizes = {"point": max(search.options.n_points, longest), "state": n_states, "multiplier": n_states,
-             "angle": search.dynamics.n_angles}  # fmt: skip
+             "angle": search.dynamics.n_angles, "destination": n}  # fmt: skip
     table = _Table(dims, shape, n, sizes, search.dynamics)
+    starts = [d for d in ds["status"].dims if d not in dims]
+    table.n_diverged = (ds["status"] == DIVERGED).sum(starts).transpose(*dims).values
     for index, one in found.items():
         for i, x in enumerate(one.features):
-            table.fill((*index, i), x, one.counts[i], one.label.size)
+            table.fill((*index, i), x, one.counts[i])
+        table.share(index, one)
     return table
 
 
 def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
-    """Fill in the largest exponent of bounded sets, the mean over their cells, where the cube has it."""
+    """Take the largest exponent of sets that do not close from the cube, where it has one."""
     if "lyapunov" not in ds:
         return result
     dims, signs = result["attractor_id"].dims, ChaosOptions()
-    rate = ds["lyapunov"].isel(exponent=0, drop=True).transpose(*dims).values
+    first = ds[["lyapunov", "lyapunov_stderr"]].isel(exponent=0, drop=True).transpose(*dims)
+    rate, error = first["lyapunov"].values, first["lyapunov_stderr"].values
     counts = on_attractor(ds, n_sigma=signs.n_sigma, least=signs.least).transpose(*dims).values
     ids, kind = result["attractor_id"].values, result["kind"].values
-    for index in np.argwhere(kind == BOUNDED_SET):
+    for index in np.argwhere(np.isin(kind, APERIODIC)):
         point, i = tuple(index[:-1]), index[-1]
-        own = rate[point][(ids[point] == i) & counts[point]]
-        if own.size:  # in rising order, so that the last bit does not depend on that of the cells
-            result["lyapunov_max"].values[tuple(index)] = np.sort(own).mean()
+        which = (ids[point] == i) & counts[point]
+        if which.any():
+            # in rising order, so that the last bit does not depend on that of the cells
+            order = np.argsort(rate[point][which], kind="stable")
+            own, errors = rate[point][which][order], error[point][which][order]
+            _, stderr, _ = pooled_mean(own[None], errors[None], np.ones((1, own.size), bool))
+            for end, sign in (("max", 0.0), ("low", -signs.n_sigma), ("high", signs.n_sigma)):
+                result[f"lyapunov_{end}"].values[tuple(index)] = own.mean() + sign * stderr[0]
     return result
 
 
 _BY_STATE = "see state_units"
 
 _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
-    "kind": ((), "int8", 0, "1", "kind of attractor"),
+    "kind": ((), "int8", 0, "1", "kind of set"),
+    "stability": ((), "int8", 0, "1", "what has been shown of the set"),
+    "evidence": ((), "int8", 0, "1", "what the stability rests on"),
     "orbit_period": ((), "int32", 0, "1", "period in drive periods, 0 if bounded or absent"),
     "n_cells": ((), "int64", 0, "1", "cells on the attractor"),
     "share": ((), "float64", 0.0, "1", "share of all cells of the parameter point"),
@@ -253,19 +302,30 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "multiplier_real": (("multiplier",), "float64", np.nan, "1", "Floquet multipliers, real part"),
     "multiplier_imag": (("multiplier",), "float64", np.nan, "1", "Floquet multipliers, imaginary part"),
     "residual": ((), "float64", np.nan, "1", "scaled distance of the orbit's first point from its image"),
-    "is_stable": ((), "int8", -1, "1", "whether all multipliers lie inside the unit circle, -1 not known"),
+    "multiplier_error": ((), "float64", np.nan, "1", "error of the largest modulus of the multipliers"),
     "is_polished": ((), "int8", 0, "1", "whether Newton's method converged"),
     "lyapunov_max": ((), "float64", np.nan, "1/s", "largest Lyapunov exponent"),
+    "lyapunov_low": ((), "float64", np.nan, "1/s", "largest Lyapunov exponent, lower end of its interval"),
+    "lyapunov_high": ((), "float64", np.nan, "1/s", "largest Lyapunov exponent, upper end of its interval"),
     "period_s": ((), "float64", np.nan, "s", "period of a polished orbit"),
     "eigenvalue_real": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, real part"),
     "eigenvalue_imag": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, imaginary part"),
+    "n_sampled": ((), "int64", 0, "1", "cells of the set that were extended"),
+    "n_left": ((), "int64", 0, "1", "extended cells that left the set"),
+    "n_leaving": ((), "int64", 0, "1", "extended cells that were near their end from the start"),
+    "n_to": (("destination",), "int64", 0, "1", "extended cells that left, by where they ended"),
+    "time_at_risk": ((), "float64", np.nan, "1", "time on the set in all, drive periods"),
+    "mean_lifetime": ((), "float64", np.nan, "1", "mean lifetime in drive periods"),
+    "lifetime_low": ((), "float64", np.nan, "1", "lower end of the interval, drive periods"),
+    "lifetime_high": ((), "float64", np.nan, "1", "upper end of the interval, drive periods"),
+    "closes_above": ((), "int32", 0, "1", "period of cells that seem to close above the longest looked for"),
 }  # fmt: skip
 """Own dims, dtype, fill, units and long name of the variables per attractor."""
 
 
 _ELSEWHERE = (
     "n_cells", "share", "attractor_points", "multiplier_real", "multiplier_imag", "eigenvalue_real",
-    "eigenvalue_imag",
+    "eigenvalue_imag", "n_to",
 )  # fmt: skip
 """Variables that are no attribute of `Features`."""
 
@@ -292,16 +352,19 @@ class _Table:
         dynamics: Dynamics,
     ) -> None:  # fmt: skip
         self._dims, self.n, self._dynamics = (*dims, "attractor"), n, dynamics
+        self.n_diverged = np.zeros(shape, np.int64)
         self.angle_dim = dynamics.model.angle_dim if dynamics.model is not None else "angle"
         self.arrays = {}
         for name in _names(dynamics):
             own, dtype, fill, _, _ = _TABLE[name]
             self.arrays[name] = np.full((*shape, n, *(sizes[d] for d in own)), fill, dtype)
 
-    def fill(self, at: tuple[int, ...], x: Features, n_cells: int, total: int) -> None:
-        """Write one attractor."""
+    def fill(self, at: tuple[int, ...], x: Features, n_cells: int) -> None:
+        """Write one set."""
         arrays = self.arrays
-        arrays["n_cells"][at], arrays["share"][at] = n_cells, n_cells / total
+        arrays["n_cells"][at] = n_cells
+        if x.n_to is not None:
+            arrays["n_to"][at][: len(x.n_to)] = x.n_to
         arrays["attractor_points"][at][: len(x.points)] = x.points
         if x.multipliers is not None:
             arrays["multiplier_real"][at] = x.multipliers.real
@@ -312,9 +375,20 @@ class _Table:
         for name in arrays.keys() - set(_ELSEWHERE):
             arrays[name][at] = getattr(x, name)
 
+    def share(self, index: tuple[int, ...], one: Found) -> None:
+        """Write the shares of a point's attractors among its cells with an outcome."""
+        counts = np.array(one.counts, np.int64)
+        attracts = np.array([x.stability == ATTRACTS for x in one.features], bool)
+        total = int(counts[attracts].sum()) + self.n_diverged[index] + int((one.decision == DIVERGES).sum())
+        if total:
+            self.arrays["share"][index][: len(counts)] = np.where(attracts, counts / total, 0.0)
+
     def variables(self) -> dict[str, Any]:
         """As xarray takes them."""
-        more: dict[str, dict[str, Any]] = {"kind": _flags(" ".join(KINDS))}
+        more: dict[str, dict[str, Any]] = {
+            "kind": _flags(" ".join(KINDS)), "stability": _flags(" ".join(STABILITIES)),
+            "evidence": _flags(" ".join(EVIDENCE)),
+        }  # fmt: skip
         model = self._dynamics.model
         if "side" in self.arrays and model is not None and model.classifier is not None:
             more["side"] = flags_of(model.classifier)

@@ -23,6 +23,10 @@ class Block:
     turns : ndarray, (cell, angle)
     rest : ndarray, (cell, state), or None
         States in which cells waited in vain for a return, if sections are crossings of a flow.
+    seconds : ndarray, (cell, period_index), or None
+        Time since the section before each [s].
+    step : ndarray, (cell,), or None
+        Step size with which each goes on from its last section, bit for bit [s].
     """
 
     cells: slice
@@ -31,6 +35,8 @@ class Block:
     orbit_period: np.ndarray
     turns: np.ndarray
     rest: np.ndarray | None = None
+    seconds: np.ndarray | None = None
+    step: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Block:
         """Cells by row; their places are no longer those of `cells`."""

@@ -11,7 +11,7 @@ import xarray as xr
 from magpend_core.engine.system import System
 from pipeline.analysis.branches.connecting import OPEN, Found, Link, connect, grouped
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.layout.vocabulary import CLOSED_ORBIT
+from pipeline.layout.vocabulary import PERIODIC_ORBIT
 
 Place = tuple[tuple[int, ...], int]
 """A parameter point's index, and the row of an attractor there."""
@@ -66,7 +66,7 @@ def followable(attractors: xr.Dataset, at: Place) -> bool:
     if "is_polished" not in attractors:
         return False
     one = (*index, row)
-    return bool(attractors["kind"].values[one] == CLOSED_ORBIT and attractors["is_polished"].values[one])
+    return bool(attractors["kind"].values[one] == PERIODIC_ORBIT and attractors["is_polished"].values[one])
 
 
 def connections(

@@ -11,6 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from pipeline.analysis.attractors.cells import Block
 from pipeline.analysis.attractors.orbits import Orbit, scaled_derivative
 from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 
 REACH = 0.3
 """Scaled distance from an orbit within which spiralling in is looked for."""
@@ -20,10 +21,6 @@ STRICT = 1e-3
 
 LOOSE_SHARE = 0.1
 """Share of a tolerance above `STRICT` within which a closed cell counts as on an orbit at once."""
-
-DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "run_on", "at_rest")
-UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, RUN_ON, AT_REST = range(len(DECISIONS))
-"""How a cell was decided: values of `decision`."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +32,15 @@ class _Metric:
     contraction: float
 
     @classmethod
-    def of(cls, orbit: Orbit, geometry: Geometry) -> _Metric:
+    def of(cls, orbit: Orbit, geometry: Geometry) -> _Metric | None:
+        """Norm of an orbit; None if there is none, where it does not attract or only just."""
         matrix = scaled_derivative(orbit, geometry)
         slow = 0.5 * (1.0 + float(np.abs(orbit.multipliers).max()))
-        weight = solve_discrete_lyapunov((matrix / slow).T, np.eye(len(matrix)))
-        root = np.linalg.cholesky(0.5 * (weight + weight.T)).T
+        try:
+            weight = solve_discrete_lyapunov((matrix / slow).T, np.eye(len(matrix)))
+            root = np.linalg.cholesky(0.5 * (weight + weight.T)).T
+        except np.linalg.LinAlgError:
+            return None
         moved = np.linalg.norm(root @ matrix @ np.linalg.inv(root), 2)
         return cls(root, matrix, float(moved))
 
@@ -132,7 +133,7 @@ def _approach(
     if not orbit.is_stable or last < 2 * orbit.period:
         return code
     metric = _Metric.of(orbit, geometry)
-    if metric.contraction >= 1.0:
+    if metric is None or metric.contraction >= 1.0:
         return code
     index = np.arange(last, -1, -orbit.period)[::-1]
     difference = geometry.difference(section[:, index], orbit.points[0])

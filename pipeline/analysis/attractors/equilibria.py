@@ -1,26 +1,28 @@
-"""Equilibria of flows among the ends of cells, told apart from limit cycles.
+"""Equilibria of flows, and which cells are at one or on their way to it.
 
-A cell that comes to rest does not come back to a section by crossing: it has the status ``NO_RETURN``
-and left its last state in ``rest_state``. Where the section runs through the equilibrium, a cell that spirals
-in crosses it to the end, and its sections close on the equilibrium as they would on an orbit of period 1; at
-even times they do so in any case. Newton's method on the rates tells: a cell is at rest if an equilibrium
-lies within `NEAR` of the state in which it waited in vain, or within the tolerance of closed cells from its
-last section, and is stable; or if it is on the equilibrium itself. Cells that are farther away wait on, up to
-`WAITS` times as long, until they are near or do come back.
+Newton's method on the rates looks for equilibria from the last states of cells, near or far. A cell belongs
+to a stable one if it waits near it for a return in vain, if it is on it within the tolerance of closed
+cells, or if its sections follow the equilibrium's linear flow towards it (`approaching`): a slow focus is
+crossed by the section thousands of times. It belongs to any other one only if it is on it exactly. Cells
+that wait far from all of them wait on, up to `WAITS` times as long, until they are near or do come back.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 from magpend_core.equilibria import find_equilibria, newton_steps
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.attractors.points import Point
-from pipeline.analysis.sets import Geometry, rounded_points
+from pipeline.analysis.attractors.stability import RATE_ERROR, by_margin, largest_error
+from pipeline.analysis.sets import Geometry, hashes, rounded_points
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL
 
 NEAR = 0.1
 """Largest scaled distance from a stable equilibrium of a state in which a cell waited in vain."""
@@ -35,10 +37,16 @@ ON_IT = 1e-9
 """Scaled distance from an equilibrium, stable or not, within which a cell is on it."""
 
 SAME = 1e-6
-"""Equilibria at most this far apart are one."""
+"""Equilibria at most this far apart are one, and an orbit at most this far from one is that equilibrium."""
 
 MOST = 64
 """Most equilibria of a parameter point: where whole lines of them attract there is no end of them."""
+
+ITERATIONS = 100
+"""Newton steps: at a degenerate equilibrium each takes only a part of the way."""
+
+GUESSES, GUESS_BOX = 64, 0.1
+"""Most states from which equilibria are looked for far away, and the side of the boxes that share one."""
 
 
 @dataclass(frozen=True)
@@ -52,16 +60,90 @@ class Equilibrium:
         Of the Jacobian [1/s], by falling real part.
     residual : float
         Scaled length of the last Newton step.
+    jacobian : ndarray, (state, state)
+        In units of the scales [1/s].
+    approached_within : float
+        Scaled distance from which trajectories on both sides were seen to come nearer; 0 if not tried.
     """
 
     state: np.ndarray
     eigenvalues: np.ndarray
     residual: float
+    jacobian: np.ndarray
+    approached_within: float = 0.0
+
+    @cached_property
+    def eigenvalue_error(self) -> float:
+        """Error of the largest real part of the eigenvalues [1/s]."""
+        # the state errs by its residual, or by more where it is degenerate, and the Jacobian with it
+        size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * float(
+            np.abs(self.jacobian).max(initial=1.0)
+        )
+        return largest_error(self.jacobian, size, real=True)
+
+    @cached_property
+    def stability(self) -> int:
+        """By the eigenvalues' real parts and their error, or by trajectories beside it; see `stability`."""
+        found = by_margin(float(self.eigenvalues.real[0]), 0.0, self.eigenvalue_error)
+        return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
 
     @property
     def is_stable(self) -> bool:
-        """Whether all eigenvalues have negative real parts."""
-        return bool(self.eigenvalues.real.max() < 0.0)
+        """Whether it is shown to attract."""
+        return self.stability == ATTRACTS
+
+    @cached_property
+    def _norm(self) -> tuple[np.ndarray, float] | None:
+        """Root S of a norm |S x| that falls by exp(-rate t) at least, and the rate; None if there is none."""
+        rate = -0.5 * float(self.eigenvalues.real[0])
+        shifted = self.jacobian + rate * np.eye(len(self.jacobian))
+        try:
+            weight = solve_continuous_lyapunov(shifted.T, -np.eye(len(shifted)))
+            return np.linalg.cholesky(0.5 * (weight + weight.T)).T, rate
+        except np.linalg.LinAlgError:
+            return None
+
+    def is_approached(
+        self, section: np.ndarray, seconds: np.ndarray, noise: float, geometry: Geometry
+    ) -> np.ndarray:
+        """Say which trajectories follow the linear flow towards it.
+
+        With A the Jacobian, t the time between two sections and r = exp(-rate t) the bound on the linear
+        flow in its norm, let d be the distances and e = ``|d' - exp(A t) d|`` the error of the linear flow.
+        A trajectory is on its way if e is at most half of (1 - r)|d| over the younger half of the sections:
+        nearer by the error is smaller still.
+
+        Parameters
+        ----------
+        section
+            Shape (n, k, state).
+        seconds
+            Time since the section before each, shape (n, k) [s].
+        noise
+            Scaled error of the sections.
+        geometry
+            Of the states.
+        """
+        if self.approached_within or self._norm is None or section.shape[1] < 3:
+            return np.zeros(len(section), bool)
+        root, rate = self._norm
+        half = section.shape[1] // 2
+        away = geometry.difference(section[:, half:], self.state)
+        times = seconds[:, half + 1 :]
+        predicted = np.einsum("nkij,nkj->nki", self._flow(times), away[:, :-1])
+        size = np.linalg.norm(away @ root.T, axis=-1)
+        error = np.linalg.norm((away[:, 1:] - predicted) @ root.T, axis=-1)
+        allowed = 0.5 * (1.0 - np.exp(-rate * times)) * size[:, :-1]
+        known = noise * float(np.linalg.norm(root, 2)) * np.sqrt(len(root))
+        return np.asarray((error <= allowed + known).all(axis=1) & (size[:, -1] <= size[:, 0] + known))
+
+    def _flow(self, times: np.ndarray) -> np.ndarray:
+        """Linear flow over each of some times, shape (..., state, state)."""
+        values, vectors = np.linalg.eig(self.jacobian)
+        if np.linalg.cond(vectors) > 1e8:  # an eigenvalue without a direction of its own
+            return np.asarray(expm(self.jacobian * times[..., None, None]))
+        found = (vectors * np.exp(values * times[..., None])[..., None, :]) @ np.linalg.inv(vectors)
+        return np.asarray(found.real)
 
 
 def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> None:
@@ -78,7 +160,10 @@ def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> 
     """
     for point in points:
         states, reach = _ends(point, tolerance)
-        point.equilibria, point.at_rest = _settled(point, states, reach, geometry)
+        rows = np.flatnonzero(np.isfinite(states).all(axis=1))
+        point.equilibria = _found(point, states[rows], reach[rows], geometry)
+        point.at_rest = _settled(point, states, reach, geometry)
+        _label_approaching(point, tolerance, geometry)
 
 
 def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
@@ -115,37 +200,121 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
     return states
 
 
-def _settled(
-    point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry
-) -> tuple[list[Equilibrium], np.ndarray]:
-    """Equilibria in canonical order, and which of them each cell is at; -1 for none."""
-    at_rest = np.full(len(states), -1, np.int64)
-    rows = np.flatnonzero(np.isfinite(states).all(axis=1))
-    system = point.integrates
-    steps, _ = newton_steps(system, states[rows], point.packed)
+def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
+    """Equilibria that Newton's method finds from some states, in canonical order."""
+    if not len(states):
+        return []
+    steps, _ = newton_steps(point.integrates, states, point.packed)
     length = np.abs(steps / np.asarray(geometry.scales)).max(axis=1, initial=0.0)
     # beyond twice the reach the linear step cannot end within it but by chance
-    rows = rows[length <= 2.0 * reach[rows]]
-    if not len(rows):
-        return [], at_rest
-    boxes = geometry.boxes(states[rows], SAME)
-    _, first = np.unique(boxes, axis=0, return_index=True)
-    found = find_equilibria(system, states[rows[first]], point.packed)
-    equilibria: list[Equilibrium] = []
+    near = np.flatnonzero(length <= 2.0 * reach)
+    _, first = np.unique(geometry.boxes(states[near], SAME), axis=0, return_index=True)
+    _, other = np.unique(hashes(geometry.boxes(states, GUESS_BOX)), return_index=True)
+    guesses = states[np.concatenate([near[first], other[:GUESSES]])]
+    return equilibria_near(point, guesses, geometry)
+
+
+def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
+    """Different equilibria that Newton's method finds from some states, `MOST` at most."""
+    found = find_equilibria(point.integrates, states, point.packed, max_iterations=ITERATIONS)
+    scales = np.asarray(geometry.scales)
+    kept: list[Equilibrium] = []
     for i in np.flatnonzero(found.converged):
-        if len(equilibria) == MOST:
+        if all(geometry.distance(found.states[i], other.state) > SAME for other in kept):
+            jacobian = found.jacobians[i] * scales / scales[:, None]
+            kept.append(
+                Equilibrium(found.states[i], found.eigenvalues[i], float(found.residual[i]), jacobian)
+            )
+        if len(kept) == MOST:
             break
-        one = Equilibrium(found.states[i], found.eigenvalues[i], float(found.residual[i]))
-        if all(geometry.distance(one.state, other.state) > SAME for other in equilibria):
-            equilibria.append(one)
-    if not equilibria:
-        return [], at_rest
-    order = np.lexsort(rounded_points(np.array([e.state for e in equilibria]), geometry).T[::-1])
-    used: list[Equilibrium] = []
-    for i in order:
-        away = geometry.distance(states[rows], equilibria[i].state)
-        near = away <= (reach[rows] if equilibria[i].is_stable else ON_IT)
-        if near.any():
-            at_rest[rows[near]] = len(used)
-            used.append(equilibria[i])
-    return used, at_rest
+    if not kept:
+        return []
+    order = np.lexsort(rounded_points(np.array([e.state for e in kept]), geometry).T[::-1])
+    return [kept[i] for i in order]
+
+
+def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Which equilibrium each cell is at; -1 for none."""
+    at_rest = np.full(len(states), -1, np.int64)
+    rows = np.flatnonzero(np.isfinite(states).all(axis=1))
+    for k, one in enumerate(point.equilibria):
+        away = geometry.distance(states[rows], one.state)
+        at_rest[rows[away <= (reach[rows] if one.is_stable else ON_IT)]] = k
+    return at_rest
+
+
+def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
+    """Put cells at the degenerate equilibria that were seen to attract, in place."""
+    states, _ = _ends(point, tolerance)
+    assert point.at_rest is not None
+    for k, one in enumerate(point.equilibria):
+        if one.approached_within:
+            near = geometry.distance(np.nan_to_num(states, nan=np.inf), one.state) <= one.approached_within
+            point.at_rest[near & (point.at_rest < 0)] = k
+
+
+def _label_approaching(point: Point, tolerance: float, geometry: Geometry) -> None:
+    """Put cells that are on their way to a stable equilibrium there, in place."""
+    assert point.at_rest is not None
+    for block in point.blocks():
+        rows = np.flatnonzero(block.is_closed | block.is_bounded)
+        assert block.seconds is not None
+        number = approaching(point, block.section[rows], block.seconds[rows], tolerance, geometry)
+        own = rows[number >= 0]
+        point.at_rest[own + block.cells.start] = number[number >= 0]
+
+
+def approaching(
+    point: Point, section: np.ndarray, seconds: np.ndarray, tolerance: float, geometry: Geometry
+) -> np.ndarray:
+    """Stable equilibrium of a point that each trajectory is on its way to, -1 for none.
+
+    Parameters
+    ----------
+    point
+        With its equilibria.
+    section, seconds
+        See `Equilibrium.is_approached`.
+    tolerance
+        Scaled distance within which a cell is on what it closes on.
+    geometry
+        Of the states.
+    """
+    found = np.full(len(section), -1, np.int64)
+    for k, one in enumerate(point.equilibria):
+        rows = np.flatnonzero(found < 0)
+        if one.is_stable and len(rows):
+            near = one.is_approached(section[rows], seconds[rows], 0.01 * tolerance, geometry)
+            found[rows[near]] = k
+    return found
+
+
+def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
+    """Number of the stable equilibrium near a state in which a cell waited in vain; it may be a new one."""
+    if not np.isfinite(state).all():
+        return None
+    state = _waited(point, state[None])[0]
+    for one in equilibria_near(point, state[None], geometry) if np.isfinite(state).all() else ():
+        if one.is_stable and geometry.distance(one.state, state) <= NEAR:
+            return number_of(one, point, geometry)
+    return None
+
+
+def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
+    """Place of an equilibrium among those of a point, which it joins if it is new."""
+    for k, other in enumerate(point.equilibria):
+        if geometry.distance(one.state, other.state) <= SAME:
+            return k
+    point.equilibria.append(one)
+    return len(point.equilibria) - 1
+
+
+def rest_of_orbit(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
+    """Number of the equilibrium that a polished orbit with this section point is; None if it moves."""
+    steps, _ = newton_steps(point.integrates, state[None], point.packed)
+    if not np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME:
+        return None
+    for one in equilibria_near(point, state[None], geometry):
+        if geometry.distance(one.state, state) <= 10.0 * SAME:
+            return number_of(one, point, geometry)
+    return None

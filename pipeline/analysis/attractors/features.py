@@ -22,13 +22,13 @@ from magpend_core.models.parameters import Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import evaluate
 from magpend_core.trajectory import trajectory
-from pipeline.analysis.attractors.bounded import mean_rotation
 from pipeline.analysis.attractors.cells import Block
 from pipeline.analysis.attractors.cycles import Cycle
 from pipeline.analysis.attractors.equilibria import Equilibrium
+from pipeline.analysis.attractors.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS
 from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points
 from pipeline.analysis.sides import UNKNOWN
-from pipeline.layout.vocabulary import CLOSED_ORBIT, EQUILIBRIUM
+from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
 
 ENERGY = "energy"
 """Quantity of a model of which attractors have ranges."""
@@ -58,6 +58,8 @@ class Cells:
         Cells by the classifier's code.
     points : ndarray, (m, state)
         Section points of least hash.
+    seconds : list of ndarray, (cell,)
+        Mean time between two sections of the cells [s].
     """
 
     n_points: int
@@ -68,6 +70,7 @@ class Cells:
     turns: list[np.ndarray] = field(default_factory=list)
     sides: dict[int, int] = field(default_factory=dict)
     points: np.ndarray | None = None
+    seconds: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
         """Take in some cells of a block; `labels` are the codes of the classifier for all its cells."""
@@ -80,6 +83,8 @@ class Cells:
         self.turns.append(np.abs(block.turns[cells]))
         for code, count in zip(*np.unique(labels[cells], return_counts=True), strict=True):
             self.sides[int(code)] = self.sides.get(int(code), 0) + int(count)
+        if block.seconds is not None:
+            self.seconds.append(block.seconds[cells].mean(axis=1))
         both = flat if self.points is None else np.concatenate([self.points, flat])
         least = np.unique(hashes(both), return_index=True)[1][: self.n_points]
         self.points = both[least]
@@ -88,6 +93,11 @@ class Cells:
     def mean_rotation(self) -> np.ndarray:
         """Mean over cells; summed in rising order, so that the last bit does not depend on theirs."""
         return np.asarray(np.sort(np.concatenate(self.rotations), axis=0).mean(axis=0))
+
+    @property
+    def mean_seconds(self) -> float:
+        """Mean time between two sections [s]; NaN if it is not known."""
+        return float(np.sort(np.concatenate(self.seconds)).mean()) if self.seconds else np.nan
 
     def side(self, parameters: Parameters, frequency: float) -> int:
         """Code of the set: that of all its cells, or else that of their points together.
@@ -121,13 +131,34 @@ class Features:
     multipliers: np.ndarray | None = None
     residual: float = np.nan
     is_polished: bool = False
-    is_stable: int = -1
+    stability: int = NOT_SETTLED
+    evidence: int = 0
+    multiplier_error: float = np.nan
     lyapunov_max: float = np.nan
+    lyapunov_low: float = np.nan
+    lyapunov_high: float = np.nan
+    n_sampled: int = 0
+    n_left: int = 0
+    n_leaving: int = 0
+    time_at_risk: float = np.nan
+    mean_lifetime: float = np.nan
+    lifetime_low: float = np.nan
+    lifetime_high: float = np.nan
+    n_to: np.ndarray | None = None
+    closes_above: int = 0
     period_s: float = np.nan
     eigenvalues: np.ndarray | None = None
     image: np.ndarray | None = None
     mirror_partner: int = -1
     mirror_distance: float = np.nan
+
+
+def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Mean rotation of each angle over the kept sections [turns per drive period], shape (cell, angle)."""
+    angles = np.asarray(geometry.is_angle)
+    change = section[:, -1, angles] - section[:, 0, angles]
+    n = max(section.shape[1] - 1, 1)
+    return np.asarray((change / TWO_PI + turns) / n)
 
 
 def sides_of(
@@ -163,17 +194,20 @@ def follow_orbit(found: Features, parameters: Parameters, frequency: float, geom
 
 def fill_cycle(found: Features, cycle: Cycle) -> None:
     """Fill in what is known of a limit cycle seen at even times: it has no section points of its own."""
-    found.kind, found.period_s, found.residual = CLOSED_ORBIT, cycle.seconds, cycle.residual
-    found.multipliers, found.is_stable, found.lyapunov_max = cycle.multipliers, 1, 0.0
+    found.kind, found.period_s, found.residual = PERIODIC_ORBIT, cycle.seconds, cycle.residual
+    found.stability, found.evidence = ATTRACTS, BY_MULTIPLIERS
+    found.multipliers, found.lyapunov_max = cycle.multipliers, 0.0
+    found.lyapunov_low = found.lyapunov_high = 0.0
 
 
 def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: int) -> Features:
     """Describe an equilibrium: its exponents are the real parts of its eigenvalues."""
     x = Features(
         found.state[None], EQUILIBRIUM, 0, np.zeros(n_angles), UNKNOWN, found.state, found.state,
-        residual=found.residual, is_polished=True, is_stable=int(found.is_stable),
-        lyapunov_max=float(found.eigenvalues.real[0]), eigenvalues=found.eigenvalues,
+        residual=found.residual, is_polished=True, stability=found.stability,
+        evidence=BY_APPROACH if found.approached_within else BY_EIGENVALUES, eigenvalues=found.eigenvalues,
     )  # fmt: skip
+    x.lyapunov_max = x.lyapunov_low = x.lyapunov_high = float(found.eigenvalues.real[0])
     if parameters is None:
         return x
     x.side = int(sides_of(x.points[None], np.zeros((1, n_angles), np.int64), np.inf, parameters)[0])

@@ -1,95 +1,243 @@
-"""Cells labelled with what the search found, and attractors described."""
+"""All that is found at one parameter point: cells labelled, sets described with their evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from magpend_core.multipliers import orbit_exponents
 from pipeline.analysis.attractors import features as feature
-from pipeline.analysis.attractors.bounded import Clouds, assign, find_sets
+from pipeline.analysis.attractors import stability
+from pipeline.analysis.attractors.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.cells import Block, marks_of
-from pipeline.analysis.attractors.deciding import AT_REST, CLOSED, RUN_ON, SAME_SET, UNDECIDED, decide
+from pipeline.analysis.attractors.clouds import members
+from pipeline.analysis.attractors.courses import DIVERGED, rest_number
+from pipeline.analysis.attractors.deciding import decide
+from pipeline.analysis.attractors.equilibria import put_at_rest
+from pipeline.analysis.attractors.extending import Outcome, extend
 from pipeline.analysis.attractors.features import Cells, Features
+from pipeline.analysis.attractors.lifetimes import lifetime_interval
 from pipeline.analysis.attractors.orbits import Orbit, raw_orbit
 from pipeline.analysis.attractors.points import Point
-from pipeline.analysis.attractors.searching import Search, State
-from pipeline.analysis.attractors.spirals import Recurrence, keys_of
+from pipeline.analysis.attractors.probing import is_approaching, probe_equilibrium, probe_orbit
+from pipeline.analysis.attractors.requests import Slopes, Work
+from pipeline.analysis.attractors.searching import Search, State, search_orbits
+from pipeline.analysis.attractors.spirals import keys_of
 from pipeline.analysis.sets import Geometry, order_by_points
 from pipeline.analysis.sides import UNKNOWN
-from pipeline.layout.vocabulary import BOUNDED_SET, CLOSED_ORBIT
+from pipeline.layout.vocabulary import (
+    APPROACHING,
+    AT_REST,
+    BOUNDED_SET,
+    CLOSED,
+    DIVERGES,
+    EXTENDED,
+    NEUTRAL,
+    PERIODIC_ORBIT,
+    SAME_SET,
+    UNDECIDED,
+)
 
-UNSETTLED = -2
-"""Label of spirals that were not run on, until the sets are told."""
+PRESERVED, VOLUME_RTOL = 1e-7, 1e-11
+"""Largest logarithm of the change of a volume over a period that counts as none, and the tolerance for it."""
+
+MOST_PROBES = 8
+"""Most degenerate orbits or equilibria of a point beside which trajectories are started."""
 
 
 @dataclass
 class Found:
-    """Attractors of one parameter point."""
+    """Sets of one parameter point, and the set of each cell.
+
+    Attributes
+    ----------
+    label : ndarray of int64, (cell,)
+        Place in `features`, -1 for none.
+    decision : ndarray of int8, (cell,)
+        See `deciding.DECISIONS`.
+    features : list of Features
+    counts : list of int
+        Cells on each.
+    ran_out : bool
+        Whether the budget of the extension ended before all was told.
+    """
 
     label: np.ndarray
     decision: np.ndarray
     features: list[Features]
     counts: list[int]
+    ran_out: bool = False
 
 
-def conclude(point: Point, state: State, search: Search) -> Found:
-    """Label all cells, and describe what they are labelled with."""
-    label = np.full(point.n_cells, -1, np.int64)
-    decision = np.zeros(point.n_cells, np.int8)
-    raw: dict[int, tuple[float, int, np.ndarray]] = {}
-    left = np.full(point.n_cells, -1, np.int64)
+@dataclass
+class _Labels:
+    """Labels of the cells while they are given: orbits, raw orbits, sets, equilibria, cycles, in order."""
+
+    label: np.ndarray
+    decision: np.ndarray
+
+    @classmethod
+    def of(cls, n_cells: int) -> _Labels:
+        return cls(np.full(n_cells, -1, np.int64), np.zeros(n_cells, np.int8))
+
+    def put(self, cells: np.ndarray, number: int | np.ndarray, decision: int) -> None:
+        self.label[cells], self.decision[cells] = number, decision
+
+
+def analyse(point: Point, search: Search) -> Work[Found]:
+    """Find the sets that the cells of a parameter point are on, and show what can be shown of them."""
+    labels = _Labels.of(point.n_cells)
+    if search.options.polish and (yield from _preserves_volume(point, search)):
+        return _describe(point, [], [_conservative(point, labels)], labels, search)
+    state = yield from search_orbits(point, search)
+    groups = _label_orbits(point, state, labels, search)
+    if search.options.polish:
+        yield from _probe(point, state, labels, search)
+    options = search.options
+    budget = options.budget if options.extend and options.polish else 0.0
+    loose = np.where(_is_elsewhere(point), 0, labels.label)
+    found = yield from extend(point, state.orbits, loose, search.settings, budget, options.n_sample)
+    state.orbits = found.orbits
+    _label_courses(point, found, labels, groups, search)
+    raw = _label_raw(point, state, groups, labels, search)
+    _label_sets(point, len(state.orbits) + len(raw), found.sets, labels, groups, search)
+    result = _describe(point, [*state.orbits, *raw], found.sets, labels, search)
+    result.ran_out = found.ran_out
+    return result
+
+
+def _is_elsewhere(point: Point) -> np.ndarray:
+    """Cells at an equilibrium or on a cycle of a flow in even times."""
+    found = np.zeros(point.n_cells, bool)
+    for told in (point.at_rest, point.on_cycle):
+        if told is not None:
+            found |= told >= 0
+    return found
+
+
+# ---- conservative systems ----------------------------------------------------------------------
+
+
+def _preserves_volume(point: Point, search: Search) -> Work[bool]:
+    """Whether the flow, or the section map, leaves volumes as they are wherever it was looked at."""
+    before, after = _some_steps(point)
+    if not len(before):
+        return False
+    derivatives: np.ndarray = yield Slopes(before, VOLUME_RTOL)
+    if not np.isfinite(derivatives).all():
+        return False
+    return bool((np.abs(point.volumes(derivatives, before, after)) <= PRESERVED).all())
+
+
+def _some_steps(point: Point, n: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """Last two section points of cells that go on, those of least hash."""
+    found = np.zeros((0, 2, point.n_states))
     for block in point.blocks():
-        label[block.cells], decision[block.cells] = decide(
+        if block.section.shape[1] > 1:
+            both = np.concatenate([found, block.section[block.is_closed | block.is_bounded, -2:]])
+            found = both[np.unique(marks_of(both), return_index=True)[1][:n]]
+    return found[:, 0], found[:, 1]
+
+
+def _conservative(point: Point, labels: _Labels) -> BoundedSet:
+    """All cells of a flow that preserves volume, as one set."""
+    for block in point.blocks():
+        own = np.flatnonzero(block.is_closed | block.is_bounded)
+        labels.put(own + block.cells.start, 0, SAME_SET)
+    return BoundedSet.neutral()
+
+
+# ---- labels ------------------------------------------------------------------------------------
+
+
+def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -> np.ndarray:
+    """Label the cells on orbits; returns the group of each closed cell on none, -1 for all others."""
+    groups = np.full(point.n_cells, -1, np.int64)
+    for block in point.blocks():
+        own = block.cells
+        labels.label[own], labels.decision[own] = decide(
             block, state.orbits, search.tolerance, search.geometry
         )
-        _label_spirals(block, state.spirals, label, decision, search)
         if search.is_loose:
-            _label_ends(block, state.ends, label, decision)
+            _label_ends(block, state.ends, labels.label, labels.decision)
             continue
-        own = state.closed.group_of(block, state.keys, state.group)
-        own[label[block.cells] >= 0] = -1
-        left[block.cells] = own
-        _representatives(block, own, raw, search.geometry)
-    numbers = {g: len(state.orbits) + i for i, g in enumerate(sorted(raw))}
-    for g, number in numbers.items():
-        label[left == g] = number
-    decision[left >= 0] = CLOSED
-    orbits = [*state.orbits, *(raw_orbit(raw[g][2], search.geometry) for g in sorted(raw))]
-    _label_sets(point, len(orbits), label, decision, search)
-    label[label == UNSETTLED] = -1
-    resting = first = int(label.max(initial=-1)) + 1
-    for told, known, code in (
-        (point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED),
-    ):  # fmt: skip
-        if told is not None:
-            own = told >= 0
-            label[own], decision[own] = first + told[own], code
-            first += len(known)
-    return _describe(point, orbits, resting, label, decision, search)
+        group = state.closed.group_of(block, state.keys, state.group)
+        groups[own] = np.where(labels.label[own] >= 0, -1, group)
+    return groups
 
 
-def _label_spirals(
-    block: Block, spirals: Mapping[int, int], label: np.ndarray, decision: np.ndarray, search: Search,
-) -> None:  # fmt: skip
-    """Label the bounded cells that come back near by where those of their box went, in place.
+def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[None]:
+    """Start trajectories beside degenerate orbits and equilibria, and label the cells that come nearer."""
+    neutral = [i for i, orbit in enumerate(state.orbits) if orbit.is_polished and orbit.stability == NEUTRAL]
+    for i in neutral[:MOST_PROBES]:
+        within = yield from probe_orbit(state.orbits[i], search.geometry)
+        if within:
+            state.orbits[i] = replace(state.orbits[i], approached_within=within)
+            for block in point.blocks():
+                rows = np.flatnonzero((block.is_closed | block.is_bounded) & (labels.label[block.cells] < 0))
+                near = is_approaching(block.section[rows], state.orbits[i], search.geometry)
+                labels.put(rows[near] + block.cells.start, i, APPROACHING)
+    degenerate = [k for k, one in enumerate(point.equilibria) if one.stability == NEUTRAL]
+    for k in degenerate[:MOST_PROBES]:
+        within = yield from probe_equilibrium(point.equilibria[k], search.geometry)
+        if within:
+            point.equilibria[k] = replace(point.equilibria[k], approached_within=within)
+    if any(one.approached_within for one in point.equilibria):
+        put_at_rest(point, search.tolerance, search.geometry)
 
-    There are more boxes than are run on where very many cells spiral at once. If all that were run on
-    ended on orbits, the others make no set either: they stay undecided.
-    """
-    rest = np.flatnonzero(block.is_bounded & (label[block.cells] < 0)) if spirals else np.zeros(0, np.int64)
-    if not len(rest):
+
+def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
+    """Label the sampled cells that ended, and those beside them, by where they went."""
+    ends = {course.key: course.end for course in found.courses if not course.goes_on}
+    if not ends:
         return
-    section = block.section[rest]
-    none_stayed = all(number >= 0 for number in spirals.values())
-    is_near = Recurrence.of(section, search.options.max_orbit_period, search.geometry).is_near
-    keys = keys_of(section, search.tolerance, search.geometry)
-    for row, key, near in zip(rest + block.cells.start, keys.tolist(), is_near, strict=True):
-        number = spirals.get(key, UNSETTLED if none_stayed else -1) if near else -1
-        label[row] = number
-        decision[row] = RUN_ON if number >= 0 else UNDECIDED
+    by_group = {int(groups[c.cell]): c.end for c in found.courses if not c.goes_on and groups[c.cell] >= 0}
+    elsewhere = _is_elsewhere(point)
+    for block in point.blocks():
+        rows = np.flatnonzero((block.is_closed | block.is_bounded) & (labels.label[block.cells] < 0))
+        keys = keys_of(block.section[rows], search.settings.closure, search.geometry)
+        for cell, key in zip((rows + block.cells.start).tolist(), keys.tolist(), strict=True):
+            end = ends.get(key, by_group.get(int(groups[cell])) if groups[cell] >= 0 else None)
+            if end is None or elsewhere[cell]:
+                continue
+            if end >= 0:
+                labels.put(np.array([cell]), end, EXTENDED)
+            elif end == DIVERGED:
+                labels.decision[cell] = DIVERGES
+            elif (number := rest_number(end)) is not None and point.at_rest is not None:
+                point.at_rest[cell] = number
+
+
+def _label_raw(
+    point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search
+) -> list[Orbit]:
+    """Label the closed cells that Newton's method has no orbit for: each group by itself."""
+    left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
+    best: dict[int, tuple[float, int, np.ndarray]] = {}
+    for block in point.blocks():
+        _representatives(block, left[block.cells], best, search.geometry)
+    for i, g in enumerate(sorted(best)):
+        labels.put(left == g, len(state.orbits) + i, CLOSED)
+    return [raw_orbit(best[g][2], search.geometry) for g in sorted(best)]
+
+
+def _label_sets(
+    point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
+) -> None:
+    """Label the sampled cells of the sets, and the others by the points that they share with one."""
+    for i, one in enumerate(sets):
+        own = one.cells[labels.label[one.cells] < 0]
+        labels.put(own, first + i, SAME_SET)
+    if not sets:
+        return
+    clouds, elsewhere = [one.cloud for one in sets if one.cloud is not None], _is_elsewhere(point)
+    for block in point.blocks():
+        free = (labels.label[block.cells] < 0) & (labels.decision[block.cells] != DIVERGES)
+        rows = np.flatnonzero(block.is_bounded & free & ~elsewhere[block.cells])
+        own = members(block.section[rows], clouds, search.geometry)
+        labels.put(rows[own >= 0] + block.cells.start, first + own[own >= 0], SAME_SET)
 
 
 def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
@@ -97,7 +245,7 @@ def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decisi
     rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
     for row, mark in zip(rest, marks_of(block.section[rest]), strict=True):
         if int(mark) in ends:
-            label[row + block.cells.start], decision[row + block.cells.start] = ends[int(mark)], RUN_ON
+            label[row + block.cells.start], decision[row + block.cells.start] = ends[int(mark)], EXTENDED
 
 
 def _representatives(
@@ -118,62 +266,23 @@ def _representatives(
             best[g] = entry
 
 
-def _label_sets(point: Point, first: int, label: np.ndarray, decision: np.ndarray, search: Search) -> None:
-    """Label the bounded cells that no orbit accounts for, in place, from number `first` on."""
-    rule = search.rule
-    for _ in range(rule.n_rounds):
-        anchors: Clouds | None = None
-        for block in point.blocks():
-            loose = np.flatnonzero(block.is_bounded & (label[block.cells] == -1))
-            if len(loose):
-                clouds = Clouds.of(block.section[loose], block.turns[loose], search.geometry, rule)
-                anchors = (clouds if anchors is None else anchors.joined(clouds)).first(rule.n_anchors)
-        if anchors is None:
-            return
-        sets = find_sets(anchors, search.geometry, rule)
-        for block in point.blocks():
-            loose = np.flatnonzero(block.is_bounded & (label[block.cells] == -1))
-            if len(loose):
-                clouds = Clouds.of(block.section[loose], block.turns[loose], search.geometry, rule)
-                own = assign(clouds, sets, rule)
-                cells = loose[own >= 0] + block.cells.start
-                label[cells], decision[cells] = first + own[own >= 0], SAME_SET
-        first += len(sets)
-
-
 # ---- description -------------------------------------------------------------------------------
 
 
 def _describe(
-    point: Point,
-    orbits: list[Orbit],
-    resting: int,
-    label: np.ndarray,
-    decision: np.ndarray,
-    search: Search,
+    point: Point, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], labels: _Labels, search: Search
 ) -> Found:
-    """Features of all labels that have cells, and labels in canonical order.
-
-    From `resting` on they are equilibria, and then limit cycles seen at even times.
-    """
+    """Features of all labels that have cells, and labels in canonical order."""
+    resting = len(orbits) + len(sets)
+    _label_elsewhere(point, resting, labels)
     cells: dict[int, Cells] = {}
     for block in point.blocks():
-        own = label[block.cells]
+        own = labels.label[block.cells]
         sides = feature.sides_of(block.section, block.turns, point.frequency, point.parameters)
         for number in np.unique(own[own >= 0]):
             found = cells.setdefault(int(number), Cells(search.options.n_points))
             found.add(block, np.flatnonzero(own == number), sides, search.geometry)
-    features = {}
-    for number, found in cells.items():
-        told = number - resting
-        if 0 <= told < len(point.equilibria):
-            rest = point.equilibria[told]
-            features[number] = feature.of_equilibrium(rest, point.parameters, point.n_angles)
-            continue
-        orbit = orbits[number] if number < len(orbits) else None
-        features[number] = _features(found, orbit, point, search)
-        if told >= 0:
-            feature.fill_cycle(features[number], point.cycles[told - len(point.equilibria)])
+    features = {n: _features_of(n, found, orbits, sets, point, search) for n, found in cells.items()}
     numbers = list(features)
     order = [numbers[i] for i in order_by_points([features[n].points for n in numbers], search.geometry)]
     ranked = [features[n] for n in order]
@@ -182,46 +291,128 @@ def _describe(
         feature.pair_mirrors(ranked, model.mirror, search.options.mirror_threshold, search.geometry)
     table = np.full(max(numbers, default=0) + 2, -1, np.int32)
     table[order] = np.arange(len(order))
+    _number_ends(ranked, order, sets, len(orbits), resting, table)
+    decided = (labels.label >= 0) | (labels.decision == DIVERGES)
     return Found(
-        table[label],
-        np.where(label >= 0, decision, UNDECIDED).astype(np.int8),
+        table[labels.label],
+        np.where(decided, labels.decision, UNDECIDED).astype(np.int8),
         ranked,
         [cells[n].n for n in order],
     )
 
 
-def _features(cells: Cells, orbit: Orbit | None, point: Point, search: Search) -> Features:
-    if orbit is None:
-        assert cells.points is not None
-        points = feature.sorted_points(cells.points, search.geometry)
-    else:
-        points = orbit.points
-    found = Features(
-        points, BOUNDED_SET if orbit is None else CLOSED_ORBIT, orbit.period if orbit else 0,
-        cells.mean_rotation, UNKNOWN, cells.low, cells.high,
-    )  # fmt: skip
+def _label_elsewhere(point: Point, first: int, labels: _Labels) -> None:
+    """Label the cells at equilibria, and then those on cycles of a flow in even times."""
+    for told, known, code in (
+        (point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED),
+    ):  # fmt: skip
+        if told is not None:
+            own = told >= 0
+            labels.put(own, first + told[own], code)
+        first += len(known)
+
+
+def _number_ends(
+    ranked: Sequence[Features],
+    order: Sequence[int],
+    sets: Sequence[BoundedSet],
+    first: int,
+    resting: int,
+    table: np.ndarray,
+) -> None:
+    """Number the ends of the cells that left each set as the sets of the point are numbered, in place."""
+    for features, number in zip(ranked, order, strict=True):
+        if first <= number < resting:
+            ended = np.zeros(len(order), np.int64)
+            for end, n in sets[number - first].ended.items():
+                rest = rest_number(end)
+                at = end if end >= 0 else -1 if rest is None else resting + rest
+                if 0 <= at < len(table) and table[at] >= 0:
+                    ended[table[at]] += n
+            features.n_to = ended
+
+
+def _features_of(
+    number: int,
+    cells: Cells,
+    orbits: Sequence[Orbit],
+    sets: Sequence[BoundedSet],
+    point: Point,
+    search: Search,
+) -> Features:
+    """Describe what some cells are on, by its number among all labels."""
+    resting = len(orbits) + len(sets)
+    if number < len(orbits):
+        return _of_orbit(cells, orbits[number], point, search)
+    if number < resting:
+        return _of_set(cells, sets[number - len(orbits)], point, search)
+    told = number - resting
+    if told < len(point.equilibria):
+        return feature.of_equilibrium(point.equilibria[told], point.parameters, point.n_angles)
+    found = _of_points(cells, BOUNDED_SET, 0, point, search)
+    feature.fill_cycle(found, point.cycles[told - len(point.equilibria)])
+    return found
+
+
+def _of_points(cells: Cells, kind: int, period: int, point: Point, search: Search) -> Features:
+    """Describe a set by the section points of its cells."""
+    assert cells.points is not None
+    points = feature.sorted_points(cells.points, search.geometry)
+    found = Features(points, kind, period, cells.mean_rotation, UNKNOWN, cells.low, cells.high)
     if point.parameters is not None:
         found.side = cells.side(point.parameters, point.frequency)
-    frequency = point.frequency
-    if orbit is not None and orbit.is_polished:
-        is_flow = search.dynamics.is_flow
+        if search.options.polish:
+            feature.follow_points(found, point.parameters, point.frequency)
+    return found
+
+
+def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Features:
+    found = _of_points(cells, one.kind, 0, point, search)
+    found.stability, found.evidence = one.stability, one.evidence
+    found.closes_above = one.closes_above
+    found.n_sampled, found.n_left, found.n_leaving = one.n_sampled, one.n_left, one.n_leaving
+    if one.time_at_risk > 0.0:
+        found.time_at_risk = one.time_at_risk
+        found.mean_lifetime = one.time_at_risk / one.n_left if one.n_left else np.nan
+        found.lifetime_low, found.lifetime_high = lifetime_interval(
+            one.n_left, one.time_at_risk, search.options.lifetime_confidence
+        )
+    if one.growth is not None:
+        # the exponent along a flow seen at crossings is 0 and not among those of the section map
+        rates = np.array([one.growth.rate, one.growth.low, one.growth.high]) / cells.mean_seconds
+        rates = np.maximum(rates, 0.0) if point.is_flow else rates
+        found.lyapunov_max, found.lyapunov_low, found.lyapunov_high = rates.tolist()
+    return found
+
+
+def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Features:
+    found = Features(
+        orbit.points, PERIODIC_ORBIT, orbit.period, cells.mean_rotation, UNKNOWN, cells.low, cells.high,
+        stability=orbit.stability,
+    )  # fmt: skip
+    frequency, is_flow = point.frequency, search.dynamics.is_flow
+    if point.parameters is not None:
+        found.side = cells.side(point.parameters, frequency)
+    if orbit.is_polished:
         frequency = orbit.period / orbit.seconds if is_flow else frequency
         _fill_orbit(found, orbit, is_flow)
     if point.parameters is None or not search.options.polish:
         return found
-    if found.is_polished:
-        feature.follow_orbit(found, point.parameters, frequency, search.geometry)
-        turns = np.round(found.rotation * found.orbit_period).astype(np.int64)
-        found.side = int(feature.sides_of(points[None], turns[None], point.frequency, point.parameters)[0])
-    else:
+    if not found.is_polished:
         feature.follow_points(found, point.parameters, point.frequency)
+        return found
+    feature.follow_orbit(found, point.parameters, frequency, search.geometry)
+    turns = np.round(found.rotation * found.orbit_period).astype(np.int64)
+    found.side = int(feature.sides_of(orbit.points[None], turns[None], point.frequency, point.parameters)[0])
     return found
 
 
 def _fill_orbit(found: Features, orbit: Orbit, is_flow: bool) -> None:
     found.multipliers, found.residual, found.is_polished = orbit.multipliers, orbit.residual, True
-    found.is_stable = int(orbit.is_stable)
-    found.lyapunov_max = float(orbit_exponents(orbit.multipliers, orbit.seconds, is_flow)[0])
+    found.multiplier_error = orbit.multiplier_error
+    found.evidence = stability.BY_APPROACH if orbit.approached_within else stability.BY_MULTIPLIERS
+    exponents = orbit_exponents(orbit.multipliers, orbit.seconds, is_flow)
+    found.lyapunov_max = found.lyapunov_low = found.lyapunov_high = float(exponents[0])
     found.period_s = orbit.seconds
     # whole turns over its period: the cells' mean has not closed to the last digit
     found.rotation = np.round(found.rotation * orbit.period) / orbit.period + 0.0  # no -0.0

@@ -309,6 +309,9 @@ def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple
             _fill(str(name), values.dtype),
         )
         moved = moved.astype(values.dtype)
+        if name == "n_to":
+            values = _destinations(values, ids, n_ids)
+            moved = np.zeros((*moved.shape[:-1], n_ids), values.dtype)
         moved[target] = _partners(values, ids)[present] if name == "mirror_partner" else values[present]
         variables[str(name)] = (ordered.dims, moved, variable.attrs)
     cells = attractors["attractor_id"]
@@ -320,7 +323,7 @@ def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple
 
 
 def _fill(name: str, dtype: np.dtype[Any]) -> float:
-    if name in ("mirror_partner", "is_stable"):
+    if name == "mirror_partner":
         return -1
     return 0 if dtype.kind in "iu" or name == "share" else np.nan
 
@@ -329,6 +332,15 @@ def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Ids of row numbers at one parameter point, -1 where there is none."""
     table = np.append(ids, -1)
     return np.asarray(table[rows])
+
+
+def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
+    """Counts by row numbers as counts by ids."""
+    moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
+    for *index, row in np.argwhere(ids >= 0).tolist():
+        point = tuple(index)
+        moved[point][:, ids[point][row]] = values[point][:, row]
+    return moved
 
 
 def _partners(values: np.ndarray, ids: np.ndarray) -> np.ndarray:

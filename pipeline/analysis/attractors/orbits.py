@@ -8,16 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import polish_orbits, stroboscopic_map
 from magpend_core.sections import run_branches
+from pipeline.analysis.attractors.stability import MATRIX_ERROR, by_margin, largest_error
 from pipeline.analysis.sets import Geometry, rounded_points
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
 
 SAME_ORBIT = 1e-7
 """Polished orbits at most this far apart are one, on top of the error that their residuals allow."""
+
+PLACE_ERROR = 30.0
+"""Error of a multiplier beside a fold over the residual's root: twice the root of the map's curvature."""
 
 RUN_ON_PERIODS, RUN_ON_TOLERANCE, RUN_ON_RTOL = 2000, 1e-5, 1e-8
 """How `run_on` integrates: drive periods at most, closure tolerance, tolerance of the steps."""
@@ -39,6 +45,8 @@ class Orbit:
         Monodromy matrix at the first point; NaN if not polished.
     seconds : float
         Period [s]; NaN if not polished.
+    approached_within : float
+        Scaled distance from which trajectories on both sides were seen to come nearer; 0 if not tried.
     """
 
     points: np.ndarray
@@ -46,6 +54,7 @@ class Orbit:
     residual: float
     derivative: np.ndarray
     seconds: float = np.nan
+    approached_within: float = 0.0
 
     @property
     def period(self) -> int:
@@ -57,10 +66,28 @@ class Orbit:
         """Whether Newton's method found it."""
         return bool(np.isfinite(self.residual))
 
+    @cached_property
+    def multiplier_error(self) -> float:
+        """Error of the largest modulus of the multipliers.
+
+        That of the monodromy matrix, and of the orbit's place: beside a fold the multiplier goes with the
+        root of the residual.
+        """
+        of_matrix = MATRIX_ERROR * float(np.abs(self.derivative).max(initial=1.0))
+        return largest_error(self.derivative, of_matrix) + PLACE_ERROR * float(np.sqrt(self.residual))
+
+    @cached_property
+    def stability(self) -> int:
+        """By its multipliers and their error, or by trajectories on both sides; see `stability`."""
+        if not self.is_polished:
+            return NOT_SETTLED
+        found = by_margin(float(np.abs(self.multipliers).max()), 1.0, self.multiplier_error)
+        return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
+
     @property
     def is_stable(self) -> bool:
-        """Whether it is polished and all multipliers lie inside the unit circle."""
-        return self.is_polished and bool(np.abs(self.multipliers).max() < 1.0)
+        """Whether it is shown to attract."""
+        return self.stability == ATTRACTS
 
     @property
     def error(self) -> float:

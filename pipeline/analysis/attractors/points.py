@@ -13,14 +13,22 @@ import xarray as xr
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
+from magpend_core.orbits import crossed_state
+from magpend_core.pointwise import rates_at
 from magpend_core.status import Status
 from pipeline.analysis.attractors.cells import Block
+from pipeline.analysis.attractors.growth import volumes_of
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import FREQUENCY_DIM, frequency_of, model_of, parameters_of, split_dims
 
 if TYPE_CHECKING:
     from pipeline.analysis.attractors.cycles import Cycle
     from pipeline.analysis.attractors.equilibria import Equilibrium
+
+_READ = (
+    "section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size",
+)  # fmt: skip
+"""Variables of a cube that are read."""
 
 BUDGET = 256 * 2**20
 """Bytes of sections held at once."""
@@ -110,6 +118,12 @@ class Point:
         Of a flow at even times: limit cycles that cells are on, see `cycles.tell_cycles`.
     on_cycle : ndarray, (cell,), or None
         Which of them each cell is on, likewise.
+    n_periods : int
+        Drive periods or returns that the run integrated here, of all cells together.
+    is_flow : bool
+        Whether sections are crossings of a flow.
+    can_rest : bool
+        Whether equilibria are told apart.
     """
 
     cube: xr.Dataset
@@ -124,6 +138,22 @@ class Point:
     at_rest: np.ndarray | None = None
     cycles: list[Cycle] = field(default_factory=list)
     on_cycle: np.ndarray | None = None
+    n_periods: int = 0
+    is_flow: bool = False
+    can_rest: bool = False
+
+    @property
+    def n_neutral(self) -> int:
+        """Exponents of the section map that are 0 by construction: along a flow seen at even times."""
+        return int(self.can_rest and not self.is_flow)
+
+    def volumes(self, derivatives: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Logarithm of the change of a volume along the flow over each step of the section map."""
+
+        def flow(states: np.ndarray) -> np.ndarray:
+            return rates_at(self.integrates, states, self.packed)
+
+        return volumes_of(derivatives, before, after, crossed_state(self.integrates), flow)
 
     @property
     def integrates(self) -> System:
@@ -164,12 +194,17 @@ class Point:
             if told is not None:
                 status = np.where(told[cells] >= 0, np.int8(Status.NO_RETURN), status)
         rest = values("rest_state", "state") if "rest_state" in part else None
-        return Block(cells, section, status, values("orbit_period"), turns, rest)
+        if "return_time" in part:
+            seconds = values("return_time", "period_index")
+        else:
+            seconds = np.full(section.shape[:2], 1.0 / self.frequency)
+        step = values("step_size") if "step_size" in part else None
+        return Block(cells, section, status, values("orbit_period"), turns, rest, seconds, step)
 
 
 def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
     """Parameter points, some at a time: what fits is loaded at once, since chunks span many points."""
-    names = [n for n in ("section", "status", "orbit_period", "turns", "rest_state") if n in ds]
+    names = [name for name in _READ if name in ds]
     cube = ds[names].reset_coords(drop=True) if FREQUENCY_DIM in ds.dims else ds[names]
     dims, start_dims = split_dims(ds["status"])
     shape = [ds.sizes[d] for d in dims]
@@ -200,15 +235,22 @@ def _point(
     block_cells: int,
 ) -> Point:  # fmt: skip
     frequency, base = frequency_of(dynamics.model, values), dynamics.parameters
+    own: dict[str, Any] = {
+        "is_flow": dynamics.is_flow, "can_rest": dynamics.can_rest,
+        "n_periods": int(one["n_periods"].sum()) if "n_periods" in one
+        else one["status"].size * one.sizes["period_index"],
+    }  # fmt: skip
     if isinstance(base, Parameters):
         parameters = base.replace(**{name: value for name, value in values.items() if name in base})
         return Point(
             one, start_dims, frequency, parameters.pack(), parameters, dynamics.n_angles, block_cells,
-            dynamics.system,
+            dynamics.system, **own,
         )  # fmt: skip
     names = dynamics.system.parameter_names if dynamics.system is not None else ()
     packed = np.zeros(len(names)) if base is None else np.array(base, np.float64)
     for name, value in values.items():
         if name in names:
             packed[names.index(name)] = value
-    return Point(one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells, dynamics.system)
+    return Point(
+        one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells, dynamics.system, **own
+    )

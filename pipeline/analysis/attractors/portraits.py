@@ -14,9 +14,9 @@ from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.vocabulary import (
-    BOUNDED_SET,
-    CLOSED_ORBIT,
+    APERIODIC,
     EQUILIBRIUM,
+    PERIODIC_ORBIT,
     frequency_of,
     parameters_of,
     told_by,
@@ -33,7 +33,7 @@ def portraits(
     n_samples: int = 256,
     n_periods: int = 20,
 ) -> xr.Dataset:
-    """Integrate each attractor of a parameter point: one period of a closed orbit, some of a bounded set.
+    """Integrate each set of a parameter point: one period of an orbit, some periods of another set.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def _step(here: xr.Dataset, parameters: Parameters, frequency: float, n_samples:
     per_return = (here["period_s"] / here["orbit_period"].where(here["orbit_period"] > 0)).values
     if np.isfinite(per_return).any():
         return float(np.nanmin(per_return)) / n_samples
-    moving = here["kind"].values == BOUNDED_SET
+    moving = np.isin(here["kind"].values, APERIODIC)
     starts = here["attractor_points"].transpose("attractor", "point", "state").values[moving, 0]
     if not len(starts):
         return 0.1 / (n_samples * frequency)
@@ -118,10 +118,10 @@ def _orbit(
 ) -> np.ndarray:
     start = one["attractor_points"].transpose("point", "state").values[0]
     kind, periods = int(one["kind"]), int(one["orbit_period"])
-    n = n_samples * (periods if kind == CLOSED_ORBIT else n_periods)
+    n = n_samples * (periods if kind == PERIODIC_ORBIT else n_periods)
     if kind == EQUILIBRIUM:
         return np.asarray(start[None])
-    if kind == CLOSED_ORBIT and (parameters.model.crossing is not None or not periods):
+    if kind == PERIODIC_ORBIT and (parameters.model.crossing is not None or not periods):
         n = math.ceil(float(one["period_s"]) / step)
     times = np.arange(n + 1) * step
     return trajectory(of_flow(parameters), 1.0 / (step * n_samples), start, times, rtol=RTOL, atol=RTOL)
@@ -132,7 +132,7 @@ def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters,
     table = np.full((len(orbits), length, len(parameters.model.states)), np.nan)
     for row, orbit in zip(table, orbits, strict=True):
         row[: len(orbit)] = orbit
-    keep = ["attractor_points", "share", "n_cells", "orbit_period", "kind", "side"]
+    keep = ["attractor_points", "share", "n_cells", "orbit_period", "kind", "stability", "side"]
     result = here[[name for name in keep if name in here]].assign(
         orbit=(("attractor", "sample", "state"), table,
                {"units": "see state_units", "long_name": "motion on the attractor"}),

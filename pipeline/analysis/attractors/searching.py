@@ -1,35 +1,25 @@
-"""The search for orbits, one parameter point after the other, in blocks of cells.
+"""The search for orbits of a parameter point, in blocks of cells.
 
 Cells are read block by block, several times over; what is kept between blocks (boxes, best guesses,
-least hashes, sums) does not depend on how they were cut. All points of a slab go in step, so that the
-guesses of all are polished in one call of the engine.
+least hashes, sums) does not depend on how they were cut.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.analysis.attractors.bounded import Rule
 from pipeline.analysis.attractors.cells import ClosedCells, Guesses, marks_of
 from pipeline.analysis.attractors.deciding import LOOSE_SHARE, STRICT, decide
-from pipeline.analysis.attractors.following import Engine, follow
-from pipeline.analysis.attractors.orbits import RUN_ON_RTOL, Orbit, distinct, number_of, polish, run_on
+from pipeline.analysis.attractors.equilibria import rest_of_orbit
+from pipeline.analysis.attractors.orbits import Orbit, distinct, number_of
 from pipeline.analysis.attractors.points import Dynamics, Point
-from pipeline.analysis.attractors.spirals import (
-    MAX_GUESSES,
-    RUN_ON_LEGS,
-    SPIRALS_PER,
-    beside,
-    near_closed,
-    spirals_of,
-)
-from pipeline.analysis.sets import Geometry, hashes
+from pipeline.analysis.attractors.requests import Polish, Settings, Work
+from pipeline.analysis.attractors.spirals import MAX_GUESSES, beside, near_closed
+from pipeline.analysis.sets import Geometry
 from pipeline.products.attractors import IdentifyOptions
-from pipeline.products.reporting import report
 
 ROUNDS, ROUNDS_LOOSE = 3, 6
 """Most rounds of guessing and polishing, with a strict and a loose tolerance."""
@@ -45,11 +35,14 @@ class Search:
     tolerance : float
         That of the options, or what follows from the run.
     dynamics : Dynamics
+    settings : Settings
+        How trajectories of the run go on.
     """
 
     options: IdentifyOptions
     tolerance: float
     dynamics: Dynamics
+    settings: Settings
 
     @property
     def geometry(self) -> Geometry:
@@ -60,11 +53,6 @@ class Search:
     def longest(self) -> int:
         """Longest period guessed."""
         return self.options.max_orbit_period
-
-    @property
-    def rule(self) -> Rule:
-        """When bounded sets are the same."""
-        return Rule.of(self.options)
 
     @property
     def is_loose(self) -> bool:
@@ -90,8 +78,6 @@ class State:
     closed : ClosedCells
     ends : dict
         Orbit by the mark of a closed cell that was run on.
-    spirals : dict
-        Orbit by the box of a spiral that was run on, -1 where it stayed.
     """
 
     orbits: list[Orbit]
@@ -99,124 +85,10 @@ class State:
     group: np.ndarray
     closed: ClosedCells
     ends: dict[int, int]
-    spirals: dict[int, int] = field(default_factory=dict)
 
 
-_Steps = Generator[Guesses, list[Orbit | None], State]
-
-
-def search_all(points: Mapping[tuple[int, ...], Point], search: Search) -> dict[tuple[int, ...], State]:
-    """Search all points in step, so that their orbits are polished and their spirals run on together."""
-    searches = {index: _search(point, search) for index, point in points.items()}
-    answers: dict[tuple[int, ...], Any] = dict.fromkeys(searches)
-    states: dict[tuple[int, ...], State] = {}
-    while answers:
-        report("searching orbits", len(states), len(searches))
-        asked: dict[tuple[int, ...], Guesses] = {}
-        for index, answer in answers.items():
-            try:
-                asked[index] = searches[index].send(answer)
-            except StopIteration as stop:
-                states[index] = stop.value
-        answers = _polish_together(asked, points, search)
-    report("searching orbits", len(states), len(searches))
-    if search.options.polish:
-        _run_spirals(states, points, search)
-    return states
-
-
-def _run_spirals(
-    states: Mapping[tuple[int, ...], State], points: Mapping[tuple[int, ...], Point], search: Search,
-) -> None:  # fmt: skip
-    """Run on what comes back near and no orbit accounts for, in place: before a bounded set is named."""
-    asked = {i: _spirals(points[i], state.orbits, search) for i, state in states.items()}
-    asked = {i: guesses for i, guesses in asked.items() if len(guesses.key)}
-    if not asked:
-        return
-    owner = np.repeat(np.arange(len(asked)), [len(g.key) for g in asked.values()])
-    start = np.concatenate([g.point for g in asked.values()])
-    engine = Engine(
-        np.stack([points[i].packed for i in asked]), np.array([points[i].frequency for i in asked]),
-        owner, start, tolerances=(RUN_ON_RTOL, RUN_ON_RTOL), max_orbit_period=search.longest,
-        residual=search.options.residual, geometry=search.geometry, system=search.dynamics.integrates,
-    )  # fmt: skip
-    known = [states[i].orbits for i in asked]
-    ends = follow(
-        start, owner, known, engine.advance, engine.polish, RUN_ON_LEGS, search.longest, search.geometry,
-        jump=engine.jump,
-    )  # fmt: skip
-    for number, (index, guesses) in enumerate(asked.items()):
-        states[index].orbits = ends.orbits[number]
-        reached = np.maximum(ends.orbit[owner == number], -1)
-        states[index].spirals = dict(zip(guesses.key.tolist(), reached.tolist(), strict=True))
-
-
-def _spirals(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Bounded cells that come back near and that none of the orbits accounts for."""
-    found = Guesses.none(len(search.geometry.scales))
-    for block in point.blocks():
-        label, _ = decide(block, orbits, search.tolerance, search.geometry)
-        rest = block.section[block.is_bounded & (label < 0)]
-        found = found.joined(spirals_of(rest, search.longest, search.tolerance, search.geometry))
-    return found.least(max(MAX_GUESSES, point.n_cells // SPIRALS_PER))
-
-
-def _polish_together(
-    asked: Mapping[tuple[int, ...], Guesses], points: Mapping[tuple[int, ...], Point],
-    search: Search,
-) -> dict[tuple[int, ...], list[Orbit | None]]:  # fmt: skip
-    if not asked:
-        return {}
-    sizes = [len(g.key) for g in asked.values()]
-    packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
-    frequency = np.repeat([points[i].frequency for i in asked], sizes)
-    start = np.concatenate([g.point for g in asked.values()])
-    period = np.concatenate([g.period for g in asked.values()])
-    mark = np.concatenate([g.mark for g in asked.values()])
-    unknown = np.flatnonzero(period == 0)
-    start[unknown], period[unknown] = run_on(
-        packed[unknown],
-        frequency[unknown],
-        start[unknown],
-        search.longest,
-        search.dynamics.integrates,
-    )
-    rows, place = _each_once(
-        np.repeat(np.arange(len(sizes)), sizes), start, period, mark, unknown, search.geometry
-    )
-    polished = polish(
-        packed[rows], frequency[rows], start[rows], period[rows],
-        geometry=search.geometry, system=search.dynamics.integrates, tolerance=search.options.residual,
-    )  # fmt: skip
-    orbits = [polished[i] if i >= 0 else None for i in place]
-    ends = np.cumsum(sizes)
-    return {i: orbits[end - n : end] for i, n, end in zip(asked, sizes, ends, strict=True)}
-
-
-def _each_once(
-    search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray,
-    geometry: Geometry,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Rows to polish, and for each row the place of its own among them, -1 for none.
-
-    Of rows that were run on and ended in one box, on one orbit that is, the one of least hash.
-    """
-    rows = np.arange(len(period))
-    key = mark.copy()
-    boxes = geometry.boxes(start[ended], STRICT)
-    key[ended] = hashes(np.concatenate([period[ended, None], boxes], axis=1))
-    group = np.stack([search.astype(np.uint64), np.isin(rows, ended).astype(np.uint64), key], axis=1)
-    order = rows[np.lexsort((mark, *group.T[::-1]))]
-    order = order[period[order] > 0]
-    new = np.ones(len(order), bool)
-    new[1:] = (group[order][1:] != group[order][:-1]).any(axis=1) | ~np.isin(order[1:], ended)
-    place = np.full(len(period), -1)
-    place[order] = np.cumsum(new) - 1
-    return order[new], place
-
-
-def _search(point: Point, search: Search) -> _Steps:
-    """Find the attractors of one point; yields guesses and is sent their orbits."""
+def search_orbits(point: Point, search: Search) -> Work[State]:
+    """Find the orbits that cells of a point have closed on, or are on their way to."""
     n_states = len(search.geometry.scales)
     closed = ClosedCells(search.geometry, search.box, Guesses.none(n_states))
     for block in point.blocks():
@@ -230,7 +102,7 @@ def _search(point: Point, search: Search) -> _Steps:
             guesses = guesses.least(MAX_GUESSES)
         for _ in range(ROUNDS_LOOSE if search.is_loose else ROUNDS):
             if len(guesses.key):
-                polished = yield guesses
+                polished = moving((yield Polish(guesses)), point, search.geometry)
                 more = distinct([*orbits, *(o for o in polished if o is not None)], search.geometry)
                 if len(more) == len(orbits):
                     break
@@ -242,13 +114,22 @@ def _search(point: Point, search: Search) -> _Steps:
     if search.is_loose:
         rest = _closed_undecided(point, orbits, search)
         if len(rest.key):
-            answers = yield rest
+            answers = moving((yield Polish(rest)), point, search.geometry)
             for mark, orbit in zip(rest.mark, answers, strict=True):
                 if orbit is not None and orbit.is_stable:
                     number = number_of(orbit, orbits, search.geometry)
                     orbits = orbits if number < len(orbits) else [*orbits, orbit]
                     ends[int(mark)] = number
     return State(orbits, keys, group, closed, ends)
+
+
+def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> list[Orbit | None]:
+    """Orbits without those that are equilibria: these are added to the point's, in place."""
+    if not point.can_rest:
+        return list(orbits)
+    return [
+        None if o is None or rest_of_orbit(point, o.points[0], geometry) is not None else o for o in orbits
+    ]
 
 
 def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:

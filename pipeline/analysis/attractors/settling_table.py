@@ -1,4 +1,4 @@
-"""Table of bounded sets that were run on."""
+"""Table of the sets that do not close, and what their extended cells showed."""
 
 from __future__ import annotations
 
@@ -15,50 +15,54 @@ from pipeline.analysis.tabular import (
     where_of,
     words_of,
 )
-from pipeline.layout.vocabulary import model_of
+from pipeline.layout.vocabulary import APERIODIC, model_of
 from pipeline.layout.words import periods_of
 from pipeline.products.product import Table
 
 
 def settling_table(ds: xr.Dataset) -> Table:
-    """Table of the bounded sets."""
+    """Table of the sets that do not close."""
     rows = settling_rows(ds)
     return Table(rows, settling_lines(ds, rows))
 
 
 def settling_rows(ds: xr.Dataset) -> list[Row]:
-    """Return a row per bounded set and parameter point: what became of the sample that was run on."""
-    dims = [str(d) for d in ds["verdict"].dims if d != "attractor"]
-    words, n = words_of(ds["verdict"]), ds.sizes["attractor"]
+    """Return a row per set that does not close and parameter point: what became of its extended cells."""
+    dims = [str(d) for d in ds["kind"].dims if d != "attractor"]
+    kinds, stabilities = words_of(ds["kind"]), words_of(ds["stability"])
     rows = []
-    for *index, i in np.argwhere(ds["verdict"].values > 0).tolist():
+    there = np.isin(ds["kind"].transpose(*dims, "attractor").values, APERIODIC)
+    for *index, i in np.argwhere(there).tolist():
         at = dict(zip(dims, index, strict=True))
         one = ds.isel(at).isel(attractor=i)
-        row: Row = {**where_of(ds, at), "attractor_id": i, "verdict": words[int(one["verdict"])]}
+        row: Row = {**where_of(ds, at), "attractor_id": i, "kind": kinds[int(one["kind"])]}
+        row |= {"stability": stabilities[int(one["stability"])], "n_cells": int(one["n_cells"])}
         row |= {name: int(one[name]) for name in ("n_sampled", "n_left", "n_leaving")}
         row |= {name: float(one[name]) for name in ("mean_lifetime", "lifetime_low", "lifetime_high")}
-        to = [(f"orbit of period {int(one['new_orbit_period'][k - n])}" if k >= n else str(k), c)
-              for k, c in enumerate(one["n_to"].values.tolist()) if c]  # fmt: skip
+        to = [(k, c) for k, c in enumerate(one["n_to"].values.tolist()) if c]
         rows.append(row | {"to": ", ".join(f"{name} ({count})" for name, count in to)})
     return rows
 
 
 def settling_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """Return the table of bounded sets."""
-    n = ds.attrs["lifetimes_n_periods"]
+    """Return the table of sets that do not close."""
     if not rows:
-        return ["bounded sets: none, so there is nothing to run on"]
-    lines = [f"bounded sets: {len(rows)}; run on for {n} {periods_of(model_of(ds))}, which lifetimes are in"]
-    dims = [str(d) for d in ds["verdict"].dims if d != "attractor"]
+        return ["sets that do not close: none, so there is nothing to extend"]
+    periods = periods_of(model_of(ds))
+    lines = [f"sets that do not close: {len(rows)}; lifetimes are in {periods}"]
+    dims = [str(d) for d in ds["kind"].dims if d != "attractor"]
     table = []
     for row in rows:
         where = {f"{d}{unit_of(ds, d)}": f"{row[d]:g}" for d in dims}
         low, high = (number(row[name], ".0f") for name in ("lifetime_low", "lifetime_high"))
-        lifetime = f"{row['mean_lifetime']:.0f} ({low} to {high})"
+        lifetime = f"{number(row['mean_lifetime'], '.0f')} ({low} to {high})"
         if not row["n_left"]:
             lifetime = f"above {low}" if low != "-" else low
-        counts = {"sampled": "n_sampled", "near an orbit": "n_leaving", "left later": "n_left"}
+        counts = {
+            "cells": "n_cells", "extended": "n_sampled", "near an orbit": "n_leaving", "left later": "n_left",
+        }  # fmt: skip
         counts = {text: str(row[name]) for text, name in counts.items()}
-        told = {"id": str(row["attractor_id"]), "verdict": row["verdict"]}
+        told = {name: row[name].replace("_", " ") for name in ("kind", "stability")}
+        told = {"id": str(row["attractor_id"])} | told
         table.append(where | told | counts | {"mean lifetime": lifetime, "to": row["to"] or "-"})
     return lines + aligned(table)

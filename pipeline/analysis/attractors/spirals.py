@@ -36,14 +36,18 @@ SAME_LAG = 1.5
 MAX_GUESSES = 64
 """Most guesses per parameter point from cells that are not closed."""
 
-SPIRALS_PER = 20
-"""One cell in so many is run on at most, where that is more than `MAX_GUESSES`."""
-
 SLOWLY, BESIDE = 1.2, (0.005, 0.01, 0.02, 0.04, 0.08)
 """Largest multiplier of an unstable orbit beside which others are looked for, and scaled distances there."""
 
-RUN_ON_LEGS = 32
-"""How long spirals are run on, in legs of `following.LEG` drive periods."""
+CHEAP = 4
+"""Longest period of which every recurrence is a guess: chaos passes many orbits, and long ones are dear."""
+
+CLOSES_IN = 0.9
+"""Share of the distance between recurring sections that is left in the later half, at most."""
+
+LEAP, LINEAR = 2.0, 0.1
+"""How far a cell that leaves an unstable orbit leaps, in its distance, and the error of the linear map that
+this allows, in units of the growth."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,8 @@ def _recurring(section: np.ndarray, max_period: int, geometry: Geometry) -> tupl
 def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     n, k, n_states = section.shape
     period, centre = np.zeros(n, np.int64), section[:, -1].copy()
-    for p in range(1, min(max_period, k // (N_PARTS * PER_PHASE)) + 1):
+    # of long periods one shrinks by chance
+    for p in range(1, min(max_period, CHEAP, k // (N_PARTS * PER_PHASE)) + 1):
         m = k // (N_PARTS * p)
         rest = np.flatnonzero(period == 0)
         own = section[rest, k - N_PARTS * m * p :].reshape(len(rest), N_PARTS, m, p, n_states)
@@ -119,7 +124,8 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Gue
     """
     found = Recurrence.of(section, max_period, geometry)
     marks = marks_of(section)
-    recurring, contracting = np.flatnonzero(found.period), np.flatnonzero(found.centred)
+    worth = (found.period > 0) & ((found.period <= CHEAP) | closes_in(section, max_period, geometry))
+    recurring, contracting = np.flatnonzero(worth), np.flatnonzero(found.centred)
     spirals = _guesses(
         found.period[recurring], found.lag[recurring], marks[recurring], section[recurring, -1], geometry
     )
@@ -129,6 +135,19 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Gue
         found.centred[contracting], away, marks[contracting], found.centre[contracting], geometry
     )
     return spirals.joined(means)
+
+
+def closes_in(section: np.ndarray, max_period: int, geometry: Geometry) -> np.ndarray:
+    """Cells that come nearer to themselves: what passes an orbit of a chaotic set is worth no Newton step."""
+    found = Recurrence.of(section, max_period, geometry)
+    closes = found.centred > 0
+    half = section.shape[1] // 2
+    for p in np.unique(found.period[found.period > 0]).tolist():
+        rows = np.flatnonzero(found.period == p)
+        lag = geometry.distance(section[rows, p:], section[rows, :-p])
+        early, late = lag[:, : half - p // 2].max(axis=1), lag[:, half - p // 2 :].max(axis=1)
+        closes[rows] |= late <= CLOSES_IN * early
+    return np.asarray(closes)
 
 
 def _guesses(
@@ -166,16 +185,52 @@ def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Gues
     return Guesses(mark, np.zeros(len(mark)), mark, point, period_of).best()
 
 
-def spirals_of(section: np.ndarray, max_period: int, side: float, geometry: Geometry) -> Guesses:
-    """Cells that come back near, the best one of each box of a side, to be run on: keys are `keys_of`."""
-    found = Recurrence.of(section, max_period, geometry)
-    rows = np.flatnonzero(found.is_near)
-    last = section[rows, -1]
-    score = np.minimum(found.lag[rows], NEAR)
-    own = keys_of(section[rows], side, geometry)
-    return Guesses(own, score, marks_of(section[rows]), last, found.period[rows]).best()
-
-
 def keys_of(section: np.ndarray, side: float, geometry: Geometry) -> np.ndarray:
     """Hash of the box that the last section of each cell lies in."""
     return hashes(geometry.boxes(section[:, -1], side))
+
+
+def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np.ndarray:
+    """Where cells that leave an unstable orbit slowly will be when they are `LEAP` times as far from it.
+
+    Beside a bifurcation that takes thousands of periods, along which the orbit's monodromy matrix tells the
+    motion. Let u be the parts of a cell's distance along the unstable eigenvectors, at the sections that
+    share the phase of the orbit's first point, and lambda the multipliers. A cell leaps as long as
+    ``|u'' - lambda**2 u| <= 0.1 (|lambda|**2 - 1) |u|`` over the younger half of them, two returns apart:
+    near a doubling what is quadratic cancels over two.
+
+    Parameters
+    ----------
+    section
+        A leg, shape (n, LEG, state).
+    orbits
+        Known orbits.
+    geometry
+        Of the states.
+
+    Returns
+    -------
+    ndarray, (n, state)
+        NaN for cells that do not leap.
+    """
+    states = np.full((len(section), section.shape[2]), np.nan)
+    scales = np.asarray(geometry.scales)
+    for orbit in orbits:
+        growth = float(np.abs(orbit.multipliers).max())
+        # where it is fast, nothing is gained
+        if not 1.0 < growth < LEAP ** (orbit.period / section.shape[1]):
+            continue
+        values, vectors = np.linalg.eig(scaled_derivative(orbit, geometry))
+        grows = np.abs(values) > 1.0
+        values, onto = values[grows], np.linalg.inv(vectors)[grows].T
+        n = 2 * int(np.log(LEAP) / np.log(growth) / 2)
+        for phase in range(orbit.period):
+            index = np.arange(section.shape[1] - 1 - phase, -1, -orbit.period)[::-1]
+            distance = geometry.difference(section[:, index[len(index) // 2 :]], orbit.points[0])
+            along = distance @ onto
+            error = np.abs(along[:, 2:] - along[:, :-2] * values**2)
+            allowed = LINEAR * (np.abs(values) ** 2 - 1.0) * np.abs(along[:, :-2])
+            linear = (error <= allowed).all(axis=(1, 2)) & (distance.shape[1] > PER_PHASE)
+            more = ((along[linear, -1] * (values**n - 1.0)) @ vectors[:, grows].T).real
+            states[linear] = orbit.points[0] + (distance[linear, -1] + more) * scales
+    return states

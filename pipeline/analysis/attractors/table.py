@@ -1,4 +1,4 @@
-"""Table of attractors."""
+"""Table of attractors, and of the other sets that cells are on."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.basins import outcomes
 from pipeline.analysis.basins.numbers import Interval, basin_fractions
+from pipeline.analysis.outcomes import outcomes, sentence
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     Row,
     aligned,
-    cell_counts,
     distinct,
     heading,
     largest_share,
@@ -25,8 +24,12 @@ from pipeline.analysis.tabular import (
     words_of,
 )
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import split_dims
+from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, split_dims
 from pipeline.products.product import Table
+
+_NUMBERS = (
+    "lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low", "lifetime_high",
+)  # fmt: skip
 
 
 def attractors_table(ds: xr.Dataset) -> Table:
@@ -36,10 +39,10 @@ def attractors_table(ds: xr.Dataset) -> Table:
 
 
 def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence: float = 0.95) -> list[Row]:
-    """Return a row per attractor and parameter point.
+    """Return a row per set and parameter point.
 
-    `fraction` is that of the cells whose outcome is known, with its interval; a continuation's branches
-    are no sample of initial conditions, so they have none.
+    `fraction` is that of the cells that end on attractors or diverge, with its interval: NaN of a set that
+    does not attract. A continuation's branches are no sample of initial conditions, so they have none.
     """
     dims, start_dims = split_dims(ds["attractor_id"])
     words = words_of(ds["decision"])
@@ -60,7 +63,8 @@ def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence:
             row = {**where_of(ds, at), **_attractor(one.isel(attractor=i))}
             if fractions is not None:
                 own = fractions.isel(at).sel(label=i)
-                row |= {name: float(own[name]) for name in ("fraction", "low", "high")}
+                counts = row["stability"] == STABILITIES[ATTRACTS]
+                row |= {n: float(own[n]) if counts else np.nan for n in ("fraction", "low", "high")}
             rows.append(row | {f"by_{name}": int(decisions[k, i]) for k, name in enumerate(words) if k})
     return rows
 
@@ -71,6 +75,8 @@ def _attractor(one: xr.Dataset) -> Row:
     row: Row = {
         "attractor_id": int(one["attractor"]),
         "kind": words_of(one["kind"])[int(one["kind"])],
+        "stability": words_of(one["stability"])[int(one["stability"])],
+        "evidence": words_of(one["evidence"])[int(one["evidence"])],
         "orbit_period": int(one["orbit_period"]),
         "period_s": float(one["period_s"]),
     }
@@ -81,7 +87,9 @@ def _attractor(one: xr.Dataset) -> Row:
         names = one[dim].values if dim in one.coords else range(one.sizes[dim])
         row |= {f"rotation_{n}": float(v) for n, v in zip(names, one["rotation"].values, strict=True)}
     row["multiplier_modulus"] = float(largest[0]) if np.isfinite(largest).any() else np.nan
-    row["is_stable"] = int(one["is_stable"])
+    row["multiplier_error"] = float(one["multiplier_error"])
+    row |= {name: float(one[name]) for name in _NUMBERS}
+    row |= {name: int(one[name]) for name in ("n_sampled", "n_left", "closes_above")}
     if "eigenvalue_real" in one:
         row["eigenvalue_real"] = float(one["eigenvalue_real"][0])
         row["eigenvalue_imag"] = float(np.abs(one["eigenvalue_imag"][0]))
@@ -96,10 +104,13 @@ def _attractor(one: xr.Dataset) -> Row:
 
 def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the table per parameter point if there are few, otherwise a line per attractor."""
-    dims, start_dims = split_dims(ds["attractor_id"])
+    dims, _ = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
-    n = ds.sizes["attractor"]
+    attracts = (ds["stability"] == ATTRACTS).any(dims) if dims else ds["stability"] == ATTRACTS
+    n, others = int(attracts.sum()), int((~attracts).sum())
     lines = [f"{n} attractor{'s' * (n != 1)} at {n_points} parameter point{'s' * (n_points != 1)}"]
+    if others:
+        lines[0] += f", and {others} other set{'s' * (others != 1)} that cells are on"
     if n_points > FEW_POINTS:
         lines += summary(ds, rows, dims, _id_summary)
     else:
@@ -108,7 +119,37 @@ def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
             where = where_of(ds, at)
             here = [row for row in rows if all(row[k] == v for k, v in where.items())]
             lines += heading(ds, where) + aligned([_attractor_words(row, n_points) for row in here])
-    return lines + cell_counts(ds, start_dims)
+    return [*lines, sentence(ds), *_remarks(ds, rows)]
+
+
+def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
+    """What a reader must know beside the table: conservative, periods not looked for, budgets spent."""
+    lines = []
+    if any(row["evidence"] == "volume" for row in rows):
+        lines.append("the flow preserves volume: a conservative system has no attractors")
+    above = sorted({row["closes_above"] for row in rows if row["closes_above"]})
+    longest = int(ds.attrs.get("identify_max_orbit_period", 0))
+    unsettled = [row for row in rows if row["stability"] == "not_settled"]
+    if above:
+        text = ", ".join(map(str, above))
+        lines.append(
+            f"cells come back after {text} periods, above the longest looked for: --max-orbit-period "
+            f"{above[-1]} (now {longest}) finds such orbits"
+        )
+    elif any(row["kind"] == "bounded_set" and row["lyapunov_high"] < 0.0 for row in unsettled):
+        lines.append(
+            f"cells that are not settled contract: they may close with a period above {longest}; "
+            "--max-orbit-period looks for longer ones"
+        )
+    if int(ds.attrs.get("identify_extend", 1)) == 0 and unsettled:
+        lines.append("nothing was extended (--no-extend): without it, samples of these cells are followed")
+    elif int(ds["ran_out"].sum()):
+        n = int(ds["ran_out"].sum())
+        lines.append(
+            f"the extension ended before all was told at {n} parameter point{'s' * (n != 1)}: "
+            f"--budget {2.0 * float(ds.attrs.get('identify_budget', 1.0)):g} allows twice as much"
+        )
+    return lines
 
 
 def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
@@ -117,6 +158,7 @@ def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
     words = {
         "id": str(row["attractor_id"]),
         "kind": row["kind"].replace("_", " "),
+        "stability": row["stability"].replace("_", " "),
         "period": str(row["orbit_period"] or "-"),
     }
     if "eigenvalue_real" in row:  # a flow: returns are not of one length
@@ -128,15 +170,41 @@ def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
     words["|multiplier|"] = number(row["multiplier_modulus"], ".4g" if "eigenvalue_real" in row else ".4f")
     if "eigenvalue_real" in row:
         words["eigenvalue"] = _eigenvalue(row)
+    if row["kind"] in ("torus", "chaotic_set", "bounded_set"):
+        words["exponent per s"] = _exponent(row)
     words["cells"] = str(row["n_cells"])
     if "fraction" in row:
-        words["share"] = with_interval(row)
+        words["share"] = with_interval(row) if np.isfinite(row["fraction"]) else "-"
     if "mirror_partner" in row:
         words["mirror"] = str(row["mirror_partner"]) if row["mirror_partner"] >= 0 else "-"
     words["letter"] = letter(row["attractor_id"])
     if n_points > 1 and "match_basis" in row:
         words["id by"] = row["match_basis"].replace("_", " ")
-    return words | {"decided": decided}
+    return words | {"decided": decided, "shown by": _shown_by(row)}
+
+
+_SHOWN_BY = {
+    "none": "-", "eigenvalues": "eigenvalues", "multipliers": "multipliers",
+    "approach": "both sides come nearer", "volume": "volume preserved",
+}  # fmt: skip
+
+
+def _shown_by(row: Row) -> str:
+    """What the stability rests on."""
+    low = number(row["lifetime_low"], ".0f")
+    if row["evidence"] == "stayed":
+        return f"{row['n_sampled']} stayed, lifetime above {low}"
+    if row["evidence"] == "left":
+        high = number(row["lifetime_high"], ".0f")
+        return f"{row['n_left']} of {row['n_sampled']} left, lifetime {low} to {high}"
+    return _SHOWN_BY[row["evidence"]]
+
+
+def _exponent(row: Row) -> str:
+    """Largest exponent with its interval [1/s]."""
+    if not np.isfinite(row["lyapunov_max"]):
+        return "-"
+    return f"{row['lyapunov_max']:.3g} ({row['lyapunov_low']:.3g} to {row['lyapunov_high']:.3g})"
 
 
 def _eigenvalue(row: Row) -> str:
@@ -151,6 +219,7 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dic
     words = {
         "id": str(rows[0]["attractor_id"]),
         "kind": distinct(r["kind"].replace("_", " ") for r in rows),
+        "stability": distinct(r["stability"].replace("_", " ") for r in rows),
         "periods": distinct(r["orbit_period"] for r in rows if r["orbit_period"]) or "-",
     }
     if "eigenvalue_real" in rows[0]:

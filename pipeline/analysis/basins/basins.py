@@ -14,12 +14,10 @@ import xarray as xr
 from pipeline.analysis.basins.boundaries import basin_entropy, uncertainty_exponent
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.basins.wada import wada_merge_test
+from pipeline.analysis.outcomes import other_cells, outcomes
 from pipeline.layout import vocabulary
-from pipeline.layout.vocabulary import split_dims
+from pipeline.layout.vocabulary import ATTRACTS, split_dims
 from pipeline.products.basins import BasinOptions
-
-DIVERGED = -2
-"""Label of the cells that diverged: an outcome like an attractor. -1 is no outcome."""
 
 
 def basins(
@@ -43,11 +41,12 @@ def basins(
     Returns
     -------
     Dataset
-        On the cells: `attractor_id`, `decision`, `status`, `n_periods`. On the parameter dims and
-        `label`, the ids and -2 where cells diverged: `count`, `fraction` and all that
+        On the cells: `attractor_id`, `decision`, `status`, `n_periods`, and `outcome`, the attractor that a
+        cell ends on, -2 where it diverged, -1 else (`pipeline.analysis.outcomes`). On the parameter dims and
+        `label`, the ids of attractors and -2: `count`, `fraction` and all that
         `basin_numbers.basin_fractions` returns, cells without an outcome being unfinished. On the
-        parameter dims: `n_pending`, `n_undecided` (bounded, but on nothing found) and `n_failed` (step
-        limits), which add up to `n_unfinished`.
+        parameter dims: `n_pending`, `n_not_settled`, `n_transient`, `n_unstable`, `n_neutral` and `n_failed`
+        (step limits), which add up to `n_unfinished`. On the parameter dims and `attractor`: `stability`.
 
         If the starts are a grid, evenly spaced along every axis, on the parameter dims:
         `basin_entropy`, `boundary_basin_entropy`, `uncertainty_exponent`, `wada_beyond`, each with
@@ -64,14 +63,16 @@ def basins(
     options = options or BasinOptions(**changes)
     check_starts(ds)
     dims, start_dims = split_dims(ids["attractor_id"])
-    cells = ids[["attractor_id", "decision", "status"]].drop_dims("attractor", errors="ignore")
+    cells = ids[["attractor_id", "decision", "status", "stability", "ran_out"]]
     result = cells.assign(n_periods=ds["n_periods"].transpose(*dims, *start_dims).load())
     labels = outcomes(ids)
+    result["outcome"] = labels.assign_attrs(units="1", long_name="attractor that the cell ends on")
+    attract = np.flatnonzero((ids["stability"] == ATTRACTS).any(dims).values)
     fractions = basin_fractions(
-        labels, dims=start_dims, ids=ids["attractor"].values.tolist(),
+        labels, dims=start_dims, ids=ids["attractor"].values[attract].tolist(),
         inferred=ids["status"] == vocabulary.INFERRED, confidence=options.confidence, method=options.interval,
     )  # fmt: skip
-    result = result.assign(fractions.data_vars).assign(_unfinished(ids, start_dims))
+    result = result.assign(fractions.data_vars).assign(_unfinished(ids, dims))
     result = result.assign_coords(label=fractions["label"])
     reason = _no_grid(ds, start_dims)
     points = _Points(dims, tuple(ids.sizes[d] for d in dims))
@@ -103,30 +104,28 @@ def check_starts(ds: xr.Dataset) -> None:
         raise ValueError("basins need several initial conditions per parameter point; this run has one.")
 
 
-def outcomes(ids: xr.Dataset) -> xr.DataArray:
-    """Label of each cell: its attractor, -2 (`DIVERGED`), or -1 if its outcome is not known."""
-    label = ids["attractor_id"].values.copy()
-    label[ids["status"].values == vocabulary.DIVERGED] = DIVERGED
-    return ids["attractor_id"].copy(data=label)
-
-
-def _unfinished(ids: xr.Dataset, start_dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
+def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
     """Numbers of cells without an outcome, by what became of them."""
-    status, unknown = ids["status"], ids["attractor_id"] < 0
-    pending, diverged = status == vocabulary.PENDING, status == vocabulary.DIVERGED
-    failed = status.isin(vocabulary.FAILED)
+    others = other_cells(ids)
+    shape = outcomes(ids).transpose(*dims, ...).shape
     kinds = {
-        "n_pending": (pending, "cells not computed"),
-        "n_undecided": (
-            unknown & ~pending & ~failed & ~diverged,
-            "cells on nothing found",
+        "n_pending": (("pending",), "cells not computed"),
+        "n_not_settled": (("not settled",), "cells of which nothing could be shown"),
+        "n_transient": (("on a transient set",), "cells on sets that others were seen to leave"),
+        "n_unstable": (("on an unstable orbit or equilibrium",), "cells on sets that do not attract"),
+        "n_neutral": (("on a neutral set",), "cells on neutral sets"),
+        "n_failed": (
+            ("step limit", "step underflow", "unreached", "no return"), "cells that could not be integrated",
         ),
-        "n_failed": (unknown & failed, "cells that could not be integrated"),
-    }
-    return {
-        name: (which & unknown).sum(start_dims, dtype=np.int64).assign_attrs(units="1", long_name=text)
-        for name, (which, text) in kinds.items()
-    }
+    }  # fmt: skip
+    found = {}
+    for name, (words, text) in kinds.items():
+        which = np.zeros(shape, bool)
+        for word in words:
+            which |= others.get(word, False)
+        count = which.reshape(*shape[: len(dims)], -1).sum(axis=-1, dtype=np.int64)
+        found[name] = xr.DataArray(count, dims=dims, attrs={"units": "1", "long_name": text})
+    return found
 
 
 def _no_grid(ds: xr.Dataset, start_dims: tuple[str, ...]) -> str:

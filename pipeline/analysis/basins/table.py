@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.basins import DIVERGED
+from pipeline.analysis.outcomes import DIVERGED, sentence
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     Row,
     aligned,
-    cell_counts,
     heading,
     largest_share,
     ranges,
@@ -48,11 +47,14 @@ def basin_rows(ds: xr.Dataset) -> list[Row]:
 
 def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return fractions and numbers on boundaries: a table per point if there are few, or ranges."""
-    dims, start_dims = split_dims(ds["attractor_id"])
+    dims, _ = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
     seen = [row for row in rows if row["n_cells"]]
     confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
-    lines = [f"fractions of the cells whose outcome is known, {ds.attrs['basin_interval']}, {confidence}"]
+    lines = [
+        f"fractions of the cells that end on attractors or diverge, {ds.attrs['basin_interval']}, "
+        f"{confidence}"
+    ]
     if n_points > FEW_POINTS:
         lines += summary(ds, seen, dims, _label_summary)
         lines += [_range_line(ds, name, text) for name, text in _BOUNDARY.items() if name in ds]
@@ -69,7 +71,7 @@ def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
             lines += _boundary_lines(one)
     if ds.attrs["not_computed"]:
         lines += [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
-    return lines + cell_counts(ds, start_dims)
+    return [*lines, sentence(ds)]
 
 
 def _label(code: int) -> str:

@@ -13,7 +13,7 @@ from magpend_core.models.parameters import Parameters
 from magpend_core.orbits import polish_orbits, scaled_distance, stroboscopic_map
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.layout.vocabulary import BOUNDED, CLOSED_ORBIT, EQUILIBRIUM, frequency_of, is_start_dim
+from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, is_start_dim
 
 CLOSE = 0.1
 """Largest scaled distance of a recurrence that is worth a try."""
@@ -59,7 +59,7 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
                 state = np.asarray(one["attractor_points"].values[0])
                 start = Start(family, state, value_of(family, frequency, packed))
             yield Listed(
-                int(i), where, period, start, kind == EQUILIBRIUM, kind == CLOSED_ORBIT and not period
+                int(i), where, period, start, kind == EQUILIBRIUM, kind == PERIODIC_ORBIT and not period
             )
 
 
@@ -108,11 +108,11 @@ def attracting(
 def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str:
     """Why an attractor is no start, empty if it is one."""
     if one.is_rest:
-        return "an equilibrium, no closed orbit"
+        return "an equilibrium, not a periodic orbit"
     if one.is_cycle:
         return "a limit cycle seen at even times; see it at crossings: [section] of a new run"
     if not one.period:
-        return "a bounded set, no closed orbit; --recurrences P starts from orbits that it comes near"
+        return "a set that does not close; --recurrences P starts from orbits that it comes near"
     if one.start is None:
         return f"Newton's method found no orbit of period {one.period} there"
     if max_period and one.period > max_period:

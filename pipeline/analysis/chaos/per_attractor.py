@@ -4,7 +4,7 @@ Schema
 ------
 Dims: the *parameter dims* and ``attractor`` as in `pipeline.analysis.attractors.attractors`; ``rank``, as
 many as there are states; ``multiplier``. Variables, beside the copies of ``kind``, ``orbit_period``,
-``n_cells``, ``share``, ``multiplier_real``, ``multiplier_imag``, ``is_stable``:
+``n_cells``, ``share``, ``multiplier_real``, ``multiplier_imag``, ``stability``, ``evidence``:
 
 =============================== ========== ===================================================================
 variable                        own dims   meaning
@@ -52,10 +52,14 @@ from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yor
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
 from pipeline.analysis.chaos.sections import Floats, geometry_of
 from pipeline.layout.vocabulary import (
-    BOUNDED_SET,
-    CLOSED_ORBIT,
+    APERIODIC,
+    CHAOTIC_SET,
     EQUILIBRIUM,
     PERIODIC,
+    PERIODIC_ORBIT,
+    TORUS,
+    TRANSIENT,
+    UNSTABLE,
     model_of,
     split_dims,
 )
@@ -80,12 +84,14 @@ class Nature(IntEnum):
     CHAOTIC_BY_TEST = 5
     REGULAR_BY_TEST = 6
     TRANSIENT = 7
+    QUASI_PERIODIC = 8
 
     @property
     def words(self) -> str:
         """As tables say it."""
         by_test = self.name.endswith("_BY_TEST")
-        return self.name.removesuffix("_BY_TEST").lower() + (" (by the 0-1 test)" if by_test else "")
+        name = self.name.removesuffix("_BY_TEST").lower().replace("quasi_", "quasi-")
+        return name + (" (by the 0-1 test)" if by_test else "")
 
     @property
     def has_dimension(self) -> bool:
@@ -142,8 +148,8 @@ def chaos_per_attractor(
     """
     dims, starts = split_dims(cells["motion"])
     copied = [
-        "kind", "orbit_period", "n_cells", "share", "multiplier_real", "multiplier_imag", "is_stable",
-        "period_s",
+        "kind", "stability", "evidence", "orbit_period", "n_cells", "share", "multiplier_real",
+        "multiplier_imag", "period_s", "lyapunov_max", "lyapunov_low", "lyapunov_high",
     ]  # fmt: skip
     copied += [name for name in ("eigenvalue_real", "eigenvalue_imag") if name in attractors]
     own = attractors[copied].transpose(*dims, "attractor", ...)
@@ -188,7 +194,7 @@ def _of_attractor(
 ) -> dict[str, Any]:
     """Counts, exponents, 0-1 test and nature of one attractor."""
     is_own = cells.values["attractor_id"] == number
-    found: dict[str, Any] = {"kind_is_bounded": int(one["kind"]) == BOUNDED_SET}
+    found: dict[str, Any] = {"kind_is_bounded": int(one["kind"]) in APERIODIC}
     found |= _counts(cells, is_own, options)
     found |= _exponents(one, cells, is_own, n_states)
     k = cells.get("zero_one")
@@ -223,7 +229,7 @@ def _exponents(
     one: xr.Dataset, cells: _Cells, is_own: npt.NDArray[np.bool_], n_states: int
 ) -> dict[str, Any]:
     real, imaginary = one["multiplier_real"].values, one["multiplier_imag"].values
-    if int(one["kind"]) == CLOSED_ORBIT and np.isfinite(real).all():
+    if int(one["kind"]) == PERIODIC_ORBIT and np.isfinite(real).all():
         rate = orbit_exponents(real + 1j * imaginary, float(one["period_s"]), cells.is_flow)
         zero = np.zeros(n_states)
         return {
@@ -253,20 +259,23 @@ def _exponents(
 
 
 def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Nature:
-    if int(one["kind"]) in (CLOSED_ORBIT, EQUILIBRIUM) and int(one["is_stable"]) == 1:
-        return Nature.REGULAR
-    if found["n_transient"] == int(one["n_cells"]):
+    """Nature by what the set was shown to be; where nothing was, by its exponents or the 0-1 test."""
+    kind, stability = int(one["kind"]), int(one["stability"])
+    if kind in (PERIODIC_ORBIT, EQUILIBRIUM):
+        return Nature.UNDECIDED if stability == UNSTABLE else Nature.REGULAR
+    if stability == TRANSIENT or found["n_transient"] == int(one["n_cells"]):
         return Nature.TRANSIENT
+    if kind == TORUS:
+        return Nature.QUASI_PERIODIC
     rate = found.get("attractor_lyapunov")
     if rate is not None and np.isfinite(rate[0]):
         margin = np.maximum(options.n_sigma * found["attractor_lyapunov_stderr"], options.least)
-        if int(one["kind"]) in (CLOSED_ORBIT, EQUILIBRIUM):
-            return Nature.REGULAR if rate[0] <= margin[0] else Nature.UNDECIDED
         if rate[0] > margin[0]:
             return Nature.HYPERCHAOTIC if len(rate) > 1 and rate[1] > margin[1] else Nature.CHAOTIC
-        return Nature.REGULAR if rate[0] < -margin[0] else Nature.UNDECIDED
-    if int(one["kind"]) == CLOSED_ORBIT:
-        return Nature.REGULAR if int(one["is_stable"]) < 0 else Nature.UNDECIDED
+        if kind != CHAOTIC_SET:
+            return Nature.REGULAR if rate[0] < -margin[0] else Nature.UNDECIDED
+    if kind == CHAOTIC_SET:
+        return Nature.CHAOTIC
     k = found.get("median_zero_one")
     if k is None:
         return Nature.UNKNOWN

@@ -1,4 +1,4 @@
-"""Correlation dimension per attractor, of bounded sets that stay, and why the others have none."""
+"""Correlation dimension of attractors that do not close, and why other sets have none."""
 
 from __future__ import annotations
 
@@ -7,27 +7,25 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.attractors.lifetimes import ATTRACTOR, lifetimes
 from pipeline.analysis.chaos.dimensions import correlation_dimension
 from pipeline.analysis.chaos.per_attractor import pooled
 from pipeline.analysis.chaos.sections import geometry_of
 from pipeline.analysis.selection import select_points
-from pipeline.layout.vocabulary import BOUNDED_SET, split_dims
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, split_dims
 from pipeline.products.chaos import DimensionOptions
 
-REASONS = ("has_dimension", "absent", "closed_orbit", "transient", "too_few_points")
-HAS_DIMENSION, ABSENT, CLOSED, TRANSIENT, TOO_FEW = range(len(REASONS))
+REASONS = ("has_dimension", "absent", "closed", "does_not_attract", "too_few_points")
+HAS_DIMENSION, ABSENT, CLOSED, NO_ATTRACTOR, TOO_FEW = range(len(REASONS))
 """Values of `reason`."""
 
 
 def section_dimension(
     ds: xr.Dataset, attractors: xr.Dataset, options: DimensionOptions | None = None, **changes: Any
 ) -> xr.Dataset:
-    """Correlation dimension of each bounded set that stays, from the sections of its cells.
+    """Correlation dimension of each attractor that does not close, from the sections of its cells.
 
     A cell that is still closing, or a chaotic transient, fills nothing: a slope of its correlation sum is no
-    dimension. So bounded sets are run on first, as `lifetimes` does, and only those that none of the sample
-    leaves have a dimension.
+    dimension. So only sets that were shown to attract have one.
 
     Parameters
     ----------
@@ -45,7 +43,7 @@ def section_dimension(
     Dataset
         On the parameter dims and `attractor` (those that a point of the selection has): the variables of
         `pipeline.analysis.chaos.dimensions.correlation_dimension`; `n_cells`, `share`, `kind`; `reason`, why
-        there is no dimension (`REASONS`); `verdict`, `n_sampled`, `n_left` and `lifetime_low` of `lifetimes`.
+        there is no dimension (`REASONS`); `stability`, `n_sampled`, `n_left`, `lifetime_low` of `identify`.
 
     Raises
     ------
@@ -58,16 +56,15 @@ def section_dimension(
     dims, starts = split_dims(part["status"])
     found = attractors.sel({d: part[d].values for d in dims})
     present = (found["kind"] > 0).any([d for d in found["kind"].dims if d != "attractor"])
-    stay = lifetimes(part, found, options)
-    found, stay = (x.isel(attractor=np.flatnonzero(present.values)) for x in (found, stay))
+    found = found.isel(attractor=np.flatnonzero(present.values))
     section = part[["section", "status"]].load().assign_attrs(ds.attrs)
     ids = found["attractor_id"].transpose(*dims, *starts).values
     curves, reason = [], np.full(found["kind"].transpose(*dims, "attractor").shape, ABSENT, np.int8)
     kind = found["kind"].transpose(*dims, "attractor").values
-    verdict = stay["verdict"].transpose(*dims, "attractor").values
+    stability = found["stability"].transpose(*dims, "attractor").values
     for index in np.ndindex(*reason.shape):
         number = int(found["attractor"].values[index[-1]])
-        stays = kind[index] == BOUNDED_SET and verdict[index] == ATTRACTOR
+        stays = kind[index] in APERIODIC and stability[index] == ATTRACTS
         own = (ids[index[:-1]] == number).ravel() & stays
         point = section.isel(dict(zip(dims, index[:-1], strict=True)))
         curve = correlation_dimension(
@@ -76,21 +73,21 @@ def section_dimension(
         )  # fmt: skip
         curves.append(curve)
         reason[index] = _reason(int(kind[index]), stays, float(curve["correlation_dimension"]))
-    return _dataset(found, stay, curves, reason, dims).assign_attrs(
+    return _dataset(found, curves, reason, dims).assign_attrs(
         {**ds.attrs, **{f"dimension_{k}": getattr(options, k) for k in ("theiler", "n_max", "floor")}}
     )
 
 
 def _reason(kind: int, stays: bool, dimension: float) -> int:
-    if kind != BOUNDED_SET:
+    if kind not in APERIODIC:
         return CLOSED if kind else ABSENT
     if not stays:
-        return TRANSIENT
+        return NO_ATTRACTOR
     return HAS_DIMENSION if np.isfinite(dimension) else TOO_FEW
 
 
 def _dataset(
-    found: xr.Dataset, stay: xr.Dataset, curves: list[xr.Dataset], reason: np.ndarray, dims: tuple[str, ...]
+    found: xr.Dataset, curves: list[xr.Dataset], reason: np.ndarray, dims: tuple[str, ...]
 ) -> xr.Dataset:
     own = (*dims, "attractor")
     variables: dict[str, Any] = {}
@@ -106,6 +103,5 @@ def _dataset(
         "units": "1", "long_name": "why there is no dimension",
         "flag_values": np.arange(len(REASONS), dtype=np.int8), "flag_meanings": " ".join(REASONS),
     }  # fmt: skip
-    result = found[["n_cells", "share", "kind"]].transpose(*own).assign(variables)
-    kept = stay[["verdict", "n_sampled", "n_left", "lifetime_low"]].transpose(*own)
-    return result.assign(kept.data_vars).assign(reason=(own, reason, about))
+    copied = ["n_cells", "share", "kind", "stability", "n_sampled", "n_left", "lifetime_low"]
+    return found[copied].transpose(*own).assign(variables).assign(reason=(own, reason, about))

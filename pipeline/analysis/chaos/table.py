@@ -20,7 +20,7 @@ from pipeline.analysis.tabular import (
     with_error,
     words_of,
 )
-from pipeline.layout.vocabulary import split_dims
+from pipeline.layout.vocabulary import APERIODIC, KINDS, split_dims
 from pipeline.products.product import Table
 
 _COUNTS = (
@@ -64,6 +64,8 @@ def _rows(ds: xr.Dataset) -> list[Row]:
         one = ds.isel(at).isel(attractor=i)
         row: Row = {
             **where_of(ds, at), "attractor_id": int(one["attractor"]),
+            "kind": words_of(one["kind"])[int(one["kind"])],
+            "stability": words_of(one["stability"])[int(one["stability"])],
             "nature": natures[int(one["nature"])], "orbit_period": int(one["orbit_period"]),
             "n_cells": int(one["n_cells"]), "share": float(one["share"]),
             "exponents_from": sources[int(one["exponents_from"])],
@@ -92,6 +94,8 @@ def _spectrum(one: xr.Dataset) -> Row:
 def _words(row: Row) -> dict[str, str]:
     found = {
         "id": str(row["attractor_id"]),
+        "kind": row["kind"].replace("_", " "),
+        "stability": row["stability"].replace("_", " "),
         "motion": _nature_words(row),
         "period": str(row["orbit_period"] or "-"),
         "cells": str(row["n_cells"]),
@@ -169,19 +173,23 @@ _CURVE = (
     "fit_high", "largest_resolved",
 )  # fmt: skip
 _WHY = {
-    "closed_orbit": "none: a closed orbit", "transient": "none: a transient",
+    "closed": "none: it closes", "does_not_attract": "none: not shown to attract",
     "too_few_points": "none: too few points for a range to fit",
 }  # fmt: skip
+
+
+_OPEN = tuple(KINDS[code] for code in APERIODIC)
 
 
 def dimension_table(ds: xr.Dataset) -> Table:
     """Table with a row per attractor and parameter point: its dimension, or why it has none."""
     rows = _dimension_rows(ds)
     dims = [str(d) for d in ds["reason"].dims if d != "attractor"]
-    lines = ["correlation dimension of the sections of bounded sets that stay"]
-    if not any(row["kind"] == "bounded_set" for row in rows):
-        lines.append("  no bounded set: all attractors are closed orbits, of dimension 0")
-    table = [_dimension_words(ds, row, dims) for row in rows if row["kind"] == "bounded_set"]
+    lines = ["correlation dimension of the sections of attractors that do not close"]
+    open_rows = [row for row in rows if row["kind"] in _OPEN]
+    if not open_rows:
+        lines.append("  none: all sets close, and have the dimension 0 on the section")
+    table = [_dimension_words(ds, row, dims) for row in open_rows]
     return Table(rows, lines + aligned(table))
 
 
@@ -210,7 +218,7 @@ def _dimension_words(ds: xr.Dataset, row: Row, dims: Sequence[str]) -> dict[str,
         **{f"{d}{unit_of(ds, d)}": f"{row[d]:g}" for d in dims},
         "id": str(row["attractor_id"]),
         "cells": str(row["n_cells"]),
-        "run on": stays,
+        "extended": stays,
         "points": str(row["n_points"]),
         "dimension": _WHY.get(row["reason"], value),
         "fitted radii": ends,

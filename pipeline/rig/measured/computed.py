@@ -14,7 +14,14 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.selection import choose, select_points, start_dims
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import ABSENT, BOUNDED_SET, CLOSED_ORBIT, FREQUENCY_DIM, split_dims
+from pipeline.layout.vocabulary import (
+    ABSENT,
+    APERIODIC,
+    FREQUENCY_DIM,
+    PERIODIC_ORBIT,
+    UNSTABLE,
+    split_dims,
+)
 from pipeline.rig.measured.distances import Candidate
 from pipeline.runs.derive import AnalysedRun, refused
 from pipeline.spec.problems import SpecError
@@ -114,12 +121,15 @@ class Computed:
         return i if abs(f[i] - frequency_hz) <= reach or f[0] < frequency_hz < f[-1] else -1
 
     def regime(self, place: int, attractor: int) -> tuple[int, int] | None:
-        """Period (0 for a bounded set) and side of an attractor at a frequency; None if it is not there."""
+        """Period (0 of a set that does not close) and side of a set at a frequency; None if it is not there.
+
+        A rig does not show what is unstable, so that is not there either.
+        """
         one = self.attractors.isel({FREQUENCY_DIM: place}).sel(attractor=attractor)
         kind = int(one["kind"])
-        if kind == ABSENT:
+        if kind == ABSENT or int(one["stability"]) == UNSTABLE:
             return None
-        period = int(one["orbit_period"]) if kind == CLOSED_ORBIT else 0
+        period = int(one["orbit_period"]) if kind == PERIODIC_ORBIT else 0
         return period, int(one["side"]) if "side" in one else 0
 
     def candidates(self, frequency_hz: float, states: Sequence[str]) -> list[Candidate]:
@@ -133,10 +143,11 @@ class Computed:
             return []
         here = self.attractors.isel({FREQUENCY_DIM: i})
         found = []
-        for number in here["attractor"].values[here["kind"].values != ABSENT]:
+        for number in here["attractor"].values:
             regime = self.regime(i, int(number))
-            assert regime is not None
-            if int(here["kind"].sel(attractor=number)) == BOUNDED_SET:
+            if regime is None:
+                continue
+            if int(here["kind"].sel(attractor=number)) in APERIODIC:
                 points = self._set(i, int(number))
             else:
                 points = self._orbit(frequency_hz, i, int(number), regime[0])

@@ -13,7 +13,7 @@ from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.compute.task import rest_states
-from pipeline.layout.vocabulary import BOUNDED_SET, CLOSED_ORBIT, EQUILIBRIUM, section_attributes
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT, section_attributes
 from tests.core.flows import BAUTIN, HOPF, flow
 
 GRID = [[x, y] for x in np.linspace(-1.2, 1.2, 7) for y in np.linspace(-1.1, 1.1, 7)]
@@ -59,8 +59,8 @@ def test_identify__cycle_beside_equilibrium(value):
     """
     ds = cube(BAUTIN, GRID, crossing=Crossing("y", value, longest=20.0), mu=-0.1)
     found = identify(ds)
-    assert sorted(kinds(found)) == [CLOSED_ORBIT, EQUILIBRIUM]
-    rest, orbit = kinds(found).index(EQUILIBRIUM), kinds(found).index(CLOSED_ORBIT)
+    assert sorted(kinds(found)) == [EQUILIBRIUM, PERIODIC_ORBIT]
+    rest, orbit = kinds(found).index(EQUILIBRIUM), kinds(found).index(PERIODIC_ORBIT)
     squared = (np.array(GRID) ** 2).sum(axis=1)
     own = np.where(squared < 0.5 * (1.0 - np.sqrt(0.6)), rest, orbit)
     assert found["attractor_id"].values.tolist() == own.tolist()
@@ -73,7 +73,7 @@ def test_identify__cycle_beside_equilibrium(value):
     np.testing.assert_allclose(found["attractor_points"].values[rest, 0], 0.0, atol=1e-10)
     np.testing.assert_allclose(found["eigenvalue_real"].values[rest], -0.1, atol=1e-10)
     np.testing.assert_allclose(np.sort(found["eigenvalue_imag"].values[rest]), [-2.0, 2.0], atol=1e-10)
-    assert found["is_stable"].values.tolist() == [1, 1]
+    assert found["stability"].values.tolist() == [ATTRACTS] * 2
     assert float(found["lyapunov_max"][orbit]) == 0.0
     assert float(found["lyapunov_max"][rest]) == pytest.approx(-0.1, abs=1e-10)
 
@@ -82,8 +82,8 @@ def test_identify__cycle_beside_equilibrium(value):
 def test_identify__strobed_cycle_is_one(frequency_hz):
     """A strobe of the cycle's period, of half of it and of another one: one limit cycle, not one per cell."""
     found = identify(cube(HOPF, GRID, frequency_hz=frequency_hz))
-    assert sorted(kinds(found)) == [CLOSED_ORBIT, EQUILIBRIUM]
-    orbit = kinds(found).index(CLOSED_ORBIT)
+    assert sorted(kinds(found)) == [EQUILIBRIUM, PERIODIC_ORBIT]
+    orbit = kinds(found).index(PERIODIC_ORBIT)
     assert int(found["n_cells"][orbit]) == len(GRID) - 1
     assert float(found["period_s"][orbit]) == pytest.approx(np.pi, rel=1e-9)
     expected = [1.0, np.exp(-0.5 * np.pi)]

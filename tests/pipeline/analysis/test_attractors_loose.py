@@ -9,9 +9,10 @@ import xarray as xr
 from magpend_core import load_preset, sections
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.attractors.cells import Block
-from pipeline.analysis.attractors.deciding import CLOSED, RUN_ON, UNDECIDED, decide
+from pipeline.analysis.attractors.deciding import decide
 from pipeline.analysis.attractors.orbits import Orbit
 from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import ATTRACTS, CLOSED, EXTENDED, PERIODIC_ORBIT, UNDECIDED
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 
@@ -38,7 +39,7 @@ def orbit_of_cells(found):
     One cell in 64 may be one: how long it lasts changes with the last bit of the arithmetic.
     """
     rows = found["attractor_id"].values
-    on_orbit = (rows >= 0) & (found["kind"].values[rows] == 1)
+    on_orbit = (rows >= 0) & (found["kind"].values[rows] == PERIODIC_ORBIT)
     assert (~on_orbit).sum() <= 1
     return found["attractor_points"].values[rows, 0], np.where(
         on_orbit, found["orbit_period"].values[rows], 0
@@ -57,9 +58,9 @@ def test_identify__loose_closure_gives_the_labels_of_a_strict_run(frequency, per
     strict, loose = (run(frequency, tolerance) for tolerance in (1e-5, 2e-2))
     assert loose["n_periods"].sum() < 0.6 * strict["n_periods"].sum()
     expected, found = (identify(ds, parameters=load_preset()) for ds in (strict, loose))
-    closed = found["kind"].values == 1
+    closed = found["kind"].values == PERIODIC_ORBIT
     assert found["is_polished"].values[closed].all()
-    assert (found["is_stable"].values[closed] == 1).all()
+    assert (found["stability"].values[closed] == ATTRACTS).all()
     (points, period), (seen, seen_period) = orbit_of_cells(expected), orbit_of_cells(found)
     both = (period > 0) & (seen_period > 0)
     assert set(period[both]) == periods
@@ -74,7 +75,7 @@ def test_identify__loose_closure_sees_half_the_period():
     _, period = orbit_of_cells(found)
     assert (ds["orbit_period"].values == 1).mean() > 0.9
     assert set(period) - {0} == {2}
-    assert {CLOSED, RUN_ON} <= set(found["decision"].values.tolist())
+    assert {CLOSED, EXTENDED} <= set(found["decision"].values.tolist())
 
 
 def test_identify__loose_closure_in_any_order_and_in_blocks():

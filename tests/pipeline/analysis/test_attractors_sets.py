@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.bounded import Clouds, Rule
 from pipeline.analysis.attractors.cells import Block
-from pipeline.analysis.attractors.deciding import APPROACHING, CERTAIN, CLOSED, UNDECIDED, decide
+from pipeline.analysis.attractors.deciding import decide
 from pipeline.analysis.attractors.orbits import Orbit, raw_orbit
 from pipeline.analysis.attractors.spirals import near_closed
 from pipeline.analysis.sets import Geometry, groups, hashes, mean_distance, nearest_distances
-from pipeline.products.attractors import IdentifyOptions
+from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 
 GEOMETRY = Geometry((True, True, False, False), (1.0, 1.0, 10.0, 10.0))
 PLANE = Geometry((True, False), (1.0, 10.0))
@@ -61,16 +60,6 @@ def test_hashes__of_the_row_alone():
 def test_groups__connected():
     assert groups(5, np.array([[0, 3], [3, 4]])).tolist() == [0, 1, 2, 0, 0]
     assert len(set(groups(3, np.zeros((0, 2), int)))) == 3
-
-
-def test_anchors__by_their_own_data():
-    rng = np.random.default_rng(2)
-    section, turns = rng.normal(size=(50, 8, 4)), np.zeros((50, 2), int)
-    order = rng.permutation(50)
-    plain = Clouds.of(section, turns, GEOMETRY, Rule.of(IdentifyOptions()))
-    moved = Clouds.of(section[order], turns, GEOMETRY, Rule.of(IdentifyOptions()))
-    assert np.array_equal(plain.first(7).mark, moved.first(7).mark)
-    assert np.array_equal(plain.first(7).boxes, moved.first(7).boxes)
 
 
 def test_raw_orbit__the_same_from_any_phase():

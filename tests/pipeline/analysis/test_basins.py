@@ -8,6 +8,7 @@ import xarray as xr
 
 from magpend_core.status import Status
 from pipeline.analysis.basins.basins import basins
+from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.runs.derive import derive
 from pipeline.spec.problems import SpecError
 
@@ -24,12 +25,15 @@ def labelled(grids, status=None, spacing=0.1):
         "psi1_0": spacing * np.arange(grids.shape[1]),
         "psi2_0": spacing * np.arange(grids.shape[2]),
     }
+    per, shape = ("frequency", "attractor"), (len(grids), grids.max() + 1)
     ids = xr.Dataset(
         {
             "attractor_id": (DIMS, grids),
             "decision": (DIMS, (grids >= 0).astype(np.int8)),
             "status": (DIMS, status.astype(np.int8)),
-            "kind": (("frequency", "attractor"), np.ones((len(grids), grids.max() + 1), np.int8)),
+            "kind": (per, np.full(shape, PERIODIC_ORBIT, np.int8)),
+            "stability": (per, np.full(shape, ATTRACTS, np.int8)),
+            "ran_out": ("frequency", np.zeros(len(grids), np.int8)),
         },
         coords={**coords, "attractor": np.arange(grids.max() + 1)},
     )
@@ -76,7 +80,7 @@ def test_basins__cells_without_an_outcome():
     for row, code in enumerate((Status.PENDING, Status.BOUNDED, Status.STEP_LIMIT, Status.DIVERGED)):
         grid[row, :5], status[row, :5] = -1, code
     found = basins(*labelled([grid], [status]), interval="clopper-pearson").isel(frequency=0)
-    counts = [int(found[name]) for name in ("n_pending", "n_undecided", "n_failed", "n_unfinished")]
+    counts = [int(found[name]) for name in ("n_pending", "n_not_settled", "n_failed", "n_unfinished")]
     assert counts == [5, 5, 5, 15]
     assert found["label"].values.tolist() == [-2, 0, 1]
     assert found["count"].values.tolist() == [5, 180, 200]
@@ -141,7 +145,7 @@ def test_derive_basins__of_an_incomplete_run(made):
     n = made.plan.cells_in(0)
     assert int((found["status"] > 0).sum()) == n
     assert int(found["n_pending"].sum()) == made.plan.n_cells - n
-    per_point = found["n_unfinished"] - found["n_pending"] - found["n_undecided"] - found["n_failed"]
+    per_point = found["n_unfinished"] - found["n_pending"] - found["n_not_settled"] - found["n_failed"]
     assert not per_point.any()
     again = derive(made.info.directory, "basins", {"polish": False, "box": 2})
     xr.testing.assert_identical(found, again)

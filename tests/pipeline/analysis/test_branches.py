@@ -41,6 +41,7 @@ from pipeline.analysis.branches.problems import (
     torus_test,
 )
 from pipeline.analysis.branches.table import branches_table
+from pipeline.layout.vocabulary import BOUNDED_SET, PERIODIC_ORBIT
 
 
 @inline
@@ -259,7 +260,7 @@ def run_of(*periods, kinds=None):
     return parameters, xr.Dataset(
         {
             "status": (("frequency", "initial_condition"), np.ones((2, 1), np.int8)),
-            "kind": (dims, np.where(period > 0, 1, 2)),
+            "kind": (dims, np.where(period > 0, PERIODIC_ORBIT, BOUNDED_SET)),
             "orbit_period": (dims, period),
             "is_polished": (dims, (period > 0).astype(np.int8)),
             "attractor_points": ((*dims, "point", "state"), np.zeros((2, n, max(periods), 2))),
@@ -273,7 +274,7 @@ def test_attracting__all_periods_or_a_line_for_what_is_left_out():
     starts, left_out = attracting(found, parameters, "frequency", (0.1, 0.3))
     assert sorted(s.family.period for s in starts) == [1, 1, 5, 5, 7, 7]
     (line,) = left_out
-    assert line.startswith("attractor 3 at frequency 0.15 to 0.2 (2 points): a bounded set")
+    assert line.startswith("attractor 3 at frequency 0.15 to 0.2 (2 points): a set that does not close")
     assert "--recurrences" in line
     starts, left_out = attracting(found, parameters, "frequency", (0.1, 0.17), 5)
     assert sorted(s.family.period for s in starts) == [1, 5]

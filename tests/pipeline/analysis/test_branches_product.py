@@ -8,6 +8,7 @@ import pytest
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.table import branches_table, curves_table
 from pipeline.cli.exits import Exit
+from pipeline.layout.vocabulary import ABSENT, CHAOTIC_SET
 from pipeline.products.branches import BranchOptions
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.products.reporting import reporting
@@ -57,7 +58,7 @@ def test_attractors__ids_through_the_cascade(directory):
     basis = ds["match_basis"].values
     words = ds["match_basis"].attrs["flag_meanings"].split()
     assert {words[b] for b in basis[1:3, :2].ravel()} == {"doubling", "absent"}
-    assert ds["kind"].values[3].tolist() == [0, 0, 2]
+    assert ds["kind"].values[3].tolist() == [ABSENT, ABSENT, CHAOTIC_SET]
     text = "\n".join(attractors_table(ds).lines)
     assert "id by" in text
     assert "first appearance" in text
@@ -70,7 +71,7 @@ def test_branches__all_periods_or_a_line(directory):
     assert sorted(set(ds["orbit_period"].values.tolist())) == [1, 2, 4]
     assert any("following branches" in what and 0 < done <= total for what, done, total in heard)
     lines = branches_table(ds).lines
-    assert any("bounded set" in line and "--recurrences" in line for line in lines)
+    assert any("does not close" in line and "--recurrences" in line for line in lines)
     short = derive(directory, "branches", SHORT)
     left_out = [line for line in branches_table(short).lines if "take it with --period 4" in line]
     assert len(left_out) == 1

@@ -18,6 +18,17 @@ from pipeline.analysis.chaos.per_attractor import Nature
 from pipeline.analysis.chaos.staying import section_dimension
 from pipeline.analysis.chaos.table import chaos_table, dimension_table
 from pipeline.cli.exits import Exit
+from pipeline.layout.vocabulary import (
+    ABSENT,
+    ATTRACTS,
+    BOUNDED_SET,
+    EVIDENCE,
+    KINDS,
+    PERIODIC_ORBIT,
+    STABILITIES,
+    TRANSIENT,
+    UNSTABLE,
+)
 from pipeline.plots import plot_convergence, plot_dimension
 from pipeline.runs.derive import derive
 
@@ -51,24 +62,31 @@ def made_up(first, frequency=(2.0,), *, stderr=0.02, n_blocks=16, n_keep=5):
     )
 
 
-def attractors_of(cube, ids, kinds, periods=None, multipliers=None):
+def attractors_of(cube, ids, kinds, periods=None, multipliers=None, verdicts=None):
     """Attractors by hand: `ids` of the cells (frequency, cell), `kinds` (frequency, attractor)."""
     ids, kinds = np.atleast_2d(ids), np.atleast_2d(kinds)
-    periods = np.where(kinds == 1, 1, 0) if periods is None else np.atleast_2d(periods)
+    periods = np.where(kinds == PERIODIC_ORBIT, 1, 0) if periods is None else np.atleast_2d(periods)
     mu = np.full((*kinds.shape, 4), np.nan) if multipliers is None else np.asarray(multipliers, float)
     at, cells = ("frequency", "attractor"), ("frequency", "initial_condition")
     counts = np.stack([(ids == i).sum(1) for i in range(kinds.shape[1])], 1)
-    stable = np.where(np.isfinite(mu[..., 0]), np.abs(mu).max(-1) < 1, -1)
+    stability = np.where(np.isfinite(mu[..., 0]) & (np.abs(mu).max(-1) >= 1), UNSTABLE, ATTRACTS)
+    stability = np.where(kinds == ABSENT, ABSENT, stability) if verdicts is None else np.atleast_2d(verdicts)
+    unknown = np.full(kinds.shape, np.nan)
     return xr.Dataset(
         {
             "attractor_id": (cells, ids.astype(np.int32)),
-            "kind": (at, kinds.astype(np.int8), {"flag_meanings": "absent closed_orbit bounded_set"}),
+            "kind": (at, kinds.astype(np.int8), {"flag_meanings": " ".join(KINDS)}),
             "orbit_period": (at, periods.astype(np.int32)),
             "n_cells": (at, counts),
             "share": (at, counts / ids.shape[1]),
             "multiplier_real": ((*at, "multiplier"), mu),
             "multiplier_imag": ((*at, "multiplier"), np.where(np.isfinite(mu), 0.0, np.nan)),
-            "is_stable": (at, stable.astype(np.int8)),
+            "stability": (at, stability.astype(np.int8), {"flag_meanings": " ".join(STABILITIES)}),
+            "evidence": (at, np.zeros(kinds.shape, np.int8), {"flag_meanings": " ".join(EVIDENCE)}),
+            "n_sampled": (at, np.full(kinds.shape, 4)),
+            "n_left": (at, np.where(stability == TRANSIENT, 4, 0)),
+            "lifetime_low": (at, np.full(kinds.shape, 99.0)),
+            **{f"lyapunov_{end}": (at, unknown) for end in ("max", "low", "high")},
             "period_s": (at, periods / np.atleast_1d(cube["frequency"].values)[:, None]),
         },
         coords={"frequency": cube["frequency"], "attractor": np.arange(kinds.shape[1])},
@@ -78,13 +96,13 @@ def attractors_of(cube, ids, kinds, periods=None, multipliers=None):
 def one_set(cube):
     """All cells on one bounded set."""
     shape = cube["status"].shape
-    return attractors_of(cube, np.zeros(shape, int), np.full((shape[0], 1), 2))
+    return attractors_of(cube, np.zeros(shape, int), np.full((shape[0], 1), BOUNDED_SET))
 
 
 def test_chaos__exponents_of_each_attractor():
     """Two sets side by side: no mean over both, and no bias by which cells count as chaotic."""
     cube = made_up([0.3, 0.36, 0.8, 0.8])
-    found = chaos(cube, attractors_of(cube, [0, 0, 1, 1], [2, 2])).isel(frequency=0)
+    found = chaos(cube, attractors_of(cube, [0, 0, 1, 1], [BOUNDED_SET] * 2)).isel(frequency=0)
     assert found.attractor_lyapunov.values[0] == pytest.approx(0.33 + SPREAD)
     assert found.attractor_lyapunov.values[1] == pytest.approx(0.8 + SPREAD)
     # two cells 0.06 apart with errors of 0.02: variance 0.0018 between, of which 0.0004 is explained
@@ -106,7 +124,7 @@ def test_chaos__exponents_of_orbits_are_their_multipliers():
     cube["status"][:] = 1
     cube["orbit_period"][:] = 2
     mu = np.array([[[0.9, -0.5, 0.2, 0.1]]])
-    found = chaos(cube, attractors_of(cube, [0, 0], [1], [2], mu)).isel(frequency=0, attractor=0)
+    found = chaos(cube, attractors_of(cube, [0, 0], [PERIODIC_ORBIT], [2], mu)).isel(frequency=0, attractor=0)
     assert found.attractor_lyapunov.values == pytest.approx(np.log([0.9, 0.5, 0.2, 0.1]) * 2.0 / 2)
     assert found.exponents_from == 1
     assert found.attractor_kaplan_yorke == 0
@@ -121,7 +139,7 @@ def test_chaos__a_closed_cell_with_a_positive_exponent():
     cells = chaotic_cells(cube)
     assert cells.motion.values.tolist() == [[Motion.UNDECIDED, Motion.REGULAR, Motion.REGULAR]]
     assert cells.contradicts.values.tolist() == [[1, 0, 0]]
-    table = chaos_table(chaos(cube, attractors_of(cube, [0, 0, 0], [1])))
+    table = chaos_table(chaos(cube, attractors_of(cube, [0, 0, 0], [PERIODIC_ORBIT])))
     assert table.rows[0]["n_contradicting"] == 1
     assert "1 closed with a positive exponent" in "\n".join(table.lines)
 
@@ -191,7 +209,7 @@ def test_chaos__zero_one_needs_sections():
 def test_chaos__without_exponents():
     cube = made_up([0.3, -0.2], n_keep=256)[["section", "status", "orbit_period"]]
     cube["orbit_period"][0, 1] = 2
-    found = chaos(cube, attractors_of(cube, [0, 1], [2, 1]))
+    found = chaos(cube, attractors_of(cube, [0, 1], [BOUNDED_SET, PERIODIC_ORBIT]))
     assert "run it with [products] lyapunov" in found.attrs["not_computed"]
     assert found.motion.values.tolist() == [[Motion.UNKNOWN, Motion.REGULAR]]
     # K near 1 alone tells, and says what it rests on
@@ -203,7 +221,9 @@ def test_chaos__without_exponents():
 
 def test_chaos__correlation_dimension_of_enough_points():
     cube = on_a_plane()
-    found = chaos(cube, attractors_of(cube, [0] * 8 + [1, 1], [2, 2]), n_max=4000).isel(frequency=0)
+    found = chaos(cube, attractors_of(cube, [0] * 8 + [1, 1], [BOUNDED_SET] * 2), n_max=4000).isel(
+        frequency=0
+    )
     assert found.attractor_correlation.values[0] == pytest.approx(2.0, abs=0.15)
     assert np.isnan(found.attractor_correlation.values[1])
     without = chaos(cube, one_set(cube), n_max=0)
@@ -221,7 +241,9 @@ def test_chaos_table__a_summary_if_there_are_many_points():
     rates = np.full((8, 2), -0.2)
     rates[[0, 1, 4], 0] = [0.3, 0.38, 0.33]
     cube = made_up(rates, frequency)
-    table = chaos_table(chaos(cube, attractors_of(cube, np.tile([0, 1], (8, 1)), np.full((8, 2), 2))))
+    table = chaos_table(
+        chaos(cube, attractors_of(cube, np.tile([0, 1], (8, 1)), np.full((8, 2), BOUNDED_SET)))
+    )
     assert table.lines[0] == "16 cells at 8 parameter points"
     assert re.search(r"^  regular +0, 1 +13 +8 +1 to 4\.5$", table.lines[2])
     assert re.search(r"^  chaotic +0 +3 +3 +1 to 1\.5, 3$", table.lines[3])
@@ -331,32 +353,17 @@ def on_a_plane(n_cells=8, n_keep=500):
     return cube
 
 
-@pytest.fixture
-def verdicts(monkeypatch):
-    """Let sets stay (1) or not (2) instead of running them on."""
-
-    def stay(*codes):
-        def lifetimes(ds, found, options):
-            values = np.broadcast_to(np.array(codes, np.int8), found["kind"].shape)
-            own = found["kind"].dims
-            return xr.Dataset(
-                {
-                    "verdict": (own, values), "n_sampled": (own, 4 + 0 * values),
-                    "n_left": (own, 4 * (values == 2)), "lifetime_low": (own, np.full(values.shape, 99.0)),
-                },
-                found.coords,
-            )  # fmt: skip
-
-        monkeypatch.setattr("pipeline.analysis.chaos.staying.lifetimes", lifetimes)
-
-    return stay
-
-
-def test_section_dimension__of_each_set_that_stays(verdicts):
+def test_section_dimension__of_each_set_that_stays():
     cube = on_a_plane()
-    verdicts(1, 2, 0)
     found = section_dimension(
-        cube, attractors_of(cube, [0] * 8 + [1, 2], [2, 2, 1]), at={"frequency": 2.0}
+        cube,
+        attractors_of(
+            cube,
+            [0] * 8 + [1, 2],
+            [BOUNDED_SET, BOUNDED_SET, PERIODIC_ORBIT],
+            verdicts=[ATTRACTS, TRANSIENT, ATTRACTS],
+        ),
+        at={"frequency": 2.0},
     ).isel(frequency=0)
     assert found.n_points.values.tolist() == [4000, 0, 0]
     assert float(found.correlation_dimension[0]) == pytest.approx(2.0, abs=0.1)
@@ -364,15 +371,14 @@ def test_section_dimension__of_each_set_that_stays(verdicts):
     assert np.isnan(found.correlation_dimension.values[1:]).all()
     assert found.reason.values.tolist() == [0, 3, 2]
     lines = dimension_table(found.expand_dims("frequency")).lines
-    assert re.search(r"none: a transient", lines[3])
+    assert re.search(r"none: not shown to attract", lines[3])
     assert "4 of 4 left" in lines[3]
 
 
-def test_section_dimension__nothing_to_measure(verdicts):
-    verdicts(1)
+def test_section_dimension__nothing_to_measure():
     cube = made_up([0.3, 0.3], n_keep=50)
-    closed = section_dimension(cube, attractors_of(cube, [0, 0], [1]))
-    assert "no bounded set" in dimension_table(closed).lines[1]
+    closed = section_dimension(cube, attractors_of(cube, [0, 0], [PERIODIC_ORBIT]))
+    assert "all sets close" in dimension_table(closed).lines[1]
     few = section_dimension(cube, one_set(cube))
     assert "none: too few points" in dimension_table(few).lines[2]
 
@@ -381,10 +387,9 @@ def artists(fig, gid):
     return [a for a in fig.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)]
 
 
-def test_plot_dimension__curve_fit_and_slope(verdicts):
-    verdicts(1)
+def test_plot_dimension__curve_fit_and_slope():
     cube = on_a_plane()
-    ds = section_dimension(cube, attractors_of(cube, [0] * 8 + [-1, -1], [2]))
+    ds = section_dimension(cube, attractors_of(cube, [0] * 8 + [-1, -1], [BOUNDED_SET]))
     fig = plot_dimension(ds)
     (curve,), (slope,), (fit,) = (artists(fig, g) for g in ("correlation_sum", "local_slope", "fit"))
     one = ds.isel(frequency=0, attractor=0)
@@ -403,8 +408,8 @@ def test_plot_dimension__curve_fit_and_slope(verdicts):
     assert at == pytest.approx(np.log(curve.get_ydata())[inside], abs=0.05)
     with pytest.raises(ValueError, match="frequency has several"):
         plot_dimension(xr.concat([ds, ds], "frequency"))
-    with pytest.raises(ValueError, match="no bounded set stays"):
-        plot_dimension(section_dimension(cube, attractors_of(cube, [0] * 10, [1])))
+    with pytest.raises(ValueError, match="without a period"):
+        plot_dimension(section_dimension(cube, attractors_of(cube, [0] * 10, [PERIODIC_ORBIT])))
 
 
 # ---- convergence -------------------------------------------------------------------------------
@@ -449,7 +454,7 @@ def test_plot_convergence__mistakes():
 
 
 def test_commands__dimension_and_figures(main, run, tmp_path):
-    few = ("--at", "frequency=2.4", "--n-sample", "4", "--n-periods", "64")
+    few = ("--at", "frequency=2.4", "--n-sample", "4", "--budget", "0.5")
     code, out, err = main("analyse", "dimension", run, *few, "--csv", tmp_path / "d.csv")
     assert code == 0, err
     assert re.search(r"^  2\.4 +\d +\d+ ", out, re.MULTILINE)

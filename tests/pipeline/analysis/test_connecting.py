@@ -16,6 +16,7 @@ from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.connecting import Found, Link, connect, grouped
 from pipeline.analysis.branches.exploring import Scope, Start, explore
 from pipeline.analysis.branches.problems import Family
+from pipeline.layout.vocabulary import PERIODIC_ORBIT
 
 DUFFING = load_model("duffing")
 FREQUENCY = 1.2 / (2.0 * np.pi)
@@ -164,7 +165,7 @@ def appearances(axis, values, *points, model="duffing", parameters=TWIN_WELL, si
     text = "\n".join(f"{n} = {v!r}" for n, v in parameters.items())
     ds = xr.Dataset(
         {
-            "kind": (dims, present),
+            "kind": (dims, PERIODIC_ORBIT * present),
             "is_polished": (dims, present),
             "orbit_period": (dims, period),
             "attractor_points": ((*dims, "point", "state"), section),

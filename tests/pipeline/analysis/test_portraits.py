@@ -11,6 +11,7 @@ import xarray as xr
 
 from magpend_core import load_preset
 from pipeline.analysis.attractors.portraits import portraits
+from pipeline.layout.vocabulary import ABSENT, ATTRACTS, BOUNDED_SET, PERIODIC_ORBIT
 
 ORBITS = json.loads((Path(__file__).parents[2] / "core" / "data" / "orbits.json").read_text("utf-8"))
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
@@ -22,16 +23,18 @@ def attractors():
     points = np.full((2, 3, 2, 4), np.nan)
     points[1, :2, 0] = [orbit["section"] for orbit in ORBITS[:2]]
     points[1, 2] = ORBITS[1]["section"]
-    kind = np.array([[0, 0, 0], [1, 1, 2]], np.int8)
+    kind = np.array([[ABSENT] * 3, [PERIODIC_ORBIT, PERIODIC_ORBIT, BOUNDED_SET]], np.int8)
+    there = (kind != ABSENT).astype(np.int8)
     per = ("frequency", "attractor")
     return xr.Dataset(
         {
             "attractor_id": (("frequency", "initial_condition"), np.zeros((2, 2), np.int32)),
             "kind": (per, kind),
             "orbit_period": (per, np.array([[0, 0, 0], [1, 1, 0]], np.int32)),
-            "n_cells": (per, kind.astype(np.int64)),
-            "share": (per, kind / 4.0),
-            "side": (per, kind),
+            "stability": (per, there * np.int8(ATTRACTS)),
+            "n_cells": (per, there.astype(np.int64)),
+            "share": (per, there / 3.0),
+            "side": (per, there),
             "attractor_points": ((*per, "point", "state"), points),
         },
         coords={"frequency": [2.0, 2.2], "state": STATES, "attractor": [0, 1, 2]},

@@ -14,7 +14,22 @@ from pipeline.analysis.basins.basins import basins as basins_of
 from pipeline.analysis.basins.table import basins_table
 from pipeline.analysis.tabular import FEW_POINTS
 from pipeline.cli.exits import Exit
+from pipeline.layout.vocabulary import (
+    APERIODIC,
+    ATTRACTS,
+    EVIDENCE,
+    KINDS,
+    NOT_SETTLED,
+    PERIODIC_ORBIT,
+    STABILITIES,
+)
 from pipeline.runs.derive import derive
+
+NUMBERS = (
+    "multiplier_error", "lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low",
+    "lifetime_high",
+)  # fmt: skip
+COUNTS = ("n_sampled", "n_left", "closes_above")
 
 SPIRALS = """
 kind = "sweep"
@@ -51,10 +66,13 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
     lines = out.splitlines()
     assert "attractors at 2 parameter points" in out
     at = lines.index("frequency 2.2 Hz:")
-    assert lines[at + 1].split()[:4] == ["id", "kind", "period", "side"]
+    assert lines[at + 1].split()[:5] == ["id", "kind", "stability", "period", "side"]
     left, right = (next(line for line in lines[at:] if f" {side} " in line) for side in ("left", "right"))
-    assert re.search(r"closed orbit +1 +left +0\.000 0\.000 +0\.9[67]\d\d ", left)
+    assert re.search(r"periodic orbit +attracts +1 +left +0\.000 0\.000 +0\.9[67]\d\d ", left)
     assert re.search(r"0\.\d{4} \(0\.\d{4} to 0\.\d{4}\)", right)
+    assert left.endswith("multipliers")
+    assert lines[at + 1].endswith("shown by")
+    assert lines[-1] == "all 32 cells end on attractors"
     ds = derive(spirals, "attractors")
     assert f"stored: {ds.encoding['source']}" in err
     with (tmp_path / "a.csv").open() as file:
@@ -63,6 +81,9 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
         i, at = int(row["attractor_id"]), {"frequency": float(row["frequency"])}
         one = ds.sel(at).isel(attractor=i)
         assert int(row["n_cells"]) == int(one["n_cells"])
+        assert (row["kind"], row["stability"], row["evidence"]) == (
+            "periodic_orbit", "attracts", "multipliers"
+        )  # fmt: skip
         assert float(row["low"]) < float(row["fraction"]) < float(row["high"])
         decided = sum(int(count) for name, count in row.items() if name.startswith("by_"))
         assert decided == int(row["n_cells"])
@@ -94,25 +115,75 @@ def test_basins__fractions_and_boundaries(main, spirals, tmp_path):
     assert "basins: computed" in err
 
 
-def test_settling__says_what_stays(main, spirals, tmp_path):
-    arguments = ("--n-sample", "4", "--n-periods", "64", "--csv", tmp_path / "s.csv")
-    code, out, err = main("analyse", "settling", spirals, *arguments)
+CHAOTIC = """
+kind = "sweep"
+model = "duffing"
+[parameters]
+preset = "twin-well"
+frequency_hz = 0.15915494309189535
+[axes]
+amplitude = { values = [0.25, 0.3] }
+[initial_conditions]
+kind = "random"
+n = 8
+seed = 1
+x = [-1.0, 1.0]
+v = [-1.0, 1.0]
+[integration]
+rtol = 1e-7
+atol = 1e-7
+n_transient = 100
+n_keep = 64
+"""
+
+
+@pytest.fixture
+def chaotic(main, write_spec, tmp_path):
+    """Two orbits of period 1 at the first amplitude, a chaotic attractor at the second."""
+    write_spec(CHAOTIC)
+    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
+    return tmp_path / "run"
+
+
+def test_settling__says_what_stays(main, chaotic, tmp_path):
+    """The cells of the chaotic attractor are extended, and none leaves."""
+    code, out, err = main("analyse", "settling", chaotic, "--n-sample", "4", "--csv", tmp_path / "s.csv")
     assert code == 0, err
-    ds = derive(spirals, "settling", {"n_sample": 4, "n_periods": 64})
-    n_sets = int((ds["verdict"] > 0).sum())
-    assert n_sets > 0
-    assert f"bounded sets: {n_sets}; run on for 64 drive periods" in out
+    ds = derive(chaotic, "settling", {"n_sample": 4})
+    (place,) = np.argwhere(np.isin(ds["kind"].values, APERIODIC))
+    one = ds.isel(amplitude=place[0], attractor=place[1])
+    assert out.startswith("sets that do not close: 1; lifetimes are in drive periods\n")
     with (tmp_path / "s.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert sum(int(row["n_sampled"]) for row in rows) == int(ds["n_sampled"].sum())
-    for row in rows:
-        words = (
-            "attractor"
-            if int(ds["verdict"].sel(frequency=float(row["frequency"]))[int(row["attractor_id"])]) == 1
-            else "transient"
-        )
-        assert row["verdict"] == words
-    assert re.search(r"frequency Hz +id +verdict +sampled +near an orbit +left later +mean lifetime +to", out)
+        (row,) = csv.DictReader(file)
+    assert (float(row["amplitude"]), int(row["attractor_id"])) == (0.3, place[1])
+    assert (row["kind"], row["stability"]) == ("chaotic_set", "attracts")
+    assert int(row["n_cells"]) == 8
+    assert 4 <= int(row["n_sampled"]) == int(one["n_sampled"])
+    assert int(row["n_left"]) == 0
+    assert float(row["lifetime_low"]) == float(one["lifetime_low"]) > 100
+    names = "id +kind +stability +cells +extended +near an orbit +left later +mean lifetime +to"
+    assert re.search(rf"amplitude m/s2 +{names}\n", out)
+    assert f"above {float(row['lifetime_low']):.0f}" in out
+    # the same is said of it in the table of attractors
+    _, out, _ = main("analyse", "attractors", chaotic, "--n-sample", "4")
+    assert f"{row['n_sampled']} stayed, lifetime above {float(row['lifetime_low']):.0f}" in out
+
+
+def test_settling__without_extending_nothing_is_shown(main, chaotic):
+    """More than that is known once it was asked for, and no analysis contradicts it later."""
+    code, out, err = main("analyse", "attractors", chaotic, "--no-extend")
+    assert code == 0, err
+    assert re.search(r"bounded set +not settled .* - +- +", out)
+    assert "8 of 16 cells end on attractors; 8 not settled" in out
+    assert "2 attractors at 2 parameter points, and 1 other set that cells are on" in out
+    assert "nothing was extended (--no-extend)" in out
+    code, out, err = main("analyse", "attractors", chaotic)
+    assert code == 0, err
+    assert "all 16 cells end on attractors" in out
+    code, out, err = main("analyse", "settling", chaotic, "--no-extend")
+    assert code == 0, err
+    assert "attractors: taken from" in err
+    assert re.search(r"chaotic set +attracts ", out)
 
 
 def test_hysteresis__loops_and_jumps(main, write_spec, walk_text, tmp_path):
@@ -157,7 +228,7 @@ def test_analyse__incomplete_run_and_prune(main, made):
         (["settling", "--n-sample", "0"], "n_sample = 0: must be at least 1."),
         (["settling", "--confidence", "1"], "confidence = 1.0: must be less than 1."),
         (["attractors", "--look-back", "0"], "look_back = 0: must be at least 1."),
-        (["basins", "--rule-same-share", "1.5"], "rule_same_share = 1.5: must be at most 1."),
+        (["basins", "--budget", "-1"], "budget = -1.0: must be at least 0."),
         (["basins", "--confidence", "nan"], "confidence = nan: must be a finite number."),
         (["basins", "--box", "1"], "box = 1: must be at least 2."),
         (["basins", "--interval", "wilsen"], "Did you mean 'wilson'?"),
@@ -195,10 +266,17 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
             "decision": (
                 cells_of,
                 np.ones_like(cells, np.int8),
-                {"flag_meanings": "undecided closed run_on"},
+                {"flag_meanings": "undecided closed extended"},
             ),
             "status": (cells_of, np.ones_like(cells, np.int8), flags),
-            "kind": (("frequency", "attractor"), kind, {"flag_meanings": "absent closed_orbit bounded_set"}),
+            "ran_out": ("frequency", np.zeros(n, np.int8)),
+            "kind": (
+                ("frequency", "attractor"), PERIODIC_ORBIT * kind, {"flag_meanings": " ".join(KINDS)},
+            ),
+            "stability": (
+                ("frequency", "attractor"), ATTRACTS * kind, {"flag_meanings": " ".join(STABILITIES)},
+            ),
+            "evidence": (("frequency", "attractor"), 0 * kind, {"flag_meanings": " ".join(EVIDENCE)}),
             "orbit_period": (("frequency", "attractor"), kind * np.array([1, 2])),
             "period_s": (("frequency", "attractor"), kind * np.array([1, 2]) / frequency[:, None]),
             "side": (("frequency", "attractor"), 0 * kind, {"flag_meanings": "unknown left right"}),
@@ -206,18 +284,26 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
             "multiplier_real": (("frequency", "attractor", "multiplier"), nan[..., None]),
             "multiplier_imag": (("frequency", "attractor", "multiplier"), nan[..., None]),
             "n_cells": (("frequency", "attractor"), np.stack([(cells == i).sum(1) for i in (0, 1)], 1)),
-            "is_stable": (("frequency", "attractor"), -kind),
+            **{name: (("frequency", "attractor"), nan) for name in NUMBERS},
+            **{name: (("frequency", "attractor"), 0 * kind) for name in COUNTS},
             "mirror_partner": (("frequency", "attractor"), -kind),
             "mirror_distance": (("frequency", "attractor"), nan),
         },
         coords={"frequency": ("frequency", frequency, {"units": "Hz"}), "attractor": [0, 1]},
-    )
+    )  # fmt: skip
     lines = attractors_table(ds).lines
     assert lines[0] == f"2 attractors at {n} parameter points"
-    assert lines[1].split()[:3] == ["id", "kind", "periods"]
-    assert re.search(r"^  0 +closed orbit +1 +unknown +2 to 5 +7 +56 .*1\.0000 at 2 Hz", lines[2])
-    assert re.search(r"^  1 +closed orbit +2 +unknown +4 to 5 +3 +14 .*0\.8000 at 4\.5 Hz", lines[3])
-    assert lines[4] == "all 70 cells belong to an attractor"
+    assert lines[1].split()[:4] == ["id", "kind", "stability", "periods"]
+    assert re.search(r"^  0 +periodic orbit +attracts +1 +unknown +2 to 5 +7 +56 .*1\.0000 at 2 Hz", lines[2])
+    assert re.search(
+        r"^  1 +periodic orbit +attracts +2 +unknown +4 to 5 +3 +14 .*0\.8000 at 4\.5 Hz", lines[3]
+    )
+    assert lines[4] == "all 70 cells end on attractors"
+    other = ds.copy(deep=True)
+    other["stability"][5, 1] = NOT_SETTLED
+    lines = attractors_table(other).lines
+    assert re.search(r"^  1 +periodic orbit +attracts, not settled +2 .*0\.3000 at 4 Hz", lines[3])
+    assert lines[4] == "62 of 70 cells end on attractors; 8 not settled"
     cube = ds[["status"]].assign(n_periods=ds["status"])
     measured = basins_of(cube, ds)
     lines = basins_table(measured).lines
@@ -252,13 +338,13 @@ n_keep = 16
     code, out, err = main("analyse", "attractors", "run", "--csv", "a.csv")
     assert code == 0, err
     assert "0 attractors at 2 parameter points" in out
-    assert "0 of 12 cells belong to an attractor; 12 diverged" in out
+    assert "0 of 12 cells end on attractors; 12 diverged" in out
     code, out, err = main("analyse", "basins", "run")
     assert code == 0, err
     assert re.search(r"diverged +6 +1\.0000 \(0\.6097 to 1\.0000\)", out)
     code, out, err = main("analyse", "settling", "run")
     assert code == 0, err
-    assert "bounded sets: none" in out
+    assert "sets that do not close: none" in out
     for figure in ("fractions", "attractors"):
         code, _, err = main("plot", figure, "run")
         assert code == 0, err

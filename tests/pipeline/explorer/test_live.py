@@ -6,19 +6,35 @@ import json
 import os
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
 from pipeline.explorer import slices
 from pipeline.explorer.arrays import unpack_arrays
+from pipeline.explorer.catalog import Entry
+from pipeline.explorer.colours import rgb
+from pipeline.explorer.legend import Legend
 from pipeline.explorer.live import LiveRun, LiveSession, live_problem
 from pipeline.explorer.messages import MOST_BYTES, Region, RequestError, read_request
 from pipeline.explorer.regions import zoom_toml, zoomed
 from pipeline.explorer.settling import settle_cells
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
+from pipeline.layout.vocabulary import (
+    ABSENT,
+    ATTRACTS,
+    DIVERGED,
+    EQUILIBRIUM,
+    NEUTRAL,
+    NOT_SETTLED,
+    PERIODIC_ORBIT,
+    UNSTABLE,
+)
+from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
 from pipeline.runs.status import state
@@ -236,7 +252,7 @@ def test_start__ends_of_a_flow(directories, watch):
             own = int(attractors["attractor_id"].isel(mu=mu, x_0=at[0], y_0=at[1]))
             assert end["attractor"] == own, (mu, at, end)
             kinds.add(int(attractors["kind"].isel(mu=mu, attractor=own)))
-    assert kinds == {1, 3}
+    assert kinds == {EQUILIBRIUM, PERIODIC_ORBIT}
 
 
 def test_start__of_a_flow_beside_the_runs_values(directories, watch):
@@ -263,6 +279,26 @@ def test_start__is_superseded_and_cancelled(directories, watch):
     second = watcher.send(do="start", parameters={"A": 0.2}, state={"x": 0.3})
     assert watcher.wait(first)["cancelled"] is True
     assert watcher.wait(second)["attractor"] is not None
+
+
+def test_legend__names_end_with_what_is_known_of_the_stability():
+    """What does not attract is not shown as an attractor: it says so, and is grey."""
+    point = np.zeros((1, 2))
+    entries = [
+        Entry(0, None, PERIODIC_ORBIT, 2, 0, 0, point, stability=ATTRACTS),
+        Entry(1, None, PERIODIC_ORBIT, 3, 0, 0, point, stability=UNSTABLE),
+        Entry(2, None, EQUILIBRIUM, 0, 0, 0, point, stability=NEUTRAL),
+        Entry(3, None, ABSENT, 0, 0, 0, point[:0], stability=NOT_SETTLED),
+        Entry(4, None, ABSENT, 0, 0, DIVERGED, point[:0]),
+    ]
+    catalog = SimpleNamespace(model=load_model("duffing"), entries=entries)
+    lines = Legend(catalog, None).lines()
+    assert [line["label"] for line in lines] == [
+        "period 2", "period 3, unstable", "at rest, neutral", "not periodic, not settled", "diverged"
+    ]  # fmt: skip
+    greys = ("on an unstable orbit or equilibrium", "on a neutral set", "not settled", "diverged")
+    assert [line["colour"] for line in lines[1:]] == [rgb(palette.GREYS[name]) for name in greys]
+    assert lines[0]["colour"] in palette.COLOURS
 
 
 # ---- slices --------------------------------------------------------------------------------------

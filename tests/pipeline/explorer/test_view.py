@@ -17,7 +17,7 @@ from pipeline.explorer import diagram as diagrams
 from pipeline.explorer import tables
 from pipeline.explorer.answers import ANSWERS, Query
 from pipeline.explorer.arrays import unpack_arrays
-from pipeline.explorer.colours import NONE
+from pipeline.explorer.colours import NONE, rgb, schemes
 from pipeline.explorer.diagram import diagram
 from pipeline.explorer.explored import ExploredRun, ExplorerError
 from pipeline.explorer.orbits import cell_of, linearise, orbit
@@ -29,7 +29,8 @@ from pipeline.explorer.tables import table
 from pipeline.explorer.view import describe_view
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.layout.vocabulary import DIVERGED, PERIODIC
+from pipeline.layout.vocabulary import DIVERGED, EVIDENCE, PERIODIC, TRANSIENT
+from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
 from pipeline.spec.parsing import load_spec
@@ -427,6 +428,49 @@ def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
             real = here["multiplier_real"][one].values
             np.testing.assert_allclose([m[0] for m in attrs["multipliers"]], real)
             assert attrs["stable"]
+            assert (attrs["kind"], attrs["stability"]) == ("periodic orbit", "attracts")
+            assert attrs["evidence"] == "multipliers"
+
+
+def test_view__what_does_not_attract_is_no_attractor(sweep):
+    """Cells on it are grey by what it is; the page is told so, and that it has no share."""
+    explored = ExploredRun.of(sweep)
+    known = explored.kept("attractors")
+    at = {"frequency": 1, "amplitude": 0}
+    number = int(known["share"].isel(at).values.argmax())
+    changed = known.copy(deep=True)
+    changed["stability"].loc[{"attractor": number}] = TRANSIENT
+    changed["evidence"].loc[{"attractor": number}] = EVIDENCE.index("left")
+    changed["share"].loc[{"attractor": number}] = 0.0
+    explored._opened["derived attractors"] = changed
+
+    (scheme,) = (s for s in schemes(explored) if s.name == "attractor")
+    (grey,) = (c for c in scheme.categories if c.label == "on a transient set")
+    assert grey.colour == rgb(palette.GREYS["on a transient set"])
+    assert next(c for c in scheme.categories if c.number == number).label.endswith(", transient")
+    arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 1}))
+    own = known["attractor_id"].transpose(*explored.plan.dims).values.ravel()[arrays["cell"]] == number
+    assert own.any()
+    np.testing.assert_array_equal(arrays["colour_attractor"] == grey.number, own)
+    arrays, attrs = unpack_arrays(plane(explored, at))
+    assert grey.number in arrays["label"]
+    assert grey.number in {c["id"] for c in attrs["labels"]}
+
+    told = {a["id"]: a for a in attractors(explored, at)["attractors"]}
+    assert {told[number][key] for key in ("stability", "evidence")} == {"transient", "left"}
+    assert told[number]["name"].endswith(", transient")
+    assert told[number]["low"] is None
+    assert number not in {c["attractor"] for c in curves(explored, "amplitude", {"frequency": 1})["curves"]
+                          if c["group"] == "fractions"}  # fmt: skip
+    _, attrs = unpack_arrays(orbit(explored, int(cell_on(explored, known, at, number)), 0))
+    assert (attrs["attractor"], attrs["stability"], attrs["stable"]) == (number, "transient", None)
+
+
+def cell_on(explored, found, at, number):
+    """Flat number of a cell at a point that is on a set."""
+    index = np.argwhere(found["attractor_id"].isel(at).transpose("x_0", "v_0").values == number)[0]
+    place = {**at, "x_0": int(index[0]), "v_0": int(index[1])}
+    return np.ravel_multi_index([place[d] for d in explored.plan.dims], explored.plan.shape)
 
 
 def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
@@ -518,7 +562,9 @@ def test_curves__are_shares_and_exponents_of_the_analysis(sweep):
     assert shares
     for number, one in shares.items():
         np.testing.assert_array_equal(one["y"], found["share"].isel(attractor=number).values)
-        assert all(low <= y <= high for low, y, high in zip(one["low"], one["y"], one["high"], strict=True))
+        for low, y, high in zip(one["low"], one["y"], one["high"], strict=True):
+            # where the attractor has no cells there is no interval
+            assert low <= y <= high if y else low is high is None
         assert one["x"] == found["amplitude"].values.tolist()
 
 
@@ -562,6 +608,9 @@ def test_attractors__are_those_of_the_point(sweep):
     json.dumps(found, allow_nan=False)
     assert {a["id"] for a in found} == set(np.flatnonzero(here["kind"].values > 0).tolist())
     assert [a["share"] for a in found] == sorted((a["share"] for a in found), reverse=True)
+    assert {(a["kind"], a["stability"], a["evidence"]) for a in found} == {
+        ("periodic orbit", "attracts", "multipliers")
+    }
     for one in found:
         points = here["attractor_points"].isel(attractor=one["id"]).transpose("point", "state").values
         np.testing.assert_array_equal(one["section"], points[np.isfinite(points).all(axis=1)])

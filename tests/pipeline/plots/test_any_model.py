@@ -13,6 +13,7 @@ from matplotlib.text import Text
 import pipeline.plots
 from magpend_core.models import load_model
 from pipeline.layout.letters import letter
+from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.plots import (
     Frame,
     pixels,
@@ -45,7 +46,9 @@ def make_attractors(ids, dims, coords):
         {
             "attractor_id": (dims, ids),
             "status": (dims, np.ones(ids.shape, np.int8)),
-            "kind": (per, (counts > 0).astype(np.int8)),
+            "decision": (dims, np.ones(ids.shape, np.int8)),
+            "kind": (per, np.where(counts > 0, PERIODIC_ORBIT, 0).astype(np.int8)),
+            "stability": (per, np.where(counts > 0, ATTRACTS, 0).astype(np.int8)),
             "orbit_period": (per, (counts > 0) * np.arange(1, n + 1, dtype=np.int32)),
             "n_cells": (per, counts),
             "share": (per, counts / flat.shape[-1]),
@@ -82,6 +85,7 @@ def make_portraits(n):
             "orbit": (("attractor", "sample", "state"), orbit),
             "attractor_points": (("attractor", "point", "state"), orbit[:, :1]),
             "share": ("attractor", np.full(n, 1.0 / n)),
+            "stability": ("attractor", np.full(n, ATTRACTS, np.int8)),
         },
         coords={"attractor": np.arange(n), "state": ["x", "v"], "frequency": 0.2},
     )

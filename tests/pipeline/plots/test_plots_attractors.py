@@ -18,6 +18,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.hysteresis import hysteresis
 from pipeline.layout import vocabulary
 from pipeline.layout.letters import letter
+from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.plots import (
     palette,
     plot_basins,
@@ -52,7 +53,9 @@ def make_attractors(ids, dims, coords, n=None, status=None):
         {
             "attractor_id": (dims, ids),
             "status": (dims, np.where(ids >= 0, PERIODIC, BOUNDED).astype(np.int8)),
-            "kind": (per, here.astype(np.int8)),
+            "decision": (dims, (ids >= 0).astype(np.int8)),
+            "kind": (per, np.where(here, PERIODIC_ORBIT, 0).astype(np.int8)),
+            "stability": (per, np.where(here, ATTRACTS, 0).astype(np.int8)),
             "orbit_period": (per, here.astype(np.int32)),
             "n_cells": (per, counts),
             "share": (per, counts / flat.shape[-1]),
@@ -80,7 +83,7 @@ GRID = ("psi1_0", "psi2_0")
 
 @pytest.fixture
 def grid():
-    """4 x 4 cells, all different along both axes: 0 left, 1 right above, the rest unassigned."""
+    """4 x 4 cells, all different along both axes: 0 left, 1 right above, the rest on no attractor."""
     ids = np.zeros((4, 4), np.int32)
     ids[2:, 2:] = 1
     ids[3, 0], ids[3, 1], ids[2, 0], ids[2, 1] = -1, -1, -1, -1
@@ -115,7 +118,7 @@ def test_plot_basins__each_cell_has_the_colour_of_its_legend(grid):
     fig = plot_basins(grid)
     picture, legend = colours_of(fig), legend_colours(fig)
     assert list(legend) == [
-        "A: period 1, left, 50.0 %", "B: period 1, left, 25.0 %", "undecided, 6.2 %", "diverged, 6.2 %",
+        "A: period 1, left, 50.0 %", "B: period 1, left, 25.0 %", "not settled, 6.2 %", "diverged, 6.2 %",
         "failed, 6.2 %", "pending, 6.2 %",
     ]  # fmt: skip
     expected = np.empty((4, 4, 3))
@@ -124,7 +127,7 @@ def test_plot_basins__each_cell_has_the_colour_of_its_legend(grid):
         (3, 0): "diverged",
         (3, 1): "pending",
         (2, 0): "failed",
-        (2, 1): "undecided",
+        (2, 1): "not settled",
     }.items():
         expected[cell] = legend[f"{name}, 6.2 %"]
     assert np.abs(picture - expected).max() < 0.003
@@ -171,8 +174,22 @@ def test_plot_basins__shading_by_time(grid):
     assert fig.data["n_periods"].transpose(*GRID).values.tolist() == periods.values.tolist()
 
 
+def test_plot_basins__cells_on_what_does_not_attract_are_grey(grid):
+    """They are no basin: B's cells have the name of what B is, and A keeps its colour."""
+    plain = colours_of(plot_basins(grid))
+    grid["stability"][1] = vocabulary.TRANSIENT
+    fig = plot_basins(grid)
+    assert legend_texts(fig)[:2] == ["A: period 1, left, 50.0 %", "not settled, 6.2 %"]
+    assert "on a transient set, 25.0 %" in legend_texts(fig)
+    picture = colours_of(fig)
+    assert np.abs(picture[2:, 2:] - to_rgb(palette.GREYS["on a transient set"])).max() < 0.003
+    assert np.allclose(picture[:2], plain[:2])
+    assert fig.data["outcome"].transpose(*GRID).values[2:, 2:].tolist() == [[-1, -1], [-1, -1]]
+    assert not [text for text in fig.axes[0].texts if text.get_text() == "B"]
+
+
 def test_plot_basins__inferred_cells(grid):
-    """They have their basin's colour, took no time, and are undecided if they belong to nothing."""
+    """They have their basin's colour, took no time, and are not settled if they belong to nothing."""
     inferred = grid.copy(deep=True)
     inferred["status"][1, :2] = INFERRED
     inferred["status"][2, 1] = INFERRED
@@ -213,7 +230,7 @@ def test_plot_basins__sample_is_no_grid(grid):
 def test_plot_basins__third_start_axis_must_be_chosen(grid):
     more = xr.concat([grid, grid], "psi1_dot_0").assign_coords(psi1_dot_0=[0.0, 1.0])
     more["kind"] = grid["kind"]
-    for name in ("n_cells", "share", "orbit_period", "side", "rotation"):
+    for name in ("stability", "n_cells", "share", "orbit_period", "side", "rotation"):
         more[name] = grid[name]
     with pytest.raises(ValueError, match=r"3 of the initial states are left.*such as psi1_dot_0=0"):
         plot_basins(more)
@@ -255,8 +272,14 @@ def test_cast_of__most_cells_have_own_colours_and_selection_changes_none():
     own = [cast.colours[i] for i in cast.main]
     assert len(set(own)) == 12
     assert {cast.colours[i] for i in range(30) if i not in cast.main} == {palette.OTHERS}
+    # colours go to attractors, greys to what attracts nowhere
+    other = ds.copy(deep=True)
+    other["stability"][10] = vocabulary.NEUTRAL
+    greyed = palette.cast_of(other)
+    assert greyed.colours[10] == palette.GREYS["on a neutral set"]
+    assert set(greyed.main) == {*range(11, 20), 0, 1, 2}
     part = ds.copy(deep=True)
-    part["kind"][5:] = 0
+    part["kind"][5:] = part["stability"][5:] = 0
     assert palette.cast_of(ds, part).colours == cast.colours
     assert palette.cast_of(ds, part).names[20] == "U: absent"
     assert [letter(i) for i in (0, 25, 26, 51, 52, 701, 702)] == [
@@ -273,8 +296,18 @@ def test_cast_of__most_cells_have_own_colours_and_selection_changes_none():
 def test_describe__periods_sides_turns():
     ds = make_attractors([[0, 0], [0, 0], [0, 0]], ("frequency", "initial_condition"), {}).isel(attractor=0)
     ds["orbit_period"][:] = [1, 2, 0]
+    ds["kind"][:] = [PERIODIC_ORBIT, PERIODIC_ORBIT, vocabulary.BOUNDED_SET]
     ds["side"][:] = [Side.LEFT, Side.STRADDLING, Side.STRADDLING]
     assert palette.describe(ds) == "period 1, 2 or not periodic, left or straddling"
+    for kind, word in ((vocabulary.TORUS, "quasi-periodic"), (vocabulary.CHAOTIC_SET, "chaotic")):
+        ds["kind"][2] = kind
+        assert palette.describe(ds) == f"period 1, 2 or {word}, left or straddling"
+    # of a set that does not attract it is said
+    ds["stability"][2] = vocabulary.NOT_SETTLED
+    assert palette.describe(ds).endswith(", left or straddling, not settled in parts")
+    ds["stability"][:] = vocabulary.TRANSIENT
+    assert palette.describe(ds).endswith(", left or straddling, transient")
+    ds["stability"][:] = ATTRACTS
     ds["side"][:] = Side.ROTATING
     ds["rotation"][:] = [0.0, -0.5]
     assert palette.describe(ds).endswith("rotating\N{NO-BREAK SPACE}(0,\N{NO-BREAK SPACE}\N{MINUS SIGN}0.5)")
@@ -337,13 +370,13 @@ def test_plot_fractions__bands_are_stacked_and_what_is_not_decided_is_on_top(swe
     fig = plot_fractions(sweep)
     assert band(fig, "B") == [[1.95, 2.05, 0, 0.5], [2.05, 2.15, 0, 0.4], [2.15, 2.25, 0, 0.8]]
     assert band(fig, "A") == [[1.95, 2.05, 0.5, 1.0], [2.05, 2.15, 0.4, 0.8]]
-    assert band(fig, "undecided") == [[2.15, 2.25, 0.8, 1.0]]
+    assert band(fig, "not settled") == [[2.15, 2.25, 0.8, 1.0]]
     assert band(fig, "diverged") == [[2.05, 2.15, 0.8, 0.9]]
     assert band(fig, "pending") == [[2.05, 2.15, 0.9, 1.0]]
     assert legend_texts(fig) == [
         "pending",
         "diverged",
-        "undecided",
+        "not settled",
         "A: period 1, left",
         "B: period 1, left",
         "95 % interval of an edge",
@@ -409,6 +442,22 @@ def test_plot_coexisting__angles_on_the_circle_and_unknown_state(sweep):
         plot_coexisting(sweep, state="psi3")
 
 
+def test_plot_coexisting__sets_that_do_not_attract_are_small_and_grey(sweep):
+    """B attracts at the first frequency only; there it has its colour, elsewhere the grey of what it is."""
+    sweep["stability"][1:, 1] = [vocabulary.NOT_SETTLED, vocabulary.UNSTABLE]
+    sweep["share"][1:, 1] = 0.0
+    fig = plot_coexisting(sweep)
+    np.testing.assert_allclose(offsets(fig, "points:B")[0], [[2.0, 0.2]])
+    lines = {line.get_gid(): line for line in fig.axes[0].get_lines()}
+    assert {gid: line.get_xdata().tolist() for gid, line in lines.items()} == {
+        "points:not settled": [2.1], "points:unstable": [2.2],
+    }  # fmt: skip
+    assert lines["points:unstable"].get_color() == palette.GREY_OF[vocabulary.UNSTABLE]
+    assert legend_texts(fig)[:4] == [
+        "A: period 1, left", "B: period 1, left, unstable or not settled in parts", "not settled", "unstable"
+    ]  # fmt: skip
+
+
 @pytest.fixture
 def walk():
     """Up and down over 5 frequencies: up leaves A after the third, down comes back to it at the second."""
@@ -440,7 +489,7 @@ def test_plot_coexisting__directions_and_loops(walk):
 
 @pytest.fixture
 def map_of_two():
-    """2 frequencies x 3 amplitudes, 4 cells: A alone, A + B, B with a cell undecided, ..."""
+    """2 frequencies x 3 amplitudes, 4 cells: A alone, A + B, B with a cell not settled, ..."""
     ids = np.array(
         [[[0] * 4, [0, 0, 1, 1], [1, 1, 1, -1]], [[0] * 4, [0] * 4, [-1] * 4]], np.int32
     )  # fmt: skip
@@ -482,8 +531,17 @@ def test_plot_regimes__each_point_has_its_regime(map_of_two):
     assert fig.data["n_attractors"].transpose("frequency", "q").values.tolist() == [[1, 2, 1], [1, 1, 0]]
 
 
+def test_plot_regimes__only_what_attracts_is_counted(map_of_two):
+    map_of_two["stability"][0, 1, 1] = vocabulary.NOT_SETTLED
+    fig = plot_regimes(map_of_two)
+    assert regime_names(fig) == [["1", "1", "2"], ["1", "1", "none"]]
+    assert fig.data["n_attractors"].sel(frequency=2.0, q=1.5) == 1
+    assert fig.data["share_without"].sel(frequency=2.0, q=1.5) == 0.5
+
+
 def test_plot_regimes__not_periodic_and_one_parameter(map_of_two, sweep):
     map_of_two["orbit_period"][0, 1, 1] = 0
+    map_of_two["kind"][0, 1, 1] = vocabulary.CHAOTIC_SET
     assert regime_names(plot_regimes(map_of_two))[0][1] == "1 + not periodic"
     with pytest.raises(ValueError, match="two swept parameters, and 1 are left of frequency"):
         plot_regimes(sweep)
@@ -506,6 +564,7 @@ def make_portraits(n, turning=()):
             "orbit": (("attractor", "sample", "state"), orbit),
             "attractor_points": (("attractor", "point", "state"), orbit[:, :1]),
             "share": ("attractor", 1.0 / (1.0 + np.arange(n)) / 10),
+            "stability": ("attractor", np.full(n, ATTRACTS, np.int8)),
         },
         coords={"attractor": np.arange(n), "state": STATES, "frequency": 2.2},
     )
@@ -532,7 +591,7 @@ def test_plot_gallery__orbits_sections_and_paths():
     magnets = [line for ax in fig.axes for line in ax.get_lines() if line.get_gid() == "fixed:fixed magnet"]
     assert [m.get_xydata().tolist() for m in magnets] == [[[0.0, -VALUES["h"]]]] * 3
     titles = [t.get_text().replace("\N{NO-BREAK SPACE}", " ") for ax in fig.axes for t in ax.texts]
-    assert titles[0] == "A: period 1, left, 10.0 % of the cells"
+    assert titles[0] == "A: period 1, left, share 10.0 %"
 
 
 def test_plot_gallery__scale_of_the_path_is_equal_and_holds_it():
@@ -554,9 +613,20 @@ def test_plot_gallery__largest_shares_are_drawn():
     portraits["share"][0] = 0.0
     fig = plot_gallery(attractors, portraits)
     assert fig.data["attractor"].values.tolist() == list(range(1, 9))
-    assert any("3 more attractors" in t.get_text() for t in fig.texts)
+    assert any("3 more sets" in t.get_text() for t in fig.texts)
     with pytest.raises(ValueError, match="no attractor at this parameter point"):
         plot_gallery(attractors, portraits.isel(attractor=[]))
+
+
+def test_plot_gallery__sets_that_do_not_attract_are_grey_and_have_no_share():
+    attractors, portraits = make_attractors(np.arange(2), ("initial_condition",), {}), make_portraits(2)
+    for ds in (attractors, portraits):
+        ds["stability"][1] = vocabulary.UNSTABLE
+    fig = plot_gallery(attractors, portraits)
+    titles = [t.get_text().replace("\N{NO-BREAK SPACE}", " ") for ax in fig.axes for t in ax.texts]
+    assert [t for t in titles if t] == ["A: period 1, left, share 10.0 %", "B: period 1, left, unstable"]
+    (line,) = [line for ax in fig.axes for line in ax.get_lines() if line.get_gid() == "orbit:B:psi1"]
+    assert to_rgb(line.get_color()) == to_rgb(palette.GREY_OF[vocabulary.UNSTABLE])
 
 
 def in_canvas(fig):
@@ -573,6 +643,7 @@ def test_legends__fit_into_the_figure_beside_the_axes():
     ids = np.tile(np.arange(20), (3, 1))
     ds = make_attractors(ids, ("frequency", "initial_condition"), {"frequency": [2.0, 2.1, 2.2]})
     ds["orbit_period"][:] = np.array([11, 13, 0])[:, None]
+    ds["kind"][:] = np.array([PERIODIC_ORBIT, PERIODIC_ORBIT, vocabulary.BOUNDED_SET])[:, None]
     ds["side"][:] = np.array([Side.LEFT, Side.RIGHT, Side.STRADDLING])[:, None]
     for fig in (plot_fractions(ds), plot_coexisting(ds)):
         assert in_canvas(fig)
@@ -598,9 +669,26 @@ def test_save_data__every_figure(sweep, walk, map_of_two, tmp_path):
 def test_vocabulary__codes_are_those_of_the_kernel():
     for status in Status:
         assert getattr(vocabulary, status.name) == status
-    named = [code for codes in palette.UNASSIGNED.values() for code in codes]
-    assert sorted(named) == sorted(Status)
-    assert palette.GREYS.keys() == palette.UNASSIGNED.keys()
+
+
+def test_greys__every_cell_without_an_attractor_has_one():
+    """Whatever became of a cell, and on whatever set that does not attract it is."""
+    status = np.array([*Status, PERIODIC, PERIODIC, BOUNDED, BOUNDED], np.int8)
+    ids = np.array([*np.full(len(Status), -1), 0, 1, 2, 3], np.int32)
+    ds = make_attractors(ids, ("initial_condition",), {}, status=status)
+    ds["stability"][:] = [
+        vocabulary.NOT_SETTLED, vocabulary.TRANSIENT, vocabulary.UNSTABLE, vocabulary.NEUTRAL
+    ]  # fmt: skip
+    found = palette.other_cells(ds)
+    assert found.keys() == palette.GREYS.keys()
+    assert np.sum(list(found.values()), axis=0).tolist() == [1] * len(ids)
+    for code, name in {
+        Status.DIVERGED: "diverged", Status.PENDING: "pending", Status.NO_RETURN: "no return",
+        Status.STEP_UNDERFLOW: "failed", Status.UNREACHED: "failed", Status.BOUNDED: "not settled",
+    }.items():  # fmt: skip
+        assert found[name][list(Status).index(code)], name
+    on_sets = ["not settled", "on a transient set", "on an unstable orbit or equilibrium", "on a neutral set"]
+    assert [bool(found[name][len(Status) + k]) for k, name in enumerate(on_sets)] == [True] * 4
 
 
 def bars(fig, name):
@@ -612,7 +700,7 @@ def bars(fig, name):
 def test_plot_fractions__intervals(sweep):
     fig = plot_fractions(sweep)
     # Wilson's score interval, by its own equation: |p - k/n| = z sqrt(p (1 - p) / n) at both ends
-    for outcome, k in (("A", [5, 4, 0]), ("B", [5, 4, 8]), ("undecided", [0, 0, 2])):
+    for outcome, k in (("A", [5, 4, 0]), ("B", [5, 4, 8]), ("not settled", [0, 0, 2])):
         one = fig.data.sel(outcome=outcome)
         for end in ("low", "high"):
             p, share = one[end].values, np.array(k) / 10
@@ -645,7 +733,8 @@ def test_plot_regimes__shares_and_what_may_be_missing(map_of_two):
     fig = plot_regimes(map_of_two)
     here = fig.data.sel(frequency=2.0, q=1.5)
     assert here["share"].values.tolist() == [0.5, 0.5]
-    assert ((fig.data["low"] <= fig.data["share"]) & (fig.data["share"] <= fig.data["high"])).all()
+    within = (fig.data["low"] <= fig.data["share"]) & (fig.data["share"] <= fig.data["high"])
+    assert (within == (fig.data["share"] > 0)).all()
     unseen = fig.data["unseen_high"].transpose("frequency", "q").values
     # (1 - p)^n = 0.05 with n decided cells; nothing is known where none is
     assert unseen[:, :2] == pytest.approx(1 - 0.05 ** (1 / 4))

@@ -9,7 +9,8 @@ import pytest
 import xarray as xr
 from matplotlib.colors import to_rgb
 
-from pipeline.plots import Frame, pixels, plot_bifurcation, plot_section, save_data
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED, CHAOTIC_SET, TRANSIENT
+from pipeline.plots import Frame, palette, pixels, plot_bifurcation, plot_section, save_data
 
 ATTRS = {"model": "duffing", "parameters": ""}
 
@@ -104,7 +105,10 @@ def test_plot_section__colours_of_attractors():
     ids = xr.Dataset(
         {
             "attractor_id": (("initial_condition",), np.array([0, 1, 1, -1], np.int32)),
-            "kind": ("attractor", np.ones(2, np.int8)),
+            "status": (("initial_condition",), np.full(4, BOUNDED, np.int8)),
+            "decision": (("initial_condition",), np.zeros(4, np.int8)),
+            "kind": ("attractor", np.full(2, CHAOTIC_SET, np.int8)),
+            "stability": ("attractor", np.full(2, ATTRACTS, np.int8)),
             "n_cells": ("attractor", [1, 2]),
             "orbit_period": ("attractor", [0, 0]),
         },
@@ -113,12 +117,17 @@ def test_plot_section__colours_of_attractors():
     )
     figure = plot_section(ds, ids)
     lines = {line.get_gid(): line for line in figure.axes[0].get_lines()}
-    assert set(lines) == {"points:A: not periodic", "points:B: not periodic", "points:no attractor"}
+    assert set(lines) == {"points:A: chaotic", "points:B: chaotic", "points:not settled"}
     np.testing.assert_array_equal(
-        np.sort(lines["points:A: not periodic"].get_xdata()), np.sort(ds["section"][0, :, 0])
+        np.sort(lines["points:A: chaotic"].get_xdata()), np.sort(ds["section"][0, :, 0])
     )
     colours = [to_rgb(line.get_color()) for line in lines.values()]
     assert len(set(colours)) == 3
+    # what does not attract has no colour of its own
+    ids["stability"][0] = TRANSIENT
+    lines = {line.get_gid(): line for line in plot_section(ds, ids).axes[0].get_lines()}
+    assert set(lines) == {"points:on a transient set", "points:B: chaotic", "points:not settled"}
+    assert lines["points:on a transient set"].get_color() == to_rgb(palette.GREYS["on a transient set"])
 
 
 def make_extremes():

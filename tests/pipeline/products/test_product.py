@@ -56,7 +56,7 @@ def test_validated__all_mistakes_in_one_sentence_each():
         validated(ANALYSES["basins"].options, {"box": 1, "boxx": 2, "interval": "wilsn", "seed": 0.5})
     assert sorted(caught.value.problems) == [
         "box = 1: must be at least 2.",
-        "boxx: unknown key; did you mean box or rule_box?",
+        "boxx: unknown key; did you mean box?",
         "interval = 'wilsn': must be 'wilson' or 'clopper-pearson'. Did you mean 'wilson'?",
         "seed = 0.5: must be a whole number.",
     ]

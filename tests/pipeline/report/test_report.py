@@ -10,6 +10,8 @@ import shutil
 
 import pytest
 
+from pipeline.analysis.outcomes import sentence
+from pipeline.layout.vocabulary import ATTRACTS
 from pipeline.report.report import report
 from pipeline.report.stored import stored_options
 from pipeline.runs.derive import derive
@@ -85,6 +87,43 @@ def test_report__of_a_sweep(folder, command):
     for i, share in zip(found["attractor"].values, shares, strict=True):
         assert share.partition(" at")[0] == wilson(max((ids == i).sum(1)), 6)
     assert html == written(command, folder, "run")
+
+
+CHAOTIC = """
+kind = "sweep"
+model = "duffing"
+[parameters]
+preset = "twin-well"
+frequency_hz = 0.15915494309189535
+[axes]
+amplitude = { values = [0.25, 0.3] }
+[initial_conditions]
+kind = "random"
+n = 8
+seed = 1
+x = [-1.0, 1.0]
+v = [-1.0, 1.0]
+[integration]
+rtol = 1e-7
+atol = 1e-7
+n_transient = 100
+n_keep = 64
+"""
+
+
+def test_report__sets_that_do_not_attract_have_no_share(command, tmp_path):
+    """Without extension it is not shown that the chaotic set of the larger amplitude attracts."""
+    (tmp_path / "spec.toml").write_text(CHAOTIC)
+    run_spec(tmp_path / "spec.toml", tmp_path / "run", workers=0, echo=lambda _: None)
+    found = derive(tmp_path / "run", "attractors", {"extend": False})
+    attract = (found["stability"] == ATTRACTS).any("amplitude").values
+    assert 0 < attract.sum() < attract.size
+    html = written(command, tmp_path, "run", "--only-stored")
+    rows = [re.findall(r"<td>(.*?)</td>", row) for row in re.findall(r"<tr>(<td>[A-Z]</td>.*?)</tr>", html)]
+    assert [row[2] == "attracts" for row in rows] == attract.tolist()
+    assert [row[-1] == "-" for row in rows] == (~attract).tolist()
+    assert f"{attract.sum()} attractors, {(~attract).sum()} other set; {sentence(found)}" in html
+    assert "Nothing was extended (--no-extend)" in html
 
 
 def test_report__its_commands_work(folder, command):

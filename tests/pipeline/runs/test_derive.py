@@ -21,7 +21,7 @@ from pipeline.store.errors import DamagedError
 from pipeline.store.packing import withdraw
 from pipeline.store.run import Run
 
-QUICK = {"polish": False, "rule_n_anchors": 16}
+QUICK = {"polish": False, "extend": False}
 
 
 class MeanOptions(Options):
@@ -270,9 +270,28 @@ def test_attractors__a_default_given_is_no_other_option(whole):
     two = derive(
         whole.info.directory,
         "attractors",
-        {"threshold": 0.3, "look_back": 3, "rule_box": 0.1, "n_points": 64.0, **QUICK},
+        {"threshold": 0.3, "look_back": 3, "n_sample": 32, "n_points": 64.0, **QUICK},
     )
     assert one.encoding["source"] == two.encoding["source"]
+
+
+def test_attractors__what_was_shown_holds_from_then_on(whole):
+    """A search with a smaller budget is the one with the largest; what rests on less is stale."""
+    directory = whole.info.directory
+    less = derive(directory, "attractors", {**QUICK})
+    assert less.attrs["identify_extend"] == 0
+    others = derive(directory, "attractors", {**QUICK, "n_points": 8})
+    more = derive(directory, "attractors", {"polish": False, "budget": 0.5})
+    assert (more.attrs["identify_extend"], more.attrs["identify_budget"]) == (1, 0.5)
+    for options in (QUICK, {"polish": False, "budget": 0.2}):
+        assert derive(directory, "attractors", options).encoding["source"] == more.encoding["source"]
+    # with another option nothing more is known
+    again = derive(directory, "attractors", {**QUICK, "n_points": 8})
+    assert again.encoding["source"] == others.encoding["source"]
+    found = deriving.stored(directory, "attractors")
+    assert found.encoding["source"] in (more.encoding["source"], others.encoding["source"])
+    assert less.encoding["source"] in deriving.stale(directory)
+    assert more.encoding["source"] not in deriving.stale(directory)
 
 
 def test_attractors__pending_cells_stay_pending(made):

@@ -12,10 +12,14 @@ from scipy.integrate import solve_ivp
 
 import magpend
 from pipeline.cli.exits import Exit
+from pipeline.layout.vocabulary import TRANSIENT
+from pipeline.plots import palette
 from pipeline.plots.films import durations
 from pipeline.products.animation import AnimationOptions
 from pipeline.runs import instants
+from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.filming import Start, animation
+from pipeline.runs.moving import of_attractors
 from pipeline.spec.problems import SpecError
 
 HZ = 0.11
@@ -96,6 +100,25 @@ def test_animation__pixels_of_the_bob_are_where_the_data_are(swinging):
         assert near.sum() > 40
         assert columns[near].mean() == pytest.approx(x, abs=1.5)
         assert (height - rows[near]).mean() == pytest.approx(y, abs=1.5)
+
+
+def test_of_attractors__what_does_not_attract_is_shown_when_asked_for(run, monkeypatch):
+    """Else it is said to be there; where nothing attracts, all sets are shown."""
+    opened, options = AnalysedRun.of(run), AnimationOptions(at={"frequency": 0.16})
+    found = opened.derive("attractors").copy(deep=True)
+    monkeypatch.setattr("pipeline.plots.door.attractors_of", lambda run, options: found)
+    found["stability"][:, 1] = TRANSIENT
+    found["share"][:, 1] = 0.0
+    shown, notes = of_attractors(opened, options)
+    assert [one.name for one in shown] == ["A: period 1"]
+    assert notes == ["not shown: 1 of the sets that do not attract; choose with --attractor LETTER"]
+    (shown,), notes = of_attractors(opened, options, ["B"])
+    assert (shown.name, shown.colour) == ("B: period 1, transient", palette.GREY_OF[TRANSIENT])
+    assert notes == []
+    found["stability"][:, 0] = TRANSIENT
+    shown, notes = of_attractors(opened, options)
+    assert [one.name[0] for one in shown] == ["A", "B"]
+    assert notes == []
 
 
 def test_animation__attractors_side_by_side_repeat(run):

@@ -91,7 +91,7 @@ def test_derive__attractors_chaos_and_branches(directory):
     attractors = derive(directory, "attractors")
     table = attractors_table(attractors)
     rests = [row for row in table.rows if row["kind"] == "equilibrium"]
-    cycles = [row for row in table.rows if row["kind"] == "closed_orbit"]
+    cycles = [row for row in table.rows if row["kind"] == "periodic_orbit"]
     assert {row["mu"] for row in rests} == {-0.2, -0.1}
     assert {row["mu"] for row in cycles} == {-0.2, -0.1, 0.1}
     for row in cycles:

@@ -101,7 +101,7 @@ def test_run__text_from_the_specification_to_the_figure(text_spec, tmp_path, pro
     assert "complete" in process(elsewhere, "status", directory).stdout
     assert "intact" in command(elsewhere, "verify", directory)[0]
     table = json.loads(command(elsewhere, "analyse", "attractors", directory, "--json")[0])
-    assert "closed_orbit" in {row["kind"] for row in table}
+    assert "periodic_orbit" in {row["kind"] for row in table}
     command(elsewhere, "analyse", "basins", directory, "--json")
     command(elsewhere, "plot", "basins", directory)
     assert (directory / "figures" / "basins.png").is_file()
@@ -253,13 +253,15 @@ def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, pr
     assert [row["orbit_period"] for row in json.loads(found.stdout)] == [1]
     module = project / "mine.py"
     module.write_text(module.read_text().replace("- y[0]", "- 1.1 * y[0]"))
-    again, kept, settling = in_turn(
+    again, kept, settling, more = in_turn(
         (elsewhere, "run", project / "spec.toml", "--out", "run"),
         (project, "analyse", "attractors", elsewhere / "run", *named, "--json"),
         (project, "analyse", "settling", elsewhere / "run", *named),
+        (project, "analyse", "settling", elsewhere / "run", *named, "--budget", "2"),
     )
     assert again.returncode == 2
     assert "model_digest" in again.stderr
     assert kept.returncode == 0  # what was kept needs no object
-    assert settling.returncode == 2
-    assert "restore the code" in settling.stderr
+    assert settling.returncode == 0  # and neither does what follows from it
+    assert more.returncode == 2  # a longer extension integrates
+    assert "restore the code" in more.stderr

@@ -41,7 +41,7 @@ n_keep = 8
 """
 
 
-QUICK = {"polish": False, "rule_n_anchors": 16}
+QUICK = {"polish": False, "extend": False}
 
 
 @pytest.fixture(scope="module")

@@ -18,17 +18,31 @@ export function share(attrs) {
   return known ? `${percent(attrs.share)} (95 %: ${percent(attrs.low)} to ${percent(attrs.high)})` : percent(attrs.share);
 }
 
+/** What the stability of a set rests on. */
+const EVIDENCE = {
+  eigenvalues: "shown by its eigenvalues", multipliers: "shown by its multipliers",
+  approach: "trajectories on both sides come nearer", stayed: "all extended cells stayed",
+  left: "extended cells left it", volume: "the flow preserves volume",
+};
+
+/** Whether a set attracts and what shows it; of an orbit that the analysis does not know what its multipliers say. */
+export function stabilityOf({ attrs, stable }) {
+  if (attrs.stability) return [attrs.stability, EVIDENCE[attrs.evidence]].filter(Boolean).join(", ");
+  return { true: "stable", false: "unstable" }[String(stable)] ?? null;
+}
+
 function rows(orbit, view) {
   const { attrs } = orbit, found = [];
-  const stability = { true: "stable", false: "unstable" }[String(orbit.stable)];
+  const stability = stabilityOf(orbit), attracts = !attrs.stability || attrs.stability === "attracts";
   const unit = view.model.forced ? (attrs.period === 1 ? "drive period" : "drive periods") : (attrs.period === 1 ? "return" : "returns");
   if (attrs.period) found.push(["Period", `${attrs.period} ${unit}`]);
   else if (attrs.period === null) found.push(["Period", "none found"]);
+  if (attrs.kind) found.push(["Kind", attrs.kind]);
   if (stability) found.push(["Stability", stability]);
   if (attrs.motion) found.push(["Motion", attrs.motion]);
   if (attrs.status) found.push(["Status", String(attrs.status)]);
-  if (attrs.attractor !== null && attrs.attractor !== undefined) found.push(["Attractor", attractorName(attrs.attractor, view)]);
-  const told = share(attrs);
+  if (attrs.attractor !== null && attrs.attractor !== undefined) found.push([attracts ? "Attractor" : "Set", attractorName(attrs.attractor, view)]);
+  const told = attracts ? share(attrs) : null;
   if (told) found.push(["Share of the starts", told]);
   if (attrs.exponents?.length) {
     const from = attrs.exponents_from ? ` (from the ${attrs.exponents_from})` : "";

@@ -88,9 +88,11 @@ function* planeRows({ attrs, arrays }) {
   }
 }
 
+const OF_SET = ["id", "name", "kind", "stability", "evidence", "period", "motion", "share", "low", "high"];
+
 function* attractorRows({ attractors }) {
   for (const one of attractors) {
-    const plain = [one.id, one.name, one.kind, one.period, one.motion, one.share, one.low, one.high];
+    const plain = OF_SET.map((name) => one[name]);
     for (const [k, point] of one.section.entries()) yield [...plain, k, ...point];
   }
 }
@@ -109,7 +111,7 @@ const TABLES = {
     [placeOf(view, x, at), ["branch", "period", "what", "segment", x, y], branchRows(await source.branches({ x, y, at }))],
   orbit: async (source, view, { cell, point }) => {
     const { states, quantities } = view.model, answer = await source.orbit({ cell, point }), { attrs } = answer;
-    const told = { cell, point, frequency: attrs.frequency, status: attrs.status, period: attrs.period, motion: attrs.motion, attractor: attrs.attractor, note: attrs.note };
+    const told = { cell, point, frequency: attrs.frequency, status: attrs.status, period: attrs.period, motion: attrs.motion, attractor: attrs.attractor, kind: attrs.kind, stability: attrs.stability, evidence: attrs.evidence, note: attrs.note };
     const known = Object.fromEntries(Object.entries(told).filter(([, value]) => value !== null && value !== undefined));
     return [known, ["time [s]", ...states.map(heading), ...quantities.map(heading)], orbitRows(answer, states.length, quantities.length)];
   },
@@ -120,8 +122,7 @@ const TABLES = {
     return [{ ...placeOf(view, null, at), ...fixed }, [...units, "label", "name"], planeRows(answer)];
   },
   attractors: async (source, view, { at }) => {
-    const names = ["id", "name", "kind", "period", "motion", "share", "low", "high", "point"];
-    return [placeOf(view, null, at), [...names, ...view.model.states.map(({ name }) => name)], attractorRows(await source.attractors({ at }))];
+    return [placeOf(view, null, at), [...OF_SET, "point", ...view.model.states.map(({ name }) => name)], attractorRows(await source.attractors({ at }))];
   },
 };
 

@@ -74,7 +74,8 @@ function seenOn(colour, paper) {
 
 /** Colour of an orbit: its attractor's where it attracts; where it does not, the ink's, which no attractor has. */
 export function colourOf(orbit, view, colours) {
-  if (orbit.stable === false) return colours.ink;
+  const { stability } = orbit.attrs;
+  if (orbit.stable === false || (stability && stability !== "attracts")) return colours.ink;
   const attractors = view.colours?.find((entry) => entry.name === "attractor");
   const category = attractors?.categories.find((entry) => entry.id === orbit.attrs.attractor);
   return category ? seenOn(category.colour, colours.card) : colours.accent;

@@ -1,0 +1,172 @@
+"""Section points of sets that do not close: whether two samples show one set, and which set a cell is on.
+
+Two trajectories on one ergodic set visit the same points equally often; two sets that attract have a
+distance. So the later half of either sample looks for its nearest neighbours among equally many points
+of the earlier half of its own sample and of the other one. The share of neighbours in the other sample
+is one half for samples of one set, and falls to 0 for two sets once the points are denser than the gap.
+That a half looks at another half keeps neighbours in time, which every trajectory finds in itself, out
+(Schilling, J. Am. Stat. Assoc. 81, 799, 1986, has the statistic for independent points).
+
+Samples are one set from `SAME` on, two below `OTHER`; in between more points decide, and in the end one
+set is assumed: two sets with a distance do not stay there. The measured rate of errors is in
+docs/attractors.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipeline.analysis.sets import Geometry
+
+SAME, OTHER = 0.25, 0.05
+"""Shares of neighbours in the other sample from which two samples are one set, and below which two."""
+
+MOST_POINTS = 4096
+"""Most points of a sample that are compared."""
+
+INSIDE, REACHED = 0.9, 3.0
+"""A cell is on a set if this share of its points lies within this many times the set's own spacing."""
+
+
+def thinned(points: np.ndarray, n: int) -> np.ndarray:
+    """At most `n` points of a sample, in the order of time.
+
+    They are drawn at random, always the same: every second one of a set in two pieces is one piece.
+    """
+    if len(points) <= n:
+        return points
+    drawn = np.random.default_rng(len(points)).choice(len(points), n, replace=False)
+    return np.asarray(points[np.sort(drawn)])
+
+
+def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0) -> float:
+    """Share of the nearest neighbours that lie in the other of two samples, the smaller of both ways.
+
+    Parameters
+    ----------
+    a, b
+        Section points in the order of time, shapes (n, state) and (m, state).
+    geometry
+        Of the states.
+    least
+        Scaled distances up to this count as none: two cells that close on one orbit are on one set.
+
+    Returns
+    -------
+    float
+        About 0.5 for samples of one set, 0 for distant ones; NaN if either has fewer than 4 points.
+    """
+    n = min(len(a), len(b), MOST_POINTS) // 2
+    if n < 2:
+        return float("nan")
+    a, b = thinned(a, 2 * n), thinned(b, 2 * n)
+    return min(_crossing(a, b, n, geometry, least), _crossing(b, a, n, geometry, least))
+
+
+def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float) -> float:
+    """Share of the later half of `own` whose nearest neighbour lies in `other`."""
+    # points from all of the other sample's time
+    trees = [geometry.tree(points) for points in (own[:n], thinned(other, n))]
+    near = [np.maximum(tree.query(geometry.scaled(own[n : 2 * n]), p=np.inf)[0], least) for tree in trees]
+    # points that are near both count half
+    return float((near[1] < near[0]).mean() + 0.5 * (near[1] == near[0]).mean())
+
+
+def is_stationary(path: np.ndarray, geometry: Geometry, least: float = 0.0) -> bool:
+    """Whether the early and the late half of a trajectory fill the same points."""
+    half = len(path) // 2
+    share = mixing(path[:half], path[half:], geometry, least)
+    return bool(share >= OTHER)
+
+
+def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0) -> tuple[np.ndarray, bool]:
+    """Group samples of section points into sets.
+
+    Parameters
+    ----------
+    samples
+        Points of each cell in the order of time, shape (n, state) each.
+    geometry
+        Of the states.
+    least
+        As for `mixing`.
+
+    Returns
+    -------
+    set : ndarray of int64
+        Number of the set of each sample, in the order in which they appear.
+    is_sure : bool
+        Whether no pair of sets was in doubt.
+    """
+    sets: list[list[int]] = []
+    is_sure = True
+    for i, sample in enumerate(samples):
+        shares = [mixing(sample, _pooled([samples[k] for k in own]), geometry, least) for own in sets]
+        near = [k for k, share in enumerate(shares) if share >= OTHER]
+        is_sure &= not any(OTHER <= share < SAME for share in shares)
+        if not near:
+            sets.append([i])
+            continue
+        # a sample that is near several joins them
+        joined = sorted(k for n in near for k in sets[n])
+        sets = [own for n, own in enumerate(sets) if n not in near]
+        sets.append([*joined, i])
+    number = np.zeros(len(samples), np.int64)
+    for k, own in enumerate(sorted(sets, key=min)):
+        number[own] = k
+    return number, is_sure
+
+
+def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
+    """Points of several samples as one, an equal part of each, the times interleaved."""
+    each = max(4, MOST_POINTS // len(samples))
+    parts = [thinned(sample, each) for sample in samples]
+    n = min(len(part) for part in parts)
+    return np.stack([part[:n] for part in parts], axis=1).reshape(-1, parts[0].shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Section points of one set, as other cells are held against it.
+
+    Attributes
+    ----------
+    tree : cKDTree
+        Of the scaled points.
+    spacing : float
+        Scaled distance within which nearly every point of the set finds another.
+    """
+
+    tree: cKDTree
+    spacing: float
+
+    @classmethod
+    def of(cls, samples: Sequence[np.ndarray], geometry: Geometry, least: float) -> Cloud:
+        """Cloud of the points of some cells, its spacing `least` or more."""
+        points = _pooled(samples)
+        # from the one half to the other: the whole is twice as dense
+        order = np.random.default_rng(0).permutation(len(points))
+        half, rest = np.array_split(points[order], 2)
+        away = geometry.tree(half).query(geometry.scaled(rest), p=np.inf)[0] if len(rest) else np.zeros(1)
+        return cls(geometry.tree(points), max(float(np.quantile(away, 0.99)), least))
+
+    def distances(self, section: np.ndarray, geometry: Geometry) -> np.ndarray:
+        """Distance of each section point (..., state) from the set, in units of its spacing."""
+        away = self.tree.query(geometry.scaled(section), p=np.inf)[0]
+        return np.asarray(away / self.spacing)
+
+
+def members(section: np.ndarray, clouds: Sequence[Cloud], geometry: Geometry) -> np.ndarray:
+    """Set that each cell is on by its kept sections (cell, period_index, state), -1 for none."""
+    if not clouds or not len(section):
+        return np.full(len(section), -1, np.int64)
+    away = np.stack([cloud.distances(section, geometry) for cloud in clouds])
+    inside = (away <= REACHED).mean(axis=2)
+    middle = np.median(away, axis=2)
+    best = np.where(inside >= INSIDE, middle, np.inf).argmin(axis=0)
+    found = inside[best, np.arange(len(section))] >= INSIDE
+    return np.where(found, best, -1).astype(np.int64)

@@ -1,0 +1,261 @@
+"""What the analysis of a parameter point asks of the engine, and one call that answers all points at once.
+
+The work on a point is a generator: it yields a request and is sent the answer. Points go in step, so that
+the trajectories of all fill the engine's lanes together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.engine.system import System
+from magpend_core.orbits import section_map
+from magpend_core.sections import run_branches
+from pipeline.analysis.attractors.cells import Guesses
+from pipeline.analysis.attractors.deciding import STRICT
+from pipeline.analysis.attractors.orbits import Orbit, polish, run_on
+from pipeline.analysis.attractors.points import Point
+from pipeline.analysis.sets import Geometry, hashes
+from pipeline.products.reporting import report
+
+LEG = 64
+"""Drive periods or returns between two looks at where extended cells are."""
+
+SLOPE_RTOL = 1e-8
+"""Tolerance of the derivatives along extended cells: exponents need no more."""
+
+
+@dataclass(frozen=True)
+class Leg:
+    """Extend trajectories by `LEG` sections: states (n, state) and step sizes (n,), 0 to choose them."""
+
+    state: np.ndarray
+    step: np.ndarray
+
+
+@dataclass(frozen=True)
+class Extended:
+    """Answer to a `Leg`.
+
+    Attributes
+    ----------
+    section : ndarray, (n, LEG, state)
+    status, orbit_period : ndarray, (n,)
+    turns : ndarray, (n, angle)
+    state, step : ndarray
+        With which the next leg goes on, bit for bit.
+    seconds : ndarray, (n, LEG)
+        Time since the section before [s].
+    """
+
+    section: np.ndarray
+    status: np.ndarray
+    orbit_period: np.ndarray
+    turns: np.ndarray
+    state: np.ndarray
+    step: np.ndarray
+    seconds: np.ndarray
+
+
+@dataclass(frozen=True)
+class Polish:
+    """Find the orbits near some guesses; the answer is a list of `Orbit` or None.
+
+    Guesses without a period are first run on until they close.
+    """
+
+    guesses: Guesses
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Derivatives of the section map at points (n, state); the answer has the shape (n, state, state)."""
+
+    point: np.ndarray
+    rtol: float = SLOPE_RTOL
+
+
+Request = Leg | Polish | Slopes
+T = TypeVar("T")
+Work = Generator[Request, Any, T]
+"""Analysis of a point: yields requests, is sent answers, returns what it found."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How trajectories of a run go on.
+
+    Attributes
+    ----------
+    rtol, atol : float
+    max_steps : int
+        Of one period.
+    closure : float
+        Scaled distance at which extended cells count as closed.
+    longest : int
+        Longest orbit period looked for.
+    residual : float
+        Scaled residual that Newton's method is to reach.
+    seen : int
+        Drive periods or returns that a cell of the run was integrated for.
+    system : System or None
+        What is integrated.
+    method : str
+        Of the run, by which legs go on.
+    geometry : Geometry
+    """
+
+    rtol: float
+    atol: float
+    max_steps: int
+    closure: float
+    longest: int
+    residual: float
+    seen: int
+    system: System | None
+    method: str
+    geometry: Geometry
+
+    @classmethod
+    def of(cls, ds: xr.Dataset, system: System | None, geometry: Geometry, **asked: Any) -> Settings:
+        """Settings of the run that a cube comes from."""
+        given = ds.attrs
+        method = str(given.get("method", system.method if system is not None else ""))
+        seen = int(given.get("n_transient", 0)) + int(given.get("n_keep", ds.sizes["period_index"]))
+        return cls(
+            float(given.get("rtol", 1e-8)), float(given.get("atol", 1e-8)),
+            int(given.get("max_steps_per_period", 20_000)), seen=seen, system=system, method=method,
+            geometry=geometry, **asked,
+        )  # fmt: skip
+
+
+def answer_all(
+    works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings,
+    what: str,
+) -> dict[tuple[int, ...], T]:  # fmt: skip
+    """Carry out the work on all points in step; returns what each found."""
+    answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
+    results: dict[tuple[int, ...], T] = {}
+    while answers:
+        report(what, len(results), len(works))
+        asked: dict[tuple[int, ...], Request] = {}
+        for index, answer in answers.items():
+            try:
+                asked[index] = works[index].send(answer)
+            except StopIteration as stop:
+                results[index] = stop.value
+        legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
+        guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
+        slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
+        answers = _legs(legs, points, settings) if legs else {}
+        answers |= _polished(guesses, points, settings) if guesses else {}
+        answers |= _slopes(slopes, points, settings) if slopes else {}
+    report(what, len(results), len(works))
+    return results
+
+
+def _gathered(
+    sizes: Sequence[int], asked: Mapping[tuple[int, ...], Any], points: Mapping[tuple[int, ...], Point]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Packed parameters and frequency of each row, and where the rows of each point end."""
+    packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
+    frequency = np.repeat([points[i].frequency for i in asked], sizes)
+    return packed, frequency, np.cumsum(sizes)
+
+
+def _legs(
+    asked: Mapping[tuple[int, ...], Leg], points: Mapping[tuple[int, ...], Point], settings: Settings
+) -> dict[tuple[int, ...], Extended]:
+    assert settings.system is not None
+    sizes = [len(leg.state) for leg in asked.values()]
+    packed, frequency, ends = _gathered(sizes, asked, points)
+    found = run_branches(
+        packed[:, None], frequency[:, None], np.concatenate([leg.state for leg in asked.values()]),
+        n_transient=0, n_keep=LEG, rtol=settings.rtol, atol=settings.atol,
+        max_steps_per_period=settings.max_steps, closure_tolerance=settings.closure,
+        max_orbit_period=settings.longest, system=replace(settings.system, method=settings.method),
+        step_size=np.concatenate([leg.step for leg in asked.values()]),
+    )  # fmt: skip
+    seconds = np.broadcast_to(1.0 / frequency[:, None], (len(frequency), LEG))
+    if found.return_time is not None:
+        seconds = found.return_time[:, 0]
+    return {
+        index: Extended(
+            found.section[own, 0], found.status[own, 0], found.orbit_period[own, 0], found.turns[own, 0],
+            found.final_state[own, 0], np.nan_to_num(found.step_size[own, 0]), seconds[own],
+        )
+        for index, own in _slices(asked, sizes, ends)
+    }  # fmt: skip
+
+
+def _slices(
+    asked: Mapping[tuple[int, ...], Any], sizes: Sequence[int], ends: np.ndarray
+) -> list[tuple[tuple[int, ...], slice]]:
+    return [(i, slice(end - n, end)) for i, n, end in zip(asked, sizes, ends.tolist(), strict=True)]
+
+
+def _polished(
+    asked: Mapping[tuple[int, ...], Polish], points: Mapping[tuple[int, ...], Point], settings: Settings
+) -> dict[tuple[int, ...], list[Orbit | None]]:
+    assert settings.system is not None
+    guesses = [request.guesses for request in asked.values()]
+    sizes = [len(g.key) for g in guesses]
+    packed, frequency, ends = _gathered(sizes, asked, points)
+    start = np.concatenate([g.point for g in guesses])
+    period = np.concatenate([g.period for g in guesses])
+    mark = np.concatenate([g.mark for g in guesses])
+    unknown = np.flatnonzero(period == 0)
+    start[unknown], period[unknown] = run_on(
+        packed[unknown], frequency[unknown], start[unknown], settings.longest, settings.system
+    )
+    rows, place = _each_once(
+        np.repeat(np.arange(len(sizes)), sizes), start, period, mark, unknown, settings.geometry
+    )
+    polished = polish(
+        packed[rows], frequency[rows], start[rows], period[rows],
+        geometry=settings.geometry, system=settings.system, tolerance=settings.residual,
+    )  # fmt: skip
+    found = [polished[i] if i >= 0 else None for i in place]
+    return {index: found[own] for index, own in _slices(asked, sizes, ends)}
+
+
+def _each_once(
+    search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray,
+    geometry: Geometry,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Rows to polish, and for each row the place of its own among them, -1 for none.
+
+    Of rows that were run on and ended in one box, on one orbit that is, the one of least hash.
+    """
+    rows = np.arange(len(period))
+    key = mark.copy()
+    boxes = geometry.boxes(start[ended], STRICT)
+    key[ended] = hashes(np.concatenate([period[ended, None], boxes], axis=1))
+    group = np.stack([search.astype(np.uint64), np.isin(rows, ended).astype(np.uint64), key], axis=1)
+    order = rows[np.lexsort((mark, *group.T[::-1]))]
+    order = order[period[order] > 0]
+    new = np.ones(len(order), bool)
+    new[1:] = (group[order][1:] != group[order][:-1]).any(axis=1) | ~np.isin(order[1:], ended)
+    place = np.full(len(period), -1)
+    place[order] = np.cumsum(new) - 1
+    return order[new], place
+
+
+def _slopes(
+    asked: Mapping[tuple[int, ...], Slopes], points: Mapping[tuple[int, ...], Point], settings: Settings
+) -> dict[tuple[int, ...], np.ndarray]:
+    assert settings.system is not None
+    found: dict[tuple[int, ...], np.ndarray] = {}
+    for rtol in {request.rtol for request in asked.values()}:
+        own = {index: request for index, request in asked.items() if request.rtol == rtol}
+        sizes = [len(request.point) for request in own.values()]
+        packed, frequency, ends = _gathered(sizes, own, points)
+        start = np.concatenate([request.point for request in own.values()])
+        slopes = section_map(packed, frequency, start, 1, rtol=rtol, system=settings.system).derivatives
+        found |= {index: slopes[rows] for index, rows in _slices(own, sizes, ends)}
+    return found

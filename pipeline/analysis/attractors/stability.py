@@ -1,0 +1,80 @@
+"""Stability of a set: what has been shown of it, and by what.
+
+==============  ======================================================================================
+stability       shown by
+==============  ======================================================================================
+attracts        eigenvalues with negative real parts, multipliers inside the unit circle, by more than
+                their error; of a degenerate orbit or equilibrium, trajectories on both sides that come
+                nearer; of any other set, a sample of its cells that stayed long enough
+unstable        an eigenvalue or a multiplier outside, by more than its error
+transient       cells of the set left it
+not settled     nothing: the time allowed was too short
+neutral         eigenvalues or multipliers on the axis or circle within their error, or a flow that
+                preserves volume
+==============  ======================================================================================
+
+A sample has stayed long enough when each of its cells stayed ten times the longest transient seen at the
+parameter point (the time before the last kept section counts as seen), or when the lower end of the
+lifetime's 95 % interval is that long, and when the early and the late half of the extension fill the same
+points (`clouds.mixing`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.layout.vocabulary import ATTRACTS, EVIDENCE, NEUTRAL, UNSTABLE
+
+BY_NOTHING, BY_EIGENVALUES, BY_MULTIPLIERS, BY_APPROACH, BY_STAYING, BY_LEAVING, BY_VOLUME = range(
+    len(EVIDENCE)
+)
+"""Values of `evidence`."""
+
+TIMES_LONGEST = 10.0
+"""A sample stays that has stayed so many times the longest transient seen."""
+
+MATRIX_ERROR = 1e-9
+"""Relative error of a monodromy matrix: those of two methods at tolerance 1e-12 agree to 1e-10."""
+
+RATE_ERROR = 1e-9
+"""Relative error of a Jacobian's entries at a polished equilibrium."""
+
+_TRIALS = 8
+
+
+def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> float:
+    """Estimate the error of the leading eigenvalue of a matrix whose entries err by `size` at most.
+
+    The matrix is perturbed a few times; so a multiple eigenvalue, which moves by a root of the
+    perturbation, gets the larger error that it has.
+
+    Parameters
+    ----------
+    matrix
+        Shape (n, n).
+    size
+        Absolute error of an entry.
+    real
+        Whether the largest real part is meant; else the largest modulus.
+
+    Returns
+    -------
+    float
+        Largest change of that real part or modulus; NaN if the matrix is not finite.
+    """
+    if not np.isfinite(matrix).all():
+        return float("nan")
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (_TRIALS, *matrix.shape))
+    values = np.linalg.eigvals(np.concatenate([matrix[None], matrix + size * signs]))
+    leading = (values.real if real else np.abs(values)).max(axis=1)
+    return float(np.abs(leading[1:] - leading[0]).max())
+
+
+def by_margin(leading: float, bound: float, error: float) -> int:
+    """Stability from a leading modulus or real part: `ATTRACTS` below the bound, `UNSTABLE` above it.
+
+    `NEUTRAL` stands for within the error of the bound.
+    """
+    if leading < bound - error:
+        return ATTRACTS
+    return UNSTABLE if leading > bound + error else NEUTRAL

@@ -1,0 +1,115 @@
+"""What each cell of a run ends on: an attractor, nothing bounded, or something that does not count.
+
+Shares, basins and all that is made of them count sets that attract. Every other cell is counted under its own
+name: what its set is, or how it failed. This is the only place where that is decided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.basins.numbers import binomial_interval
+from pipeline.layout import vocabulary
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED, TRANSIENT, UNSTABLE, split_dims
+from pipeline.layout.vocabulary import DIVERGES as DIVERGED_LATER
+
+DIVERGED = -2
+"""Label of the cells that diverged: an outcome like an attractor. -1 is no outcome."""
+
+_ON_SET = {
+    UNSTABLE: "on an unstable orbit or equilibrium",
+    TRANSIENT: "on a transient set",
+    NOT_SETTLED: "not settled",
+    NEUTRAL: "on a neutral set",
+}
+
+_BY_STATUS = {
+    vocabulary.PENDING: "pending",
+    vocabulary.STEP_LIMIT: "step limit",
+    vocabulary.STEP_UNDERFLOW: "step underflow",
+    vocabulary.UNREACHED: "unreached",
+    vocabulary.NO_RETURN: "no return",
+}
+
+
+def outcomes(ids: xr.Dataset) -> xr.DataArray:
+    """Label of each cell: the attractor that it ends on, -2 (`DIVERGED`), or -1 for everything else.
+
+    Parameters
+    ----------
+    ids
+        Result of `identify` or `match`.
+    """
+    label = np.where(stability_of_cells(ids) == ATTRACTS, _cells(ids, "attractor_id"), -1)
+    gone = (_cells(ids, "status") == vocabulary.DIVERGED) | (_cells(ids, "decision") == DIVERGED_LATER)
+    label[gone] = DIVERGED
+    return ids["attractor_id"].transpose(*_dims(ids)).copy(data=label).transpose(*ids["attractor_id"].dims)
+
+
+def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
+    """Stability of the set that each cell is on, 0 for none; on the parameter dims, then the start dims."""
+    dims, _ = split_dims(ids["attractor_id"])
+    cells, stability = _cells(ids, "attractor_id"), ids["stability"].transpose(*dims, "attractor").values
+    found = np.zeros(cells.shape, np.int8)
+    for index in np.ndindex(*stability.shape[:-1]):
+        found[index] = np.append(stability[index], 0)[cells[index]]
+    return found
+
+
+def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
+    """Cells that do not end on an attractor, by what became of them.
+
+    Returns
+    -------
+    dict of ndarray of bool
+        By name, on the parameter dims and then the start dims; each such cell is in exactly one.
+    """
+    label = outcomes(ids).transpose(*_dims(ids)).values
+    status, stability = _cells(ids, "status"), stability_of_cells(ids)
+    left = label == -1
+    found = {"diverged": label == DIVERGED}
+    for code, name in _ON_SET.items():
+        found[name] = left & (stability == code)
+    left &= stability == 0
+    for code, name in _BY_STATUS.items():
+        found[name] = left & (status == code)
+        left &= status != code
+    found["not settled"] = found["not settled"] | left
+    return {name: which for name, which in found.items() if which.any()}
+
+
+def share_interval(count: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """95 % Wilson interval of shares, from the numbers of cells; NaN where the share is 0.
+
+    Parameters
+    ----------
+    count, share
+        `n_cells` and `share` of sets, arrays of one shape.
+    """
+    shown = share > 0.0
+    total = np.where(shown, np.rint(count / np.where(shown, share, 1.0)), 1.0)
+    low, high = binomial_interval(np.where(shown, count, 0.0), total)
+    return np.where(shown, low, np.nan), np.where(shown, high, np.nan)
+
+
+def _dims(ids: xr.Dataset) -> tuple[str, ...]:
+    dims, starts = split_dims(ids["attractor_id"])
+    return (*dims, *starts)
+
+
+def _cells(ids: xr.Dataset, name: str) -> np.ndarray:
+    return np.asarray(ids[name].transpose(*_dims(ids)).values)
+
+
+def sentence(ids: xr.Dataset) -> str:
+    """One sentence on how many cells end on attractors, and what the others do."""
+    total = ids["attractor_id"].size
+    others = other_cells(ids)
+    n = total - sum(int(which.sum()) for which in others.values())
+    if not others:
+        return f"all {total} cells end on attractors"
+    texts = ", ".join(f"{int(which.sum())} {name}" for name, which in others.items())
+    return f"{n} of {total} cells end on attractors; {texts}"

@@ -1,0 +1,237 @@
+"""Cells that are extended: maps whose attractors, repellers and lifetimes are known on paper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magpend_core.status import Status
+from pipeline.analysis.attractors.cells import Block
+from pipeline.analysis.attractors.extending import Outcome, extend
+from pipeline.analysis.attractors.growth import growth_of, on_closed_curves
+from pipeline.analysis.attractors.orbits import Orbit
+from pipeline.analysis.attractors.requests import LEG, Extended, Leg, Polish, Settings, Slopes
+from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import (
+    ATTRACTS,
+    BOUNDED_SET,
+    CHAOTIC_SET,
+    NEUTRAL,
+    NOT_SETTLED,
+    TORUS,
+    TRANSIENT,
+)
+
+N_KEEP = 20
+TENT_SLOPE = 2.05
+
+
+class MapPoint:
+    """Cells of a map in place of a parameter point."""
+
+    can_rest, is_flow, n_neutral = False, False, 0
+
+    def __init__(self, step, slope, starts, seen=N_KEEP):
+        self.step, self.slope = step, slope
+        self.section = np.empty((len(starts), N_KEEP, starts.shape[1]))
+        state = starts.copy()
+        for i in range(N_KEEP):
+            state = step(state)
+            self.section[:, i] = state
+        self.n_cells, self.n_periods = len(starts), seen * len(starts)
+
+    def blocks(self):
+        n = self.n_cells
+        yield Block(slice(0, n), self.section, np.full(n, Status.BOUNDED), np.zeros(n, int), np.zeros((n, 0)))
+
+    def volumes(self, derivatives, before, after):
+        return np.linalg.slogdet(derivatives)[1]
+
+
+def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0) -> Outcome:
+    """Drive the extension of a point by its own map."""
+    n_states = point.section.shape[2]
+    geometry = Geometry((False,) * n_states, (scale,) * n_states)
+    settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, seen, None, "", geometry)
+    work = extend(point, list(orbits), np.full(point.n_cells, -1), settings, budget, 32)
+    answer = None
+    while True:
+        try:
+            asked = work.send(answer)
+        except StopIteration as stop:
+            return stop.value
+        if isinstance(asked, Leg):
+            section, state = np.empty((len(asked.state), LEG, n_states)), asked.state.copy()
+            for i in range(LEG):
+                state = point.step(state)
+                section[:, i] = state
+            n = len(state)
+            status = np.where(np.isfinite(state).all(axis=1), Status.BOUNDED, Status.DIVERGED)
+            answer = Extended(
+                section,
+                status,
+                np.zeros(n, int),
+                np.zeros((n, 0), int),
+                state,
+                np.zeros(n),
+                np.ones((n, LEG)),
+            )
+        elif isinstance(asked, Slopes):
+            answer = point.slope(asked.point)
+        else:
+            assert isinstance(asked, Polish)
+            answer = [None] * len(asked.guesses.key)
+
+
+def tent(slope):
+    """Tent map on [0, 1]; what leaves through the top is drawn to 2."""
+
+    def step(x):
+        inside = slope * np.minimum(x, 1.0 - x)
+        return np.where(x <= 1.0, inside, 2.0 + 0.5 * (x - 2.0))
+
+    def derivative(x):
+        return np.where(x < 0.5, slope, -slope)[:, :, None]
+
+    return step, derivative
+
+
+FIXED = Orbit(np.array([[2.0]]), np.array([0.5 + 0j]), 1e-12, np.array([[0.5]]))
+
+
+def test_extend__escape_rate_of_the_tent_map():
+    """Of a uniform density 2/slope stays at every step: the mean lifetime is s/(s - 2) = 41."""
+    starts = np.random.default_rng(3).uniform(0, 1, (4000, 1))
+    # scaled so that what counts as near the fixed point is all beyond 1: the image of the hole
+    found = settle(MapPoint(*tent(TENT_SLOPE), starts), [FIXED], scale=1.0 / 0.3)
+    (left,) = found.sets
+    assert left.stability == TRANSIENT
+    assert left.n_left > 500
+    truth = TENT_SLOPE / (TENT_SLOPE - 2.0)
+    # a cell is told after at least 8 of its sections: those that leave before are near their orbit
+    assert left.time_at_risk / left.n_left == pytest.approx(truth + 8.0, rel=0.15)
+    assert not any(course.goes_on for course in found.courses)
+
+
+def test_extend__a_chaotic_attractor_stays():
+    """At slope 1.9 the same map has one, with the exponent ln 1.9."""
+    starts = np.random.default_rng(4).uniform(0.2, 0.8, (50, 1))
+    found = settle(MapPoint(*tent(1.9), starts), [FIXED])
+    (one,) = found.sets
+    assert (one.kind, one.stability, one.n_left) == (CHAOTIC_SET, ATTRACTS, 0)
+    assert one.growth.rate == pytest.approx(np.log(1.9), abs=1e-9)
+    # the sample stayed for ten times the 20 sections that were seen
+    assert min(course.length for course in found.courses) >= 200
+    assert not found.ran_out
+
+
+def test_extend__two_chaotic_attractors_are_two():
+    """Two tents side by side, with a gap that 20 sections do not resolve."""
+
+    def step(x):
+        base = np.floor(x / 1.01)
+        y = x - 1.01 * base
+        return 1.01 * base + np.clip(1.9 * np.minimum(y, 1.0 - y), 0.0, 1.0)
+
+    starts = np.random.default_rng(5).uniform(0.3, 0.7, (40, 1)) + 1.01 * (np.arange(40) % 2)[:, None]
+    found = settle(MapPoint(step, tent(1.9)[1], starts))
+    assert [one.stability for one in found.sets] == [ATTRACTS, ATTRACTS]
+    sides = [{int(cell) % 2 for cell in one.cells} for one in found.sets]
+    assert sorted(map(sorted, sides)) == [[0], [1]]
+
+
+def rotation(alpha, contraction):
+    """A circle of radius 1 that is approached by a factor at each step, and a rotation along it."""
+
+    def step(x):
+        z = x[:, 0] + 1j * x[:, 1]
+        z = z / np.abs(z) * (1.0 + contraction * (np.abs(z) - 1.0)) * np.exp(2j * np.pi * alpha)
+        return np.stack([z.real, z.imag], axis=1)
+
+    def derivative(x):
+        angle = np.arctan2(x[:, 1], x[:, 0])
+        radial = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        tangent = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+        turned = angle + 2 * np.pi * alpha
+        new_radial = np.stack([np.cos(turned), np.sin(turned)], axis=1)
+        new_tangent = np.stack([-np.sin(turned), np.cos(turned)], axis=1)
+        return (
+            contraction * new_radial[:, :, None] * radial[:, None]
+            + new_tangent[:, :, None] * tangent[:, None]
+        )
+
+    return step, derivative
+
+
+GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+def test_extend__a_torus_attracts():
+    starts = np.random.default_rng(6).normal(size=(20, 2)) + 0.1
+    found = settle(MapPoint(*rotation(GOLDEN, 0.5), starts))
+    (one,) = found.sets
+    assert (one.kind, one.stability) == (TORUS, ATTRACTS)
+    assert abs(one.growth.weighted) < 1e-9
+
+
+def test_extend__a_torus_of_a_conservative_map_is_neutral():
+    starts = np.random.default_rng(6).normal(size=(4, 2))
+    found = settle(MapPoint(*rotation(GOLDEN, 1.0), starts))
+    # each cell keeps its own radius
+    assert [one.stability for one in found.sets] == [NEUTRAL] * 4
+
+
+def test_extend__a_slow_spiral_is_not_settled():
+    """Towards a point, by .9999 at each turn: it neither stays nor arrives in the time allowed."""
+
+    def step(x):
+        z = (x[:, 0] + 1j * x[:, 1]) * 0.9999 * np.exp(2j * np.pi * GOLDEN)
+        return np.stack([z.real, z.imag], axis=1)
+
+    def derivative(x):
+        c, s = 0.9999 * np.cos(2 * np.pi * GOLDEN), 0.9999 * np.sin(2 * np.pi * GOLDEN)
+        return np.broadcast_to(np.array([[c, -s], [s, c]]), (len(x), 2, 2))
+
+    found = settle(MapPoint(step, derivative, np.array([[1.0, 0.0]])), budget=1.0)
+    assert {one.stability for one in found.sets} == {NOT_SETTLED}
+
+
+def test_extend__cells_that_diverge_are_no_set():
+    starts = np.random.default_rng(4).uniform(0.2, 0.8, (10, 1))
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = settle(MapPoint(lambda x: np.where(x < 3, x + 0.05, x**8), lambda x: x[:, :, None], starts))
+    assert {course.end for course in found.courses} == {-3}
+
+
+def test_extend__without_a_budget_nothing_is_said():
+    starts = np.random.default_rng(4).uniform(0.2, 0.8, (50, 1))
+    found = settle(MapPoint(*tent(1.9), starts), budget=0.0)
+    assert found.spent == 0
+    assert {(one.kind, one.stability) for one in found.sets} == {(BOUNDED_SET, NOT_SETTLED)}
+
+
+def test_growth__exponents_of_the_henon_map():
+    """0.419 and ln .3 in all (validated numbers of a = 1.4, b = .3)."""
+    x = np.random.default_rng(0).uniform(-0.1, 0.1, (8, 2))
+    slopes = np.empty((8, 2048, 2, 2))
+    for _ in range(100):
+        x = np.stack([1.0 - 1.4 * x[:, 0] ** 2 + x[:, 1], 0.3 * x[:, 0]], axis=1)
+    for i in range(2048):
+        slopes[:, i] = [[[-2.8 * a, 1.0], [0.3, 0.0]] for a in x[:, 0]]
+        x = np.stack([1.0 - 1.4 * x[:, 0] ** 2 + x[:, 1], 0.3 * x[:, 0]], axis=1)
+    found = growth_of(slopes, 0, np.linalg.slogdet(slopes)[1])
+    assert found.low < 0.4192 < found.high
+    assert found.is_chaotic
+    assert not found.preserves_volume
+    assert found.volume == pytest.approx(np.log(0.3))
+
+
+def test_on_closed_curves__curves_but_no_arcs_clouds_or_points():
+    geometry, rng = Geometry((False, False), (1.0, 1.0)), np.random.default_rng(0)
+    angle = 2 * np.pi * GOLDEN * np.arange(600)
+    circle = np.stack([np.cos(angle), 0.3 * np.sin(angle)], axis=1)
+    assert on_closed_curves(circle, geometry)
+    assert not on_closed_curves(rng.uniform(-1, 1, (600, 2)), geometry)
+    assert not on_closed_curves(circle * 0.999 ** np.arange(600)[:, None], geometry)
+    # a doubled circle of a width that the points resolve
+    assert not on_closed_curves(circle * (1.0 + 0.05 * rng.uniform(-1, 1, (600, 1))), geometry)

@@ -1,0 +1,116 @@
+"""Margins and errors of eigenvalues; equilibria, degenerate orbits and conservative flows of small texts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.analysis.attractors.orbits import Orbit
+from pipeline.analysis.attractors.stability import by_margin, largest_error
+from pipeline.analysis.attractors.table import attractors_table
+from pipeline.analysis.outcomes import other_cells, outcomes, sentence
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, UNSTABLE
+from pipeline.runs.derive import derive, stale
+from pipeline.runs.run import run
+
+
+def orbit(multiplier, residual=1e-13):
+    return Orbit(np.zeros((1, 1)), np.array([multiplier + 0j]), residual, np.array([[multiplier]]))
+
+
+def test_by_margin__within_the_error_nothing_is_said():
+    assert by_margin(0.9, 1.0, 0.05) == ATTRACTS
+    assert by_margin(0.97, 1.0, 0.05) == by_margin(1.03, 1.0, 0.05) == NEUTRAL
+    assert by_margin(1.1, 1.0, 0.05) == UNSTABLE
+
+
+def test_largest_error__a_double_eigenvalue_moves_by_a_root():
+    assert largest_error(np.diag([1.0, 0.5]), 1e-10) < 1e-9
+    jordan = np.array([[1.0, 1.0], [0.0, 1.0]])
+    assert largest_error(jordan, 1e-10) == pytest.approx(1e-5, rel=0.9)
+    assert np.isnan(largest_error(np.full((2, 2), np.nan), 1e-10))
+
+
+def test_orbit__weak_attraction_is_attraction():
+    assert orbit(0.999).stability == ATTRACTS
+    assert orbit(-1.001).stability == UNSTABLE
+    assert orbit(1.0).stability == NEUTRAL
+    # beside a fold Newton's method stops where the residual is small, and the multiplier off by its root
+    assert orbit(1.0 - 1e-5, residual=1e-10).stability == NEUTRAL
+
+
+SPEC = """
+kind = "sweep"
+[parameters]
+frequency_hz = 1.0
+[model]
+name = "unst"
+states = {{ x = {{}}, y = {{}} }}
+parameters = {{ r = 0.3 }}
+equations = {{ x = "r*x - x**3", y = "-y + cos(2*pi*f*t)" }}
+[axes]
+r = {{ values = {values} }}
+[initial_conditions]
+kind = "grid"
+x = {{ start = -1.0, stop = 1.0, num = 5 }}
+y = 0.0
+[integration]
+n_transient = 300
+n_keep = 60
+"""
+"""A pitchfork at r = 0, beside a damped state that the drive moves; from starts on a symmetric grid."""
+
+
+@pytest.fixture(scope="module")
+def pitchfork(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pitchfork")
+    (folder / "spec.toml").write_text(SPEC.format(values=[0.0, 0.001, 3.0]))
+    run(folder / "spec.toml", folder / "run", workers=0)
+    return folder / "run"
+
+
+def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
+    """+-sqrt(r) with the multiplier exp(-2 r), half of the cells each; 0 with exp(r); all cells at r = 0."""
+    rows = attractors_table(derive(pitchfork, "attractors")).rows
+    told = {(row["r"], row["stability"], row["n_cells"], round(row["multiplier_modulus"], 4)) for row in rows}
+    assert told == {
+        (0.0, "attracts", 5, 1.0),
+        (0.001, "attracts", 2, 0.998), (0.001, "unstable", 1, 1.001),
+        (3.0, "attracts", 2, 0.3679), (3.0, "unstable", 1, 20.0855),
+    }  # fmt: skip
+    assert [row["evidence"] for row in rows if row["r"] == 0.0] == ["approach"]
+    fractions = [row["fraction"] for row in rows if row["r"] > 0.0 and row["stability"] == "attracts"]
+    assert fractions == [0.5] * 4
+    assert all(np.isnan(row["fraction"]) for row in rows if row["stability"] == "unstable")
+
+
+def test_outcomes__cells_on_the_repeller_are_counted_by_name(pitchfork):
+    ids = derive(pitchfork, "attractors")
+    assert (outcomes(ids) == -1).sum() == 2
+    assert {name: int(which.sum()) for name, which in other_cells(ids).items()} == {
+        "on an unstable orbit or equilibrium": 2
+    }
+    assert sentence(ids) == "13 of 15 cells end on attractors; 2 on an unstable orbit or equilibrium"
+
+
+def test_basins__have_no_basin_of_a_repeller(pitchfork):
+    found = derive(pitchfork, "basins")
+    assert found["n_unstable"].values.tolist() == [0, 1, 1]
+    at = found.sel(r=3.0)
+    own = at["fraction"].values[at["count"].values > 0]
+    assert own.tolist() == [0.5, 0.5]
+    # what the cell without an outcome could change
+    assert at["fraction_if_none"].values.max() == pytest.approx(0.4)
+    assert at["fraction_if_all"].values.max() == pytest.approx(0.6)
+
+
+def test_derive__more_evidence_holds_everywhere(pitchfork):
+    """What is asked with less is answered with the most that is kept, and the rest is stale."""
+    without = derive(pitchfork, "attractors", {"extend": False, "n_points": 8})
+    assert without.attrs["identify_extend"] == 0
+    more = derive(pitchfork, "attractors", {"budget": 3.0, "n_points": 8})
+    again = derive(pitchfork, "attractors", {"extend": False, "n_points": 8})
+    assert again.attrs["derived_key"] == more.attrs["derived_key"]
+    assert any("attractors" in name for name in stale(pitchfork))
+    basins = derive(pitchfork, "basins", {"n_points": 8})
+    assert basins.attrs["identify_budget"] == 3.0

@@ -1,0 +1,53 @@
+"""What the page's scripts say of a set: run by node, where there is one."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import pipeline.explorer
+
+SOURCES = Path(pipeline.explorer.__file__).parent / "page" / "src"
+
+
+def evaluated(module, expression):
+    """Value of an expression in the exports of a module of the page."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("there is no node on this machine")
+    code = f"import * as m from {json.dumps((SOURCES / module).as_uri())};"
+    code += f"console.log(JSON.stringify({expression}));"
+    command = [node, "--input-type=module", "--eval", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    ("attrs", "stable", "said"),
+    [
+        ({"stability": "attracts", "evidence": "multipliers"}, True, "attracts, shown by its multipliers"),
+        ({"stability": "attracts", "evidence": "stayed"}, True, "attracts, all extended cells stayed"),
+        ({"stability": "transient", "evidence": "left"}, None, "transient, extended cells left it"),
+        ({"stability": "not settled", "evidence": None}, None, "not settled"),
+        # an orbit that the analysis does not know
+        ({}, False, "unstable"),
+        ({"stability": None}, True, "stable"),
+        ({}, None, None),
+    ],
+)
+def test_stability_of__what_was_shown_and_by_what(attrs, stable, said):
+    orbit = json.dumps({"attrs": attrs, "stable": stable})
+    assert evaluated("facts.js", f"m.stabilityOf({orbit})") == said
+
+
+def test_colour_of__a_set_that_does_not_attract_has_none():
+    view = {"colours": [{"name": "attractor", "categories": [{"id": 3, "colour": "#ff0000"}]}]}
+    colours = {"card": "#ffffff", "ink": "#101010", "accent": "#0000ff"}
+    for stability, found in (("attracts", "#ff0000"), ("transient", "#101010"), ("not settled", "#101010")):
+        orbit = {"attrs": {"attractor": 3, "stability": stability}, "stable": None}
+        given = ", ".join(map(json.dumps, (orbit, view, colours)))
+        assert evaluated("orbit.js", f"m.colourOf({given})") == found

@@ -1,0 +1,117 @@
+"""Run a setting of a system through magpend, analyse it, and have it judged."""
+
+from __future__ import annotations
+
+import signal
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from tests.zoo import answers, variants
+from tests.zoo.answers import Answer
+from tests.zoo.judge import Verdict, judge_point, words
+
+
+@dataclass
+class Outcome:
+    """What came of a setting: the rows in words, the verdict, or the error."""
+
+    name: str
+    setting: str
+    verdict: Verdict = field(default_factory=Verdict)
+    found: str = ""
+    error: str = ""
+    seconds: float = 0.0
+
+    @property
+    def word(self) -> str:
+        """Verdict in a word."""
+        return "error" if self.error else self.verdict.word
+
+    @property
+    def reasons(self) -> list[str]:
+        """Return the reasons for a verdict other than right."""
+        return [self.error] if self.error else self.verdict.wrong
+
+
+def outcome_of(name: str, setting: str, limit: float = 0.0) -> Outcome:
+    """Run one setting of a system in a temporary folder; an error or a time above the limit [s] is kept."""
+    started = time.perf_counter()
+    outcome = Outcome(name, setting)
+    data = dict(variants.settings(variants.load(name)))[setting]
+    try:
+        with _time_limit(limit), tempfile.TemporaryDirectory(prefix=f"zoo-{name}-") as folder:
+            ds, rows = analysed(data, Path(folder))
+            outcome.verdict = judged(answers.load(name), ds, rows)
+            outcome.found = "; ".join(words(row) for row in rows)
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        outcome.error = f"{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
+    outcome.seconds = time.perf_counter() - started
+    return outcome
+
+
+@contextmanager
+def _time_limit(seconds: float) -> Iterator[None]:
+    """Raise TimeoutError in the block after some seconds; 0 for no limit."""
+
+    def expire(number: int, frame: FrameType | None) -> None:
+        raise TimeoutError(f"more than {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, expire)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def analysed(data: Mapping[str, Any], folder: Path) -> tuple[Any, list[dict[str, Any]]]:
+    """Run a specification and find its attractors; returns the analysis' dataset and the table's rows."""
+    from pipeline.analysis.attractors.table import attractors_table
+    from pipeline.runs.derive import derive
+    from pipeline.runs.run import run
+
+    run(variants.write(data, folder), folder / "run", workers=0, echo=lambda _: None)
+    ds = derive(folder / "run", "attractors")
+    return ds, attractors_table(ds).rows
+
+
+def judged(answer: Answer, ds: Any, rows: list[dict[str, Any]]) -> Verdict:
+    """Judge the rows of all parameter points of a run."""
+    from pipeline.analysis.sets import Geometry
+    from pipeline.layout.vocabulary import model_of, split_dims
+
+    geometry = Geometry.of(model_of(ds)).difference
+    dims, _ = split_dims(ds["attractor_id"])
+    verdict = Verdict()
+    for index in np.ndindex(*(ds.sizes[d] for d in dims)):
+        one = ds.isel(dict(zip(dims, index, strict=True)))
+        where = {d: float(one[d]) for d in dims}
+        here = [
+            {**row, "points": one["attractor_points"].sel(attractor=row["attractor_id"]).values}
+            for row in rows
+            if all(np.isclose(row[d], v, rtol=1e-12, atol=0.0) for d, v in where.items())
+        ]
+        n_cells, n_left = _cells(one)
+        verdict.add(judge_point(answer, where, here, n_cells=n_cells, n_left=n_left, geometry=geometry))
+    return verdict
+
+
+def _cells(one: Any) -> tuple[int, int]:
+    """Cells of a parameter point that did not diverge, and those of them that belong to no set."""
+
+    def shows(name: str, word: str) -> np.ndarray:
+        return np.asarray(one[name].values == one[name].attrs["flag_meanings"].split().index(word))
+
+    gone = shows("status", "diverged") | shows("decision", "diverges")
+    return int(np.count_nonzero(~gone)), int(np.count_nonzero((one["attractor_id"].values < 0) & ~gone))
