@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from magpend_core.models import LIBRARY, load_model
+from pipeline.layout.vocabulary import EQUILIBRIUM
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.workflows import shipped_workflows
 
@@ -150,7 +151,7 @@ def test_belt__where_rest_and_stick_slip_are_found(analysed, size):
     attractors = analysed("belt").derive("attractors")
     reference = REFERENCE["belt"]
     share = attractors.share
-    rests = attractors.attractor.values[(attractors["kind"] == 3).any("belt")]
+    rests = attractors.attractor.values[(attractors["kind"] == EQUILIBRIUM).any("belt")]
     at_rest = share.sel(attractor=rests).fillna(0.0).sum("attractor")
     belts = attractors.belt.values
     assert (at_rest.values[belts < reference["hopf"]] == 0.0).all()

@@ -30,6 +30,7 @@ from scalar_peers import scipy_runner
 from magpend_core import load_preset, sections
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.attractors.attractors import identify
+from pipeline.layout.vocabulary import PERIODIC_ORBIT
 
 FREQUENCY_HZ = 2.2
 TOLERANCE = 1e-8
@@ -103,7 +104,7 @@ def same_labels(a: xr.Dataset, b: xr.Dataset) -> np.ndarray:
     """Where both say the same: one orbit, or a bounded set, or nothing."""
     (kind, period, point), (other_kind, other_period, other_point) = (_labels(x) for x in (a, b))
     near = np.abs(point - other_point).max(axis=-1) <= SAME
-    return (kind == other_kind) & ((kind != 1) | ((period == other_period) & near))
+    return (kind == other_kind) & ((kind != PERIODIC_ORBIT) | ((period == other_period) & near))
 
 
 def _labels(found: xr.Dataset) -> tuple[np.ndarray, ...]:
@@ -178,8 +179,10 @@ def _report(
           f"with identification {whole:.3f}")  # fmt: skip
     same = same_labels(found[fixed.name], found[early.name])
     kind, _, _ = _labels(found[fixed.name])
+    on_orbit = same[kind == PERIODIC_ORBIT]
+    share = f"{100 * on_orbit.mean():.3f} %" if len(on_orbit) else "none"
     print(f"same labels: {100 * same.mean():.3f} % of all cells, "
-          f"{100 * same[kind == 1].mean():.3f} % of those that the fixed way sees on an orbit")  # fmt: skip
+          f"{share} of the {len(on_orbit)} that the fixed way sees on an orbit")  # fmt: skip
     for way in (fixed, early):
         one = found[way.name]
         counts = zip(one["orbit_period"].values, one["n_cells"].values, strict=True)

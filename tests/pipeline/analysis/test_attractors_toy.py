@@ -230,14 +230,14 @@ def rows(*points, rotation=None):
     for i, p in enumerate(points):
         section[i, : len(p), 0] = 0.0
         section[i, : len(p), 0, 0] = p
-        kind[i, : len(p)] = 1
+        kind[i, : len(p)] = PERIODIC_ORBIT
     ids = np.where(kind > 0, np.arange(n), -1).astype(np.int32)
     turned = np.zeros((len(points), n, 2)) if rotation is None else np.asarray(rotation, float)
     dims = ("frequency", "attractor")
     return xr.Dataset(
         {
             "kind": (dims, kind),
-            "orbit_period": (dims, (kind == 1).astype(np.int32)),
+            "orbit_period": (dims, (kind == PERIODIC_ORBIT).astype(np.int32)),
             "attractor_points": ((*dims, "point", "state"), section),
             "rotation": ((*dims, "link"), turned),
             "mirror_partner": (dims, np.where(kind > 0, np.arange(n)[::-1], -1).astype(np.int32)),
@@ -371,11 +371,13 @@ def test_match__unlike_things_have_different_ids_however_near(periods, width, sa
         {
             "attractor_points": (("frequency", "attractor", "point", "state"), points),
             "rotation": (("frequency", "attractor", "link"), np.zeros((2, 1, 2))),
-            "kind": (("frequency", "attractor"), [[1], [1 if periods[1] else 2]]),
+            "kind": (
+                ("frequency", "attractor"),
+                [[PERIODIC_ORBIT], [PERIODIC_ORBIT if periods[1] else BOUNDED_SET]],
+            ),
             "orbit_period": (("frequency", "attractor"), np.array(periods)[:, None]),
             "attractor_id": (("frequency", "initial_condition"), np.zeros((2, 1), np.int32)),
         },
         coords={"frequency": [2.0, 2.1]},
     )
-    ds["kind"][0, 0] = 1 if periods[0] else 2
     assert match(ds).sizes["attractor"] == (1 if same else 2)

@@ -226,7 +226,7 @@ def test_analyse__incomplete_run_and_prune(main, made):
         (["attractors", "--tolerance", "-1"], "tolerance = -1.0: must be at least 0."),
         (["attractors", "--threshold", "0"], "threshold = 0.0: must be greater than 0."),
         (["settling", "--n-sample", "0"], "n_sample = 0: must be at least 1."),
-        (["settling", "--confidence", "1"], "confidence = 1.0: must be less than 1."),
+        (["settling", "--lifetime-confidence", "1"], "lifetime_confidence = 1.0: must be less than 1."),
         (["attractors", "--look-back", "0"], "look_back = 0: must be at least 1."),
         (["basins", "--budget", "-1"], "budget = -1.0: must be at least 0."),
         (["basins", "--confidence", "nan"], "confidence = nan: must be a finite number."),
