@@ -37,13 +37,16 @@ class IdentifyOptions(Options):
     lifetime_confidence: float = option(0.95, "Level of the intervals of lifetimes.", gt=0.0, lt=1.0)
 
     @property
-    def effort(self) -> float:
-        """Budget of the extension, 0 without one: of two results that differ in it, the larger knows more."""
-        return self.budget if self.extend else 0.0
+    def effort(self) -> tuple[float, int]:
+        """Budget of the extension and sample, 0 without one: of two results the larger knows more."""
+        return (self.budget, self.n_sample) if self.extend and self.budget else (0.0, 0)
 
-    def with_effort(self, effort: float) -> Self:
-        """Return the same options with another budget of the extension."""
-        return self.model_copy(update={"extend": effort > 0.0, "budget": effort or self.budget})
+    def with_effort(self, effort: tuple[float, int]) -> Self:
+        """Return the same options with another budget of the extension and another sample."""
+        budget, n_sample = effort
+        if not budget:
+            return self.model_copy(update={"extend": False})
+        return self.model_copy(update={"extend": True, "budget": budget, "n_sample": n_sample})
 
 
 class AttractorOptions(IdentifyOptions):

@@ -182,8 +182,24 @@ def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
         options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {})).plain()
     except SpecError:  # the run has not what they take
         options = {}
-    given = json.loads(str(attrs.get("derived_options", "{}")))
-    return sum(options.get(key) != value for key, value in given.items())
+    return sum(options.get(key) != value for key, value in _options_of(attrs).items())
+
+
+def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that a kept result was computed with.
+
+    Raises
+    ------
+    DamagedError
+        If they cannot be read.
+    """
+    try:
+        given = json.loads(str(attrs.get("derived_options", "{}")))
+    except ValueError:
+        given = None
+    if not isinstance(given, dict):
+        raise DamagedError("its attribute derived_options is not a table in JSON")
+    return given
 
 
 def _refuse_recorded(run: Run, name: str) -> None:
@@ -215,9 +231,9 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Return options with the largest budget of extension among the kept attractors that they would find.
+    """Return options with the largest effort of extension among the kept attractors that they would find.
 
-    Options without such a budget are returned as they are.
+    Options without one are returned as they are.
     """
     if not isinstance(options, IdentifyOptions):
         return options
@@ -226,7 +242,7 @@ def most_evidence(run: Run, options: Options) -> Options:
     return options.with_effort(max([own.effort, *kept]))
 
 
-def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], float]]:
+def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
     """Other options and effort of each kept search for attractors of these cells by this code."""
     try:
         kept_here = products_in(run.info.files.below(DERIVED))
@@ -241,19 +257,20 @@ def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], float]]:
         with contextlib.suppress(DamagedError, FileNotFoundError, ValueError):
             attrs = read_product_attrs(place)
             if all(attrs.get(key) == value for key, value in current.items()):
-                kept = IdentifyOptions.model_validate(json.loads(str(attrs["derived_options"])))
+                kept = IdentifyOptions.model_validate(_options_of(attrs))
                 found.append((_aside(kept), kept.effort))
     return found
 
 
 def _aside(options: IdentifyOptions) -> dict[str, Any]:
     """Options aside from the effort."""
-    return {name: value for name, value in options.plain().items() if name not in ("extend", "budget")}
+    effort = ("extend", "budget", "n_sample")
+    return {name: value for name, value in options.plain().items() if name not in effort}
 
 
 def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
     """Whether a kept result rests on less evidence than is kept by now."""
-    name, given = str(attrs.get("derived_product")), json.loads(str(attrs.get("derived_options", "{}")))
+    name, given = str(attrs.get("derived_product")), _options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
         return False
     own = IdentifyOptions.model_validate({k: given[k] for k in IdentifyOptions.model_fields if k in given})
@@ -327,12 +344,12 @@ def _stale(run: Run) -> list[Files]:
     def is_stale(place: Files) -> bool:
         try:
             attrs = read_product_attrs(place)
+            name = str(attrs.get("derived_product"))
+            if name not in ANALYSES or attrs.get("cube_digest") != run.digest:
+                return True
+            return bool(attrs.get("analysis_version") != code_version(name)) or is_outdone(run, attrs)
         except DamagedError:
             return True
-        name = str(attrs.get("derived_product"))
-        if name not in ANALYSES or attrs.get("cube_digest") != run.digest:
-            return True
-        return bool(attrs.get("analysis_version") != code_version(name)) or is_outdone(run, attrs)
 
     products = [place for place in products_in(folder) if is_stale(place)]
     return products + leftover_products(folder, older_than=_LEFTOVER_SECONDS)

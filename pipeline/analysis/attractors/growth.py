@@ -18,18 +18,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, TORUS
 
 N_SIGMA = 3.0
-"""Standard errors at either side of an exponent's interval."""
+"""Standard errors at either side of an exponent's interval, if they were known; see `_mean`."""
 
 GROWN = 5.0
 """Least growth of a small distance over a cell's extension, as a logarithm, that shows chaos."""
 
-N_BLOCKS = 4
-"""Blocks of each cell for the error of an exponent."""
+N_BLOCKS, LEAST_BLOCKS = 4, 16
+"""Blocks of each cell for the error of an exponent, and least number of all."""
 
 ZERO = 1e-4
 """Largest modulus of an exponent that counts as 0 on a torus [per section]."""
@@ -57,7 +58,7 @@ class Growth:
     weighted_error : float
         Difference of those of both halves of the cells, the largest.
     volume, volume_error : float
-        Mean change of the logarithm of a volume along the flow, and its standard error.
+        Mean change of the logarithm of a volume along the flow, and a third of its interval's half.
     length : int
         Sections of each cell.
     """
@@ -128,10 +129,16 @@ def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Gro
 
 
 def _mean(values: np.ndarray) -> tuple[float, float]:
-    """Mean of values (cell, section) and its standard error by blocks."""
-    n = values.shape[1] // N_BLOCKS * N_BLOCKS
-    blocks = values[:, :n].reshape(len(values), N_BLOCKS, -1).mean(axis=2).ravel()
-    return float(values.mean()), float(blocks.std(ddof=1) / np.sqrt(len(blocks)))
+    """Mean of values (cell, section), and the standard error by which `N_SIGMA` is a safe interval.
+
+    An error that few blocks tell is itself uncertain: Student's distribution widens it.
+    """
+    n_cells, n_sections = values.shape
+    n_blocks = min(max(N_BLOCKS, -(-LEAST_BLOCKS // n_cells)), n_sections)
+    each = n_sections // n_blocks
+    blocks = values[:, : each * n_blocks].reshape(n_cells, n_blocks, each).mean(axis=2).ravel()
+    wider = stdtrit(len(blocks) - 1, ndtr(N_SIGMA)) / N_SIGMA
+    return float(values.mean()), float(wider * blocks.std(ddof=1) / np.sqrt(len(blocks)))
 
 
 def volumes_of(
