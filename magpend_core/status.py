@@ -17,6 +17,7 @@ class Status(IntEnum):
     UNREACHED = 6
     INFERRED = 7
     NO_RETURN = 8
+    CHATTER = 9
 
     @property
     def sentence(self) -> str:
@@ -37,4 +38,6 @@ _SENTENCES = {
     "and it carries the section, orbit_period and turns of one of them",
     Status.NO_RETURN: "the trajectory did not come back to the section within the longest time waited for; "
     "it may rest at an equilibrium; raise section.longest, or move the section",
+    Status.CHATTER: "impacts follow one another ever faster, infinitely many within a finite time; write "
+    "stick = true in [[model.impacts]] to let the state rest on the surface from then on (on one at a time)",
 }

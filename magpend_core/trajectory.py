@@ -16,6 +16,7 @@ from magpend_core.engine.jit import OPTIONS, keeping, kernel, specialise
 from magpend_core.engine.lanes import (
     CROSSED,
     DIVERGED,
+    ENDS_IN_CHATTER,
     FIRST_STEP,
     REACHED,
     STEP_LIMIT,
@@ -25,6 +26,7 @@ from magpend_core.engine.lanes import (
     ZERO,
     engine_bindings,
 )
+from magpend_core.engine.modes import CHATTERED
 from magpend_core.engine.observers import RECORD
 from magpend_core.engine.simd import WIDTH
 from magpend_core.engine.system import System
@@ -100,9 +102,13 @@ def follow(
             done = fill(w, y0, k0, t0, times, begin, turns, done, out)
         if HAS_EVENTS and w[ROWS.event] == CROSSED:
             act_on_events(w, 0, 0)
+            if HAS_IMPACTS and w[ROWS.event] == CHATTERED:
+                return ENDS_IN_CHATTER
         if w[ROWS.event] == REACHED and edge < NE:
             edge = begin_segment(w, 0, 0, edge_table, edge + 1)
         elif w[ROWS.event] == REACHED:
+            if HAS_CONTACTS:
+                hold_contacts(w, 0, 0)
             if not take_section(w, 0, 0, section, turns):
                 return DIVERGED
             i_period += 1

@@ -18,14 +18,16 @@ WRONG = 1e-3
 
 def declaration(system: System) -> Iterator[str]:
     """Problems of the fields that are no functions."""
-    least = system.n_switches + system.has_segments
+    least = system.n_switches + system.n_contacts + system.has_segments
     if system.n_modes != least:
         yield (
             f"n_modes = {system.n_modes}; it must be {least}: one for each of the {system.n_switches} "
-            "switches, and one more if has_segments."
+            f"switches, one for each of the {system.n_impacts} impacts if any sticks, and one more if "
+            "has_segments."
         )
     for field, n, of in (
         ("slides", system.n_switches, "switches"), ("impact_directions", system.n_impacts, "impacts"),
+        ("sticks", system.n_impacts, "impacts"),
     ):  # fmt: skip
         if len(getattr(system, field)) != n:
             given = len(getattr(system, field))
@@ -43,8 +45,8 @@ def declaration(system: System) -> Iterator[str]:
 
 
 def modes_at(system: System, times: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Modes at instants of the period: all switches on their upper side, and the segment."""
-    modes = [np.ones(len(times))] * system.n_switches
+    """Modes at instants of the period: all switches on their upper side, no contact, and the segment."""
+    modes = [np.ones(len(times))] * (system.n_switches + system.n_contacts)
     if system.has_segments:
         modes.append(np.searchsorted(edges[0], times, side="right").astype(np.float64))
     return tuple(modes)
@@ -56,7 +58,7 @@ def motion_problems(motion: Any, rates: np.ndarray) -> None:
     for name, n in (("switches", system.n_switches), ("impacts", system.n_impacts)):
         if n:
             _check_pairs(motion, name, n, rates)
-    for k in range(system.n_impacts):
+    for k in range(system.n_impacts + system.n_contacts):
         names = ", ".join(system.state_names)
         c = (float(np.broadcast_to(x, motion.times.shape)[0]) for x in motion.c)
         arguments = (k, float(motion.times[0]), tuple(map(float, motion.y[:, 0])), tuple(c))

@@ -8,8 +8,11 @@ that ends before the zero is an ordinary step. So a state at an event is one of 
 accuracy; nothing is interpolated.
 
 A pair of zeros within a step, at whose ends the signs are the same, is looked for where the rates make it
-possible: an attempt then ends in the cubic's extremum. What can be missed is a pair that the cubic does not
-have: an excursion beyond zero by less than its error, (h**4/384) max |f''''| in a step h.
+possible: an attempt then ends in the cubic's extremum. A surface can move faster than the states: a ball
+flies along a parabola, which a step of any length follows, above a table that shakes. So the value in the
+middle of an attempt is compared with the cubic's, and where the difference is so large that a pair may be
+hidden, the attempt is repeated with half the step. What can be missed is a pair that neither shows: an
+excursion beyond zero that is shorter than a step and not seen at its middle.
 
 An event has a side, +1 or -1: the sign of its value as of the last step, turned over where a step ends beyond
 zero. After an event it is the side that the trajectory goes to, whatever the last digit of the value says.
@@ -53,6 +56,12 @@ SAME = 1e-9
 
 ACCEPT, TAKE_BACK, LANDED = 0.0, 1.0, 2.0
 
+RESOLVED = 1e-4
+"""An attempt shorter than this [periods] is not halved in search of a pair of zeros."""
+
+ROUNDED = 1e-12
+"""Difference from a cubic, relative to the numbers that make it, that is rounding."""
+
 
 def _events_of(system: System) -> Callable[..., Any]:
     """Return a function that gives values and rates of all events, one after the other, as one flat tuple.
@@ -81,6 +90,16 @@ def _events_of(system: System) -> Callable[..., Any]:
     return inline(scope["event_values"])
 
 
+def _middle_of(n: int) -> Callable[..., Any]:
+    """Return a function that gives the states in the middle of an attempt, by cubics."""
+    lines = ["def middle_of(y0, dy0, y1, dy1, h):", "eighth = 0.125 * h"]
+    parts = [f"multiply_add(eighth, dy0[{i}] - dy1[{i}], 0.5 * (y0[{i}] + y1[{i}]))" for i in range(n)]
+    lines.append(f"return ({', '.join(parts)},)")
+    scope: dict[str, Any] = {"__name__": __name__, "multiply_add": multiply_add}
+    exec("\n    ".join(lines), scope)
+    return inline(scope["middle_of"])
+
+
 def event_bindings(system: System) -> dict[str, Any]:
     """Names that the templates of events use, for a system."""
     of, direction = system.section or (0, 0)
@@ -102,6 +121,8 @@ def event_bindings(system: System) -> dict[str, Any]:
         "STARTS": (*starts, 0.0),
         "SAME_VALUE": (*same, 0.0),
         "event_values": _events_of(system),
+        "middle_of": _middle_of(system.known),
+        "HAS_SURFACES": system.n_switches + system.n_impacts > 0,
     }
 
 
@@ -165,6 +186,32 @@ def pair(w: Any, row: int, k: int) -> Any:
 def fires(w: Any, base: int, k: int) -> Any:
     """1 where a change of side of event `k` is an event, 0 where it is only noted."""
     return where_less(DIRECTIONS[k] * load(w, base + ROWS.side + k * WIDTH), 0.5, 1.0, 0.0)
+
+
+def hides_events(w: Any, base: int) -> Any:
+    """1 where a pair of zeros may be hidden: the middle of the attempt is that far off an event's cubic."""
+    h, t, level = load(w, base + ROWS.step), load(w, base + ROWS.time), load(w, base + ROWS.level)
+    y0, y1 = load_rows(w, base + ROWS.state, N_KNOWN), load_rows(w, base + ROWS.trial, N_KNOWN)
+    dy0 = load_rows(w, base + ROWS.slopes, N_KNOWN)
+    dy1 = load_rows(w, base + ROWS.slopes + (N_STAGES - 1) * N * WIDTH, N_KNOWN)
+    c = load_rows(w, base + ROWS.constants, NC)
+    middle = event_values(multiply_add(0.5, h, t), middle_of(y0, dy0, y1, dy1, h), dy1, c, level)
+    store_rows(w, base + ROWS.halfway_events, middle)
+    store_rows(w, base + ROWS.found, event_values(t + h, y1, dy1, c, level))
+    hides = 0.0 * h
+    for k in range(N_SWITCHES + N_IMPACTS):
+        known, found = pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k)
+        a, da, b, db = margin(w, base, k, known, found)
+        da, db = h * da, h * db
+        side = load(w, base + ROWS.side + k * WIDTH)
+        value = side * load(w, base + ROWS.halfway_events + 2 * k * WIDTH) - minimum(side * known[0], 0.0)
+        off = absolute(value - multiply_add(0.125, da - db, 0.5 * (a + b)))
+        least = minimum(multiply_add(1.0 / 3.0, da, a), multiply_add(-1.0 / 3.0, db, b))
+        size = ROUNDED * (absolute(a) + absolute(b) + absolute(da) + absolute(db))
+        # a step that ends beyond zero is taken back anyway
+        may = where_less(b, 0.0, 0.0, fires(w, base, k))
+        hides = maximum(hides, where_less(least, off + off, where_less(size, off, may, 0.0), 0.0))
+    return where_less(RESOLVED * load(w, base + ROWS.period), h, hides, 0.0)
 
 
 def judge_events(w: Any, base: int, failed: Any) -> Any:
@@ -281,5 +328,5 @@ def section_counts(w: Any, base: int, lane: int) -> bool:
 INLINE = ("cubic_dip", "may_dip", "cubic_root", "margin", "pair", "fires", "section_counts")
 """Templates here that dissolve into their callers, callees first; they come before those of `CALLED`."""
 
-CALLED = ("turn_sides", "aim", "settle_events", "judge_events")
+CALLED = ("turn_sides", "aim", "settle_events", "hides_events", "judge_events")
 """The others."""

@@ -30,7 +30,7 @@ from magpend_core.engine import tangents as tangent_templates
 from magpend_core.engine.digests import code_length
 from magpend_core.engine.events import LANDED, TAKE_BACK, event_bindings
 from magpend_core.engine.jit import bound_part, inline, keeping, kernel, specialise
-from magpend_core.engine.modes import mode_bindings
+from magpend_core.engine.modes import CHATTERED, mode_bindings
 from magpend_core.engine.observers import Observer
 from magpend_core.engine.simd import (
     WIDTH,
@@ -84,6 +84,7 @@ NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW, DUE, CROSSED = 0.0, 1.0, 2.0, 3.0, 
 PENDING, DIVERGED = int(Status.PENDING), int(Status.DIVERGED)
 STEP_LIMIT, STEP_UNDERFLOW = int(Status.STEP_LIMIT), int(Status.STEP_UNDERFLOW)
 UNREACHED, NO_RETURN = int(Status.UNREACHED), int(Status.NO_RETURN)
+ENDS_IN_CHATTER = int(Status.CHATTER)
 
 
 class Rows(NamedTuple):
@@ -120,6 +121,7 @@ class Rows(NamedTuple):
     known: int  # values and rates of events at the begin of the step, see `events`
     found: int  # at the end of the attempt
     passed: int  # where the last attempt that was taken back ended
+    halfway_events: int  # in the middle of the attempt, if there are surfaces
     side: int  # of each event
     fired: int  # 1 if it happened at the end of the last step
     dip: int  # share of the attempt at which it may have gone beyond zero and come back, or 2
@@ -137,7 +139,8 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
     n = system.n_events
     counts = [
         system.n_states, system.tableau.n_stages * system.n_states, system.n_states, *[1] * 18,
-        system.n_states if n_watched else 0, *[n_watched] * 6, *[2 * n] * 3, *[n] * 3, *[1 if n else 0] * 4,
+        system.n_states if n_watched else 0, *[n_watched] * 6, *[2 * n] * 3,
+        2 * n if system.n_switches + system.n_impacts else 0, *[n] * 3, *[1 if n else 0] * 4,
         (system.tableau.n_stages - 1) * n_entries(system),
         -(-(system.n_constants + system.n_modes) // 4) * 4,
     ]  # fmt: skip
@@ -336,6 +339,10 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
     next_wish = where_less(0.5, stepped, next_wish, wish)
     if HAS_EVENTS:
         aimed = load(w, base + ROWS.aimed)
+        if HAS_SURFACES:
+            hides = hides_events(w, base)
+            next_wish = where_less(0.5, hides, minimum(next_wish, 0.5 * h), next_wish)
+            rejected = maximum(rejected, hides)
         verdict = judge_events(w, base, rejected)
         taken_back = where_less(absolute(verdict - TAKE_BACK), 0.5, 1.0, 0.0)
         # the length of an attempt to an event says nothing of what error control allows
@@ -448,6 +455,8 @@ def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> i
         w[base + ROWS.fresh + lane] = 1.0
         if HAS_SWITCHES:
             keep_switches(w, base, lane)
+        if HAS_CONTACTS:
+            seat_contacts(w, base, lane, False)
     if edge < NE:
         set_target(w, base, lane, edge_table[0, edge], edge_table, edge)
         return edge
@@ -577,7 +586,7 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, 
 
 def has_failed(status: int) -> bool:
     """Whether a cell's sections are not to be used."""
-    return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW
+    return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW or status == ENDS_IN_CHATTER
 
 
 def forget(cells: Cells, branch: int, point: int) -> None:
@@ -626,8 +635,12 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
     event = w[base + ROWS.event + column]
     w[base + ROWS.event + column] = NOTHING
     status = PENDING
-    if HAS_EVENTS and event == CROSSED and not act_on_events(w, base, column):
-        return False
+    if HAS_EVENTS and event == CROSSED:
+        on_section = act_on_events(w, base, column)
+        if HAS_IMPACTS and w[base + ROWS.event + column] == CHATTERED:
+            event = CHATTERED
+        elif not on_section:
+            return False
     if REWRITES and (event == REACHED or event == DUE or event == CROSSED):
         renew_state(w, base, column, section, work.memory[lane], settings)
         if event == DUE:
@@ -637,6 +650,8 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
         return False
     if event == (CROSSED if HAS_SECTION else REACHED):
         work.i_period[lane] += 1
+        if HAS_CONTACTS:
+            hold_contacts(w, base, column)
         if take_section(w, base, column, section, work.turns[lane]):
             at = (work.branch[lane], work.point[lane])
             if HAS_SECTION:
@@ -661,6 +676,8 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
         status = NO_RETURN
     elif event == TOO_MANY_STEPS:
         status = STEP_LIMIT
+    elif HAS_IMPACTS and event == CHATTERED:
+        status = ENDS_IN_CHATTER
     else:
         status = STEP_UNDERFLOW
     end_cell(cells, work, lane, status)

@@ -31,6 +31,25 @@ NEAR = 1e-12
 AWAY = 1e-7
 """A switch further from zero after an edge, in units of its rate and the period, is not on its surface."""
 
+CHATTERED = 6.0
+"""What the scalar pass finds at an event, beside `lanes.NOTHING` and so on: the lane's cell ends."""
+
+CHATTER, LEAST_LOSS = 1e-6, 0.3
+"""A flight between impacts shorter than the product of both numbers [periods] is taken for the last of
+infinitely many; if an impact takes a larger share of the speed than the second says, that share counts.
+
+What is left of the series then lasts for 1e-6 periods, or longer if less speed is lost.
+"""
+
+ELASTIC = 1e-9
+"""An impact that takes less than this share of the speed takes none."""
+
+LOOK = 1e-6
+"""Step of the difference that gives a second derivative [periods]."""
+
+AT_REST = 1e-5
+"""A state begins at rest on a surface that it would fall on within this time [periods]."""
+
 LEAST_VOLUME = 1e-300
 """Factor by which volumes count as changed where they vanish: where a trajectory begins to slide."""
 
@@ -67,7 +86,9 @@ def mode_bindings(system: System) -> dict[str, Any]:
         "HAS_SWITCHES": system.n_switches > 0,
         "HAS_IMPACTS": system.n_impacts > 0,
         "HAS_VECTORS": n_vectors > 0,
+        "HAS_CONTACTS": system.n_contacts > 0,
         "SLIDES": (*system.slides, False),
+        "STICKS": (*system.sticks, 0),
         "ZEROS": (0.0,) * system.known,
         "N_BASE": base.n_states,
         "N_VECTORS": n_vectors,
@@ -168,6 +189,94 @@ def begin_events(w: Any, base: int, lane: int) -> None:
     w[base + ROWS.resolution + lane] = 0.0
     if HAS_SWITCHES:
         seat_switches(w, base, lane, False)
+    if HAS_CONTACTS:
+        for k in range(N_IMPACTS):
+            w[contact_row(base, lane, k)] = 1.0
+        seat_contacts(w, base, lane, True)
+
+
+def contact_row(base: int, lane: int, k: int) -> int:
+    """Where the mode of the contact with the surface of impact `k` stands."""
+    return base + ROWS.constants + (N_OWN + N_SWITCHES + k) * WIDTH + lane
+
+
+def bend(w: Any, base: int, lane: int, event: int) -> float:
+    """Second time derivative of an event's value along the motion, by a difference."""
+    step = LOOK * w[base + ROWS.period + lane]
+    y, t = lane_states(w, base + ROWS.state + lane), w[base + ROWS.time + lane]
+    dy = lane_rates(w, base, lane)
+    before = lane_pairs(w, base, lane, dy)[2 * event + 1]
+    for i in range(N_KNOWN):
+        w[base + ROWS.state + i * WIDTH + lane] = y[i] + step * dy[i]
+    w[base + ROWS.time + lane] = t + step
+    after = lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * event + 1]
+    for i in range(N_KNOWN):
+        w[base + ROWS.state + i * WIDTH + lane] = y[i]
+    w[base + ROWS.time + lane] = t
+    return (after - before) / step
+
+
+def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
+    """Whether an impact, at the speed `arriving`, is one of infinitely many that end within a moment."""
+    event = N_SWITCHES + k
+    leaving = -DIRECTIONS[event] * lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * event + 1]
+    if not (abs(leaving) < arriving and leaving > -ELASTIC * arriving):
+        return False
+    lost = 1.0 - max(leaving, 0.0) / arriving
+    pushes = DIRECTIONS[event] * bend(w, base, lane, event)
+    flight = 2.0 * max(leaving, 0.0)  # times what pushes
+    return lost > ELASTIC and flight < CHATTER * max(lost, LEAST_LOSS) * w[base + ROWS.period + lane] * pushes
+
+
+def rest_on(w: Any, base: int, lane: int, k: int) -> None:
+    """Put a lane at rest on the surface of impact `k`; it ends if it rests on another that would move."""
+    for i in range(N_IMPACTS):
+        if i != k and STICKS[k] == 2 and STICKS[i] == 2 and w[contact_row(base, lane, i)] == 0.0:
+            w[base + ROWS.event + lane] = CHATTERED
+    if HAS_VECTORS:
+        set_units(w, base, lane)
+        t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
+        for j in range(N_THROUGH):
+            map_vector(w, base, lane, N_IMPACTS + k, vector_row(base, lane, j), 0.0, t, y)
+        if HAS_DIVERGENCE:
+            w[base + ROWS.state + (N - 1) * WIDTH + lane] += log_volume(w, base + ROWS.slopes + lane)
+    hold_on(w, base, lane, k)
+    w[contact_row(base, lane, k)] = 0.0
+    w[base + ROWS.side + (N_SWITCHES + k) * WIDTH + lane] = STARTS[N_SWITCHES + k]
+
+
+def hold_on(w: Any, base: int, lane: int, k: int) -> None:
+    """Put the states on the surface of impact `k`, at its speed."""
+    t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
+    new = reset_along(N_IMPACTS + k, t, y, lane_constants(w, base + ROWS.constants + lane), 0.0, y, 0.0)
+    for i in range(N_BASE):
+        w[base + ROWS.state + i * WIDTH + lane] = new[i]
+    w[base + ROWS.fresh + lane] = 1.0
+
+
+def hold_contacts(w: Any, base: int, lane: int) -> None:
+    """Take back what rounding and step errors have moved a lane off the surfaces that it rests on."""
+    for k in range(N_IMPACTS):
+        if STICKS[k] > 0 and w[contact_row(base, lane, k)] == 0.0:
+            hold_on(w, base, lane, k)
+
+
+def seat_contacts(w: Any, base: int, lane: int, begins: bool) -> None:
+    """Let a lane rest on the surfaces to which it is pushed and where it does not move; only where it did.
+
+    At the begin of a cell, `begins`, on any.
+    """
+    for k in range(N_IMPACTS):
+        mode, event = contact_row(base, lane, k), N_SWITCHES + k
+        if STICKS[k] > 0 and (begins or w[mode] == 0.0):
+            w[mode] = 1.0
+            pairs = lane_pairs(w, base, lane, lane_rates(w, base, lane))
+            pushes = DIRECTIONS[event] * bend(w, base, lane, event)
+            reach = AT_REST * w[base + ROWS.period + lane]
+            if abs(pairs[2 * event + 1]) < reach * pushes and abs(pairs[2 * event]) < reach * reach * pushes:
+                rest_on(w, base, lane, k)
+            elif not begins:
+                w[base + ROWS.side + event * WIDTH + lane] = STARTS[event]
 
 
 def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
@@ -205,10 +314,22 @@ def vector_row(base: int, lane: int, j: int) -> int:
     return base + ROWS.slopes + N_BASE * (j - N_VECTORS) * WIDTH + lane
 
 
+def map_vector(w: Any, base: int, lane: int, k: int, at: int, shift: float, t: float, y: Any) -> None:
+    """Take the vector in rows from `at`, at an instant shifted by `shift` times it, through map `k`."""
+    c, size = lane_constants(w, base + ROWS.constants + lane), 0.0
+    for i in range(N_BASE):
+        size = max(size, abs(w[at + i * WIDTH]) / SCALES[i])
+    s = STEP / size if size > 0.0 else 1.0
+    v = lane_base(w, at)
+    far, near = reset_along(k, t, y, c, shift, v, 2.0 * s), reset_along(k, t, y, c, shift, v, s)
+    back, behind = reset_along(k, t, y, c, shift, v, -s), reset_along(k, t, y, c, shift, v, -2.0 * s)
+    for i in range(N_BASE):
+        w[at + i * WIDTH] = (8.0 * (near[i] - back[i]) - (far[i] - behind[i])) / (12.0 * s)
+
+
 def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
     """Take vectors through the map of impact `k`, and note the shifts of its time in `trial`."""
     t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
-    c = lane_constants(w, base + ROWS.constants + lane)
     before = lane_rates(w, base, lane)
     rate = lane_pairs(w, base, lane, before)[2 * (N_SWITCHES + k) + 1]
     for j in range(N_THROUGH):
@@ -216,16 +337,9 @@ def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
         along = gradient_along(w, base, lane, N_SWITCHES + k, lane_base(w, at))
         shift = -along / rate if rate != 0.0 else 0.0
         w[base + ROWS.trial + j * WIDTH + lane] = shift
-        size = 0.0
         for i in range(N_BASE):
             w[at + i * WIDTH] += before[i] * shift
-            size = max(size, abs(w[at + i * WIDTH]) / SCALES[i])
-        s = STEP / size if size > 0.0 else 1.0
-        v = lane_base(w, at)
-        far, near = reset_along(k, t, y, c, shift, v, 2.0 * s), reset_along(k, t, y, c, shift, v, s)
-        back, behind = reset_along(k, t, y, c, shift, v, -s), reset_along(k, t, y, c, shift, v, -2.0 * s)
-        for i in range(N_BASE):
-            w[at + i * WIDTH] = (8.0 * (near[i] - back[i]) - (far[i] - behind[i])) / (12.0 * s)
+        map_vector(w, base, lane, k, at, shift, t, y)
 
 
 def set_units(w: Any, base: int, lane: int) -> None:
@@ -285,6 +399,13 @@ def jump(w: Any, base: int, lane: int, k: int) -> None:
     for i in range(N_SWITCHES, N_EVENTS):
         w[base + ROWS.side + i * WIDTH + lane] = 0.0
     w[base + ROWS.side + event * WIDTH + lane] = -side if moved < -bound else side
+    if HAS_CONTACTS:
+        seat_contacts(w, base, lane, False)
+    if moved >= -bound and is_chatter(w, base, lane, k, DIRECTIONS[event] * rate):
+        if STICKS[k] > 0:
+            rest_on(w, base, lane, k)
+        else:
+            w[base + ROWS.event + lane] = CHATTERED
 
 
 def act_on_events(w: Any, base: int, lane: int) -> bool:
@@ -301,18 +422,24 @@ def act_on_events(w: Any, base: int, lane: int) -> bool:
     if HAS_IMPACTS:
         for k in range(N_IMPACTS):
             if w[fired + (N_SWITCHES + k) * WIDTH] > 0.5:
-                jump(w, base, lane, k)
+                if HAS_CONTACTS and STICKS[k] > 0 and w[contact_row(base, lane, k)] == 0.0:
+                    # pulled off: neither states nor rates jump
+                    w[contact_row(base, lane, k)] = 1.0
+                    w[base + ROWS.side + (N_SWITCHES + k) * WIDTH + lane] = STARTS[N_SWITCHES + k]
+                else:
+                    jump(w, base, lane, k)
                 w[base + ROWS.fresh + lane] = 1.0
     for k in range(N_EVENTS):
         w[fired + k * WIDTH] = 0.0
     return on_section
 
 
-INLINE = ("lane_pairs", "lane_rates", "gradient_along", "switch_rate", "vector_row")
+INLINE = ("lane_pairs", "lane_rates", "gradient_along", "switch_rate", "vector_row", "contact_row")
 """Templates here that dissolve into their callers, callees first; they come before those of `CALLED`."""
 
 CALLED = (
-    "seat_switches", "next_mode", "keep_switches", "begin_events", "turn_switch", "jump_vectors", "set_units",
-    "log_volume", "jump", "act_on_events",
+    "seat_switches", "next_mode", "keep_switches", "set_units", "log_volume", "map_vector", "bend",
+    "is_chatter", "hold_on", "hold_contacts", "rest_on", "seat_contacts", "begin_events", "turn_switch",
+    "jump_vectors", "jump", "act_on_events",
 )  # fmt: skip
 """The others."""

@@ -21,6 +21,7 @@ from magpend_core.engine.jit import bound_part, keeping, kernel, specialise
 from magpend_core.engine.lanes import (
     CROSSED,
     DIVERGED,
+    ENDS_IN_CHATTER,
     FIRST_STEP,
     NOTHING,
     PENDING,
@@ -30,6 +31,7 @@ from magpend_core.engine.lanes import (
     TOO_MANY_STEPS,
     engine_bindings,
 )
+from magpend_core.engine.modes import CHATTERED
 from magpend_core.engine.observers import RECORD
 from magpend_core.engine.simd import WIDTH, load, store
 from magpend_core.engine.system import System
@@ -94,6 +96,8 @@ def begin_interval(samples: Samples, seats: Seats, lane: int, scratch: Any) -> N
     seats.edge[lane] = begin_period(w, base, column, seats.edge_table[lane])
     if HAS_SWITCHES:
         keep_switches(w, base, column)
+    if HAS_CONTACTS:
+        seat_contacts(w, base, column, False)
     w[base + ROWS.steps + column] = steps
     w[base + ROWS.rejected + column] = rejected
 
@@ -188,6 +192,8 @@ def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
         return PENDING
     if HAS_EVENTS and event == CROSSED:
         act_on_events(w, base, column)
+        if HAS_IMPACTS and w[base + ROWS.event + column] == CHATTERED:
+            return ENDS_IN_CHATTER
         return PENDING
     if event == REACHED and seats.edge[lane] < NE:
         table = seats.edge_table[lane]
@@ -196,6 +202,8 @@ def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
     if not in_bounds(w, base, column):
         return DIVERGED
     if event == REACHED:
+        if HAS_CONTACTS:
+            hold_contacts(w, base, column)
         take_section(w, base, column, scratch, seats.turns[lane])
         seats.clock[lane, 1] += samples.durations[seats.interval[lane]]
         seats.interval[lane] += 1

@@ -117,7 +117,7 @@ class System:
     n_modes : int
         Numbers that `rhs`, `jacobian` and `quantities` find behind the constants, ``c[n_constants + k]``,
         and that change at events and edges alone: each stage of a step sees the same. First one for each
-        switch, last the segment if `has_segments`.
+        switch, then one for each impact if any of them sticks, last the segment if `has_segments`.
     n_switches : int
         Number of surfaces at which the right-hand side jumps. Mode k is the side on which switch k is,
         -1.0 or +1.0; `rhs` uses it where it says ``sign(value)``. A step ends on the surface, and the mode
@@ -141,9 +141,17 @@ class System:
         ``impacts(t, y, dy, c)``: a tuple of ``(value, rate)``, as for `switches`.
     impact_directions : tuple of int
         +1 where an impact happens as its value rises through zero, -1 as it falls.
+    sticks : tuple of int
+        For each impact, whether the state rests on its surface after infinitely many impacts in a finite
+        time: 0 for no, 1 for yes, 2 for yes unless it rests on another; empty for none. There is then a mode
+        for each impact, behind those of the switches: 1.0, and 0.0 at rest. At rest, `rhs` is to keep value
+        and rate of the impact at 0, and its pair in `impacts` is the negative second derivative that the
+        value would have without the contact, and its rate: where that changes its sign the state is pulled
+        off.
     reset : callable
         ``reset(k, t, y, c)``: the states after impact number `k` as a tuple, from those before. Runs on plain
-        numbers, so that ``if k == 0`` is allowed.
+        numbers, so that ``if k == 0`` is allowed. For ``k = n_impacts + i`` the states at rest on the surface
+        of impact `i`, from those nearby, if it sticks.
     section : (int, int) or None
         Number of the state at whose crossing of a level a period ends, and the direction, +1 rising or
         -1 falling; the level is the last parameter. See `crossing.with_section`.
@@ -214,6 +222,7 @@ class System:
     n_impacts: int = 0
     impacts: Callable[..., Any] | None = None
     impact_directions: tuple[int, ...] = ()
+    sticks: tuple[int, ...] = ()
     reset: Callable[..., Any] | None = None
     section: tuple[int, int] | None = None
     quantity_names: tuple[str, ...] = ()
@@ -229,11 +238,12 @@ class System:
         absent = {
             "is_angle": (False,) * n, "scales": (1.0,) * n, "escape": (math.inf,) * n,
             "forcing": no_forcing, "edges": no_edges, "layers": no_layers,
-            "slides": (False,) * self.n_switches,
+            "slides": (False,) * self.n_switches, "sticks": (0,) * self.n_impacts,
         }  # fmt: skip
         kinds = {
             "state_names": str, "parameter_names": str, "quantity_names": str,
             "is_angle": bool, "scales": float, "escape": float, "slides": bool, "impact_directions": int,
+            "sticks": int,
         }  # fmt: skip
         for name, kind in kinds.items():  # lists cannot be hashed, integers among numbers not be looped over
             object.__setattr__(self, name, tuple(kind(value) for value in getattr(self, name)))
@@ -261,6 +271,8 @@ class System:
                 self.n_modes, self.n_switches, self.slides, self.has_segments, self.n_impacts,
                 self.impact_directions, self.section,
             )  # fmt: skip
+        if self.n_contacts:
+            data += (self.sticks,)  # type: ignore[assignment]
         if self.method != "dopri5":
             data += (self.method,)  # type: ignore[assignment]
         if self.n_known is not None or self.jacobian_entries is not None:
@@ -281,6 +293,11 @@ class System:
     def n_events(self) -> int:
         """Number of functions on whose zeros steps end."""
         return self.n_switches + self.n_impacts + (self.section is not None)
+
+    @property
+    def n_contacts(self) -> int:
+        """Number of modes that tell whether a state rests on the surface of an impact."""
+        return self.n_impacts if any(self.sticks) else 0
 
     @property
     def controlled(self) -> int:

@@ -32,6 +32,7 @@ _BY_STATUS = {
     vocabulary.STEP_UNDERFLOW: "step underflow",
     vocabulary.UNREACHED: "unreached",
     vocabulary.NO_RETURN: "no return",
+    vocabulary.CHATTER: "chatter",
 }
 
 

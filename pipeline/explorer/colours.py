@@ -36,6 +36,7 @@ _STATUS = {
     Status.STEP_UNDERFLOW: "#595959",
     Status.UNREACHED: "#8C8C8C",
     Status.NO_RETURN: "#404040",
+    Status.CHATTER: "#2E2619",
     Status.PENDING: "#BFBFBF",
 }
 

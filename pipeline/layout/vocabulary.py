@@ -48,9 +48,11 @@ DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "exten
 UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES = range(len(DECISIONS))
 """How a cell was decided: values of `decision`."""
 
-PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED, NO_RETURN = Status
+(
+    PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED, NO_RETURN, CHATTER,
+) = Status  # fmt: skip
 
-FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, NO_RETURN)
+FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, NO_RETURN, CHATTER)
 """What became of cells that could not be integrated to the end."""
 
 _GRID_SUFFIX = "_0"

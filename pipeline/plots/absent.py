@@ -18,6 +18,7 @@ LOOKS: dict[str, dict[str, Any]] = {
     "failed": {"facecolor": "0.1", "edgecolor": "0.1", "linewidth": 0.8},
     "not reached": {"facecolor": "0.62", "edgecolor": "0.62", "linewidth": 0.8},
     "no return": {"facecolor": "0.8", "edgecolor": "0.3", "linewidth": 0.6},
+    "chatter": {"facecolor": "0.45", "edgecolor": "0.1", "linewidth": 0.6},
 }
 
 

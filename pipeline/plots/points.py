@@ -20,6 +20,7 @@ ABSENT = {
     "failed": (vocabulary.DIVERGED, vocabulary.STEP_LIMIT, vocabulary.STEP_UNDERFLOW),
     "not reached": (vocabulary.UNREACHED,),
     "no return": (vocabulary.NO_RETURN,),
+    "chatter": (vocabulary.CHATTER,),
 }
 """What became of cells that have no point to draw."""
 

@@ -60,6 +60,7 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
         n_impacts=n_impacts,
         impacts=functions["impacts"] if n_impacts else None,
         impact_directions=tuple(i.direction for i in derived.impacts),
+        sticks=derived.sticks,
         reset=functions["reset"] if n_impacts else None,
         quantity_names=tuple(definition.quantities),
         quantities=functions["quantities"] if definition.quantities else None,

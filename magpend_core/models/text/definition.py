@@ -23,11 +23,14 @@ class Impact:
         +1 for rising through zero, -1 for falling.
     set : dict
         New value by name of the state; the others stay.
+    stick : bool
+        Whether the state rests on the surface after infinitely many impacts in a finite time.
     """
 
     of: Tree
     direction: int
     set: Mapping[str, Tree]
+    stick: bool = False
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,12 @@ class Definition:
             "equations": {name: written(tree) for name, tree in self.equations.items()},
             "quantities": [[name, written(tree)] for name, tree in self.quantities.items()],
             "impacts": [
-                [written(i.of), i.direction, {name: written(tree) for name, tree in i.set.items()}]
+                [
+                    written(i.of),
+                    i.direction,
+                    {name: written(tree) for name, tree in i.set.items()},
+                    *["stick"] * i.stick,
+                ]
                 for i in self.impacts
             ],
         }

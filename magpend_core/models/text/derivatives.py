@@ -138,6 +138,7 @@ _RULES: dict[str, Rule] = {
             "segment",
             "clock",
             "mode_clock",
+            "mode_contact",
             "state",
             "rate",
             "side",

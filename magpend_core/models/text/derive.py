@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magpend_core.models.parameters import POSITIVE
+from magpend_core.models.text.contacts import Jump, along, with_contacts
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.derivatives import derivatives
 from magpend_core.models.text.grammar import Tree
@@ -48,16 +49,6 @@ class Wave:
 
 
 @dataclass(frozen=True)
-class Jump:
-    """An impact: its value and rate, and all states afterwards."""
-
-    value: Node
-    rate: Node
-    direction: int
-    states: tuple[Node, ...]
-
-
-@dataclass(frozen=True)
 class Derived:
     """What is computed.
 
@@ -80,6 +71,8 @@ class Derived:
     sliding : Sliding
         Value and rate of each switch, and which of them slide.
     impacts : tuple of Jump
+    sticks : tuple of int
+        See `System.sticks`.
     missed : tuple of str
         Steep places on which steps do not end and which limit none, for people.
     """
@@ -95,6 +88,7 @@ class Derived:
     switches: tuple[Switch, ...]
     sliding: Sliding
     impacts: tuple[Jump, ...]
+    sticks: tuple[int, ...]
     missed: tuple[str, ...]
 
     @property
@@ -128,7 +122,9 @@ def derive(definition: Definition) -> Derived:
     smooth = tuple(sides.rewritten(plain))
     drive = builder.names.get(DRIVE)
     sliding = sliding_of(graph, smooth, sides.switches)
-    rates = tuple(sliding.lowered(smooth))
+    free = tuple(sliding.lowered(smooth))
+    jumps = [_jump(builder, sides, sliding, i) for i in range(len(definition.impacts))]
+    rates, jumps, sticks = with_contacts(graph, free, jumps, [i.stick for i in definition.impacts])
     states = [graph.leaf("state", i) for i in range(len(rates))]
     columns = [derivatives(graph, rates, {s: graph.one}) for s in states]
     jacobian = tuple(columns[j][i] for i in range(len(rates)) for j in range(len(rates)))
@@ -143,7 +139,7 @@ def derive(definition: Definition) -> Derived:
         preferred),
         tuple(layers), tuple(w for w in waves if w.count), tuple(sides.instants), tuple(sides.switches),
         sliding,
-        tuple(_jump(builder, sides, sliding, i) for i in range(len(definition.impacts))),
+        tuple(jumps), sticks,
         (*(f"{form} beside a jump in time" for form in late), *(["square"] * len(sides.left))),
     )  # fmt: skip
 
@@ -180,12 +176,6 @@ def _smoothed(
 def _is_layer(steep: Steep) -> bool:
     """Whether it is a place on the state, and no clock's."""
     return steep.value.kind == STATED and not any(n.op == "clock" for n in in_order([steep.value]))
-
-
-def along(graph: Graph, nodes: tuple[Node, ...]) -> list[Node]:
-    """Time derivatives of expressions of time and state, with the states' rates as leaves."""
-    states = {n: graph.leaf("rate", int(n.value)) for n in in_order(nodes) if n.op == "state"}
-    return derivatives(graph, nodes, {**states, graph.leaf("time"): graph.one})
 
 
 def _layer(graph: Graph, steep: Steep, sliding: Sliding) -> Layer:

@@ -51,7 +51,8 @@ def found_in(
     for impact in own.impacts:
         way = "rises" if impact.direction > 0 else "falls"
         new = ", ".join(f"{name} becomes {readable(tree)}" for name, tree in impact.set.items())
-        yield f"impact: where {readable(impact.of)} {way} through 0, {new}"
+        rests = "; after infinitely many impacts the state rests there" if impact.stick else ""
+        yield f"impact: where {readable(impact.of)} {way} through 0, {new}{rests}"
     for form in derived.missed:
         yield f"not followed: {form}; steps there are chosen by their error alone"
 

@@ -203,7 +203,7 @@ def source_of(derived: Derived) -> Source:
     layers = [node for la in derived.layers for node in (la.value, la.rate, la.half_width, la.per_strength)]
     switches = [node for pair in derived.sliding.pairs for node in pair]
     impacts = [node for jump in derived.impacts for node in (jump.value, jump.rate)]
-    resets = [node for jump in derived.impacts for node in jump.states]
+    resets = [node for jump in derived.impacts for node in (*jump.states, *jump.at_rest)]
     roots = (
         *derived.rates,
         *derived.jacobian,
@@ -215,7 +215,9 @@ def source_of(derived: Derived) -> Source:
         *resets,
     )
     constants = constants_of(roots)
-    n_constants, n_modes = max(1, len(constants)), len(derived.switches) + bool(derived.instants)
+    n_contacts = len(derived.sticks) if any(derived.sticks) else 0
+    n_constants = max(1, len(constants))
+    n_modes = len(derived.switches) + n_contacts + bool(derived.instants)
     leaves = _leaves(derived, constants, n_constants, n_modes)
     timed = leaves | {n.number: "t" for n in derived.graph.nodes if n.op == "time"}
     behind = dict.fromkeys((n for n, name in timed.items() if name == "t"), f"dy[{len(derived.rates)}]")
@@ -252,6 +254,8 @@ def _leaves(derived: Derived, constants: list[Node], n_constants: int, n_modes: 
             names[node.number] = f"{'y' if node.op == 'state' else 'dy'}[{int(node.value)}]"
         if node.op in ("mode_side", "mode_clock"):
             names[node.number] = f"c[{n_constants + int(node.value)}]"
+        if node.op == "mode_contact":
+            names[node.number] = f"c[{n_constants + len(derived.switches) + int(node.value)}]"
         if node.op == "segment":
             names[node.number] = f"c[{n_constants + n_modes - 1}]"
     return names
@@ -379,9 +383,12 @@ def _tuple(
 
 def _reset(derived: Derived, leaves: Mapping[int, str]) -> str:
     lines = ["zero = 0.0 * y[0]"]
-    for k, jump in enumerate(derived.impacts):
+    n = len(derived.impacts)
+    maps = {k: jump.states for k, jump in enumerate(derived.impacts)}
+    maps |= {n + k: jump.at_rest for k, jump in enumerate(derived.impacts) if jump.at_rest}
+    for k, states in maps.items():
         writer = Writer(leaves)
-        values = [f"zero + {value}" for value in writer.write(jump.states)]
+        values = [f"zero + {value}" for value in writer.write(states)]
         lines.append(f"if k == {k}:")
         lines += [f"    {line}" for line in (*writer.lines, f"return ({', '.join(values)},)")]
     same = ", ".join(f"zero + y[{i}]" for i in range(len(derived.rates)))

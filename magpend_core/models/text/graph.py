@@ -54,7 +54,7 @@ class Node:
 _LEAVES = {
     "number": CONSTANT, "parameter": CONSTANT, "frequency": CONSTANT, "rank": CONSTANT, "time": TIMED,
     "segment": TIMED, "clock": TIMED, "mode_clock": TIMED, "state": STATED, "rate": STATED,
-    "side": STATED, "mode_side": STATED,
+    "side": STATED, "mode_side": STATED, "mode_contact": STATED,
 }  # fmt: skip
 
 _FOLDED: dict[str, Callable[..., float]] = {"sqrt": math.sqrt, "absolute": abs, "floor": math.floor}

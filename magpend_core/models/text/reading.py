@@ -228,7 +228,7 @@ class _Reading(ViewsReader):
 
     def _impact(self, given: Any, place: str, states: tuple[str, ...]) -> Impact | None:
         table = self.table(given, place, 10, "keys")
-        self.keys(table, place, ("of", "direction", "set"))
+        self.keys(table, place, ("of", "direction", "set", "stick"))
         for key in ("of", "direction", "set"):
             if key not in table:
                 self.report(f"{place}.{key}", "missing; an impact has of, direction and set.")
@@ -236,6 +236,9 @@ class _Reading(ViewsReader):
         direction = table["direction"]
         if not isinstance(direction, str) or direction not in ("up", "down"):
             self.report(f"{place}.direction", f'{shown(direction)} must be "up" or "down".')
+        stick = table.get("stick", False)
+        if not isinstance(stick, bool):
+            self.report(f"{place}.stick", f"{shown(stick)} must be true or false.")
         of = self.expression(table["of"], f"{place}.of", self.known)
         values = {}
         for name, value in self.table(table["set"], f"{place}.set", MAX_STATES, "states").items():
@@ -246,7 +249,7 @@ class _Reading(ViewsReader):
             tree = self.expression(value, f"{place}.set.{name}", self.known)
             if tree is not None:
                 values[name] = tree
-        return None if of is None else Impact(of, 1 if direction == "up" else -1, values)
+        return None if of is None else Impact(of, 1 if direction == "up" else -1, values, stick is True)
 
 
 def _circle(define: Mapping[str, Tree]) -> list[str]:

@@ -115,7 +115,8 @@ def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArra
         "n_unstable": (("on an unstable orbit or equilibrium",), "cells on sets that do not attract"),
         "n_neutral": (("on a neutral set",), "cells on neutral sets"),
         "n_failed": (
-            ("step limit", "step underflow", "unreached", "no return"), "cells that could not be integrated",
+            ("step limit", "step underflow", "unreached", "no return", "chatter"),
+            "cells that could not be integrated",
         ),
     }  # fmt: skip
     found = {}
