@@ -29,6 +29,7 @@ SYSTEMS = HERE / "systems"
 LIBRARY = HERE.parents[1] / "magpend_core" / "models" / "library"
 
 NONSMOOTH = (
+    "ball-on-shaken-table",
     "belt-stick",
     "coulomb-forced",
     "coulomb-free",

@@ -38,6 +38,9 @@ ZERO = 1e-4
 NEIGHBOURS, THIN, ON_CURVE = 10, 0.2, 0.95
 """Neighbours that must lie on a line, their largest relative scatter about it, and the share of points."""
 
+GONE = -660.0
+"""Logarithm of the growth of a direction or a volume that vanishes, as at rest on a surface."""
+
 Rates = Callable[[np.ndarray], np.ndarray]
 
 LOST, LOST_ERROR = 1e-6, 1e-3
@@ -107,17 +110,15 @@ def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Gro
     volumes
         Logarithm of the change of a volume over each, shape (cell, section); see `volumes_of`.
     """
-    steps = _logarithms(derivatives)
+    steps, volumes = _logarithms(derivatives), np.maximum(volumes, GONE)
     n = steps.shape[1]
     # the first quarter turns the basis into its directions
     steps = steps[:, n // 4 :]
     n = steps.shape[1]
     order = np.argsort(-steps.mean(axis=(0, 1)), kind="stable")
-    finite = steps[..., [k for k in order if np.isfinite(steps[..., k]).all()]]
     # of those that are 0 by construction the ones nearest to 0 are left out
-    rates = np.abs(finite.mean(axis=(0, 1)))
-    known = np.argsort(rates, kind="stable")[:n_known]
-    first = np.delete(finite, known, axis=-1)[..., 0]
+    known = np.argsort(np.abs(steps[..., order].mean(axis=(0, 1))), kind="stable")[:n_known]
+    first = np.delete(steps[..., order], known, axis=-1)[..., 0]
     rate, error = _mean(first)
     volume, volume_error = _mean(volumes)
     whole = _weighted(first)
@@ -169,13 +170,13 @@ def volumes_of(
 
 
 def _logarithms(derivatives: np.ndarray) -> np.ndarray:
-    """Logarithms of the growth of each orthonormal direction at each section; -inf where one is gone."""
+    """Logarithms of the growth of each orthonormal direction at each section; `GONE` where one vanishes."""
     basis = np.broadcast_to(np.eye(derivatives.shape[-1]), derivatives[:, 0].shape)
     grown = np.empty(derivatives.shape[:-1])
     for i in range(derivatives.shape[1]):
         basis, r = np.linalg.qr(derivatives[:, i] @ basis)
         factor = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-        grown[:, i] = np.log(factor, out=np.full(factor.shape, -np.inf), where=factor > 1e-290)
+        grown[:, i] = np.log(factor, out=np.full(factor.shape, GONE), where=factor > 1e-286)
     return grown
 
 

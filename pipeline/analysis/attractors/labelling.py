@@ -122,23 +122,23 @@ def _is_elsewhere(point: Point) -> np.ndarray:
 
 def _preserves_volume(point: Point, search: Search) -> Work[bool]:
     """Whether the flow, or the section map, leaves volumes as they are wherever it was looked at."""
-    before, after = _some_steps(point)
+    before = _some_points(point)
     if not len(before):
         return False
-    derivatives: np.ndarray = yield Slopes(before, VOLUME_RTOL)
+    # not to the next section that the run kept, which has the error of the run's tolerance
+    after, derivatives = yield Slopes(before, VOLUME_RTOL)
     if not np.isfinite(derivatives).all():
         return False
     return bool((np.abs(point.volumes(derivatives, before, after)) <= PRESERVED).all())
 
 
-def _some_steps(point: Point, n: int = 16) -> tuple[np.ndarray, np.ndarray]:
-    """Last two section points of cells that go on, those of least hash."""
-    found = np.zeros((0, 2, point.n_states))
+def _some_points(point: Point, n: int = 16) -> np.ndarray:
+    """Last section points of cells that go on, those of least hash, shape (n, state)."""
+    found = np.zeros((0, 1, point.n_states))
     for block in point.blocks():
-        if block.section.shape[1] > 1:
-            both = np.concatenate([found, block.section[block.is_closed | block.is_bounded, -2:]])
-            found = both[np.unique(marks_of(both), return_index=True)[1][:n]]
-    return found[:, 0], found[:, 1]
+        more = np.concatenate([found, block.section[block.is_closed | block.is_bounded, -1:]])
+        found = more[np.unique(marks_of(more), return_index=True)[1][:n]]
+    return found[:, 0]
 
 
 def _conservative(point: Point, labels: _Labels) -> BoundedSet:

@@ -74,7 +74,7 @@ class Polish:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives of the section map at points (n, state); the answer has the shape (n, state, state)."""
+    """Images of points (n, state) under the section map, and its derivatives there, (n, state, state)."""
 
     point: np.ndarray
     rtol: float = SLOPE_RTOL
@@ -248,14 +248,15 @@ def _each_once(
 
 def _slopes(
     asked: Mapping[tuple[int, ...], Slopes], points: Mapping[tuple[int, ...], Point], settings: Settings
-) -> dict[tuple[int, ...], np.ndarray]:
+) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
     assert settings.system is not None
-    found: dict[tuple[int, ...], np.ndarray] = {}
+    found: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
     for rtol in {request.rtol for request in asked.values()}:
         own = {index: request for index, request in asked.items() if request.rtol == rtol}
         sizes = [len(request.point) for request in own.values()]
         packed, frequency, ends = _gathered(sizes, own, points)
         start = np.concatenate([request.point for request in own.values()])
-        slopes = section_map(packed, frequency, start, 1, rtol=rtol, system=settings.system).derivatives
-        found |= {index: slopes[rows] for index, rows in _slices(own, sizes, ends)}
+        ways = section_map(packed, frequency, start, 1, rtol=rtol, system=settings.system)
+        for index, rows in _slices(own, sizes, ends):
+            found[index] = ways.images[rows, -1], ways.derivatives[rows]
     return found

@@ -77,7 +77,7 @@ def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0) -> Outcome:
                 np.ones((n, LEG)),
             )
         elif isinstance(asked, Slopes):
-            answer = point.slope(asked.point)
+            answer = point.step(asked.point), point.slope(asked.point)
         else:
             assert isinstance(asked, Polish)
             answer = [None] * len(asked.guesses.key)
@@ -224,6 +224,18 @@ def test_growth__exponents_of_the_henon_map():
     assert found.is_chaotic
     assert not found.preserves_volume
     assert found.volume == pytest.approx(np.log(0.3))
+
+
+def test_growth__of_directions_that_vanish():
+    """A ball that comes to rest forgets its start; nothing is divided by that."""
+    slopes = np.zeros((2, 64, 2, 2))
+    slopes[0, ::2] = [[0.5, 0.1], [0.0, 0.2]]
+    with np.errstate(divide="ignore"):
+        found = growth_of(slopes, 0, np.linalg.slogdet(slopes)[1])
+    assert found.high < 0.0
+    assert found.contracts
+    assert not found.is_chaotic
+    assert not found.preserves_volume
 
 
 def test_on_closed_curves__curves_but_no_arcs_clouds_or_points():
