@@ -37,7 +37,7 @@ CHAOS = Analysis(
     """Tell regular from chaotic attractors: exponents, multipliers, dimensions, 0-1 test.
 
     A line per attractor, or with more than six points the ranges in which each kind of motion occurs.
-    Exponents of orbits are those of their multipliers; those of bounded sets need [products] lyapunov in the
+    Exponents of orbits are those of their multipliers; those of other sets need [products] lyapunov in the
     run's specification, the 0-1 test 200 sections.""",
     ChaosOptions,
     compute=f"{_ROOM}:chaos",
@@ -49,7 +49,7 @@ CHAOS = Analysis(
 
 DIMENSION = Analysis(
     "dimension",
-    """Measure the correlation dimension of each bounded set that stays.
+    """Measure the correlation dimension of each set that attracts and does not close.
 
     A sample of each is run on first, as `settling` does: transients and motions that are still closing have
     no dimension. Takes seconds per point, and thousands of sections for two digits.""",

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.outcomes import outcomes
+
 
 def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
     """Where a continuation finds other attractors going up than going down.
@@ -45,7 +47,8 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
         If the cube has no branches in both directions.
     """
     check_directions(ds)
-    cells = ids["attractor_id"]
+    # of sets that do not attract, and of cells that diverge, nothing is said
+    cells = outcomes(ids).clip(min=-1)
     dims = [str(d) for d in cells.dims if d != "branch"]
     path = str(ds.attrs.get("path", dims[0] if len(dims) == 1 else ""))
     if path not in dims:

@@ -35,7 +35,7 @@ def compare(
     at
         Values of the run's other axes.
     seed
-        Of the samples drawn of bounded sets.
+        Of the samples drawn of sets that do not close.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def compare(
         `measured`, and by step ``noise_floor``: Wasserstein-1 between the halves of the step's sections;
         ``winner``: id of the nearest attractor, -1 where the run's axis does not reach; ``distance`` from it
         and ``runner_up`` from the next (NaN if there is no other), both in units of the states' scales, and
-        ``distance_in_noise`` in units of the floor; ``computed_period`` (0: bounded set) and
+        ``distance_in_noise`` in units of the floor; ``computed_period`` (0: a set that does not close) and
         ``computed_side`` of the winner; ``same_period``, ``same_side``: 1 if they agree, 0 if not, -1
         unknown; and (step, attractor) ``distances``. Of each window's end, dim ``edge``:
         ``edge_measured_hz``, ``edge_measured_error_hz``, ``edge_computed_hz``, ``edge_computed_error_hz``,
@@ -77,7 +77,7 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
         "distance": ("1", "distance from the nearest attractor"),
         "runner_up": ("1", "distance from the next attractor"),
         "distance_in_noise": ("1", "distance in units of the noise floor"),
-        "computed_period": ("1", "period of the nearest attractor, 0: bounded set"),
+        "computed_period": ("1", "period of the nearest attractor, 0: a set that does not close"),
         "computed_side": ("1", "side of the nearest attractor"),
         "same_period": ("1", "whether the periods agree"),
         "same_side": ("1", "whether the sides agree"),

@@ -74,7 +74,7 @@ class Computed:
     attractors : Dataset
         Result of the analysis ``attractors``: dims frequency, cells, attractor, in rising frequency.
     cube : Dataset
-        Cells of the run, for the points of bounded sets and the diagram.
+        Cells of the run, for the points of sets that do not close and the diagram.
     parameters : Parameters
     title, digest : str
     """
@@ -136,7 +136,7 @@ class Computed:
         """Attractors at a frequency, with their points in the chosen states.
 
         Points of a closed orbit are interpolated between neighbouring frequencies at which the id has the
-        same period; else, and for bounded sets, they are those of the nearest frequency.
+        same period; else, and for sets that do not close, they are those of the nearest frequency.
         """
         i = self.place(frequency_hz)
         if i < 0:

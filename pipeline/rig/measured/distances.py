@@ -56,11 +56,11 @@ class Candidate:
     attractor : int
         Its id.
     orbit_period : int
-        0 for a bounded set.
+        0 for a set that does not close.
     side : int
         Code of the model's classifier.
     points : ndarray
-        (n, state): all points of a closed orbit, or a sample of a bounded set.
+        (n, state): all points of a closed orbit, or a sample of a set that does not close.
     """
 
     attractor: int

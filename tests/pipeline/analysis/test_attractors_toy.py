@@ -8,7 +8,7 @@ import xarray as xr
 
 from pipeline.analysis.attractors.attractors import identify, match
 from pipeline.analysis.attractors.hysteresis import hysteresis
-from pipeline.layout.vocabulary import BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 K = 64
@@ -300,7 +300,12 @@ def test_hysteresis__loop_and_jumps():
     coords = {"frequency": ("frequency", axis, {"units": "Hz"}), "direction": ("branch", direction)}
     dims = ("frequency", "branch")
     ds = xr.Dataset({"status": (dims, np.ones((6, 4), np.int8))}, coords, attrs={"path": "frequency"})
-    ids = xr.Dataset({"attractor_id": (dims, values)}, {**coords, "attractor": [0, 1]})
+    shown = np.full((6, 2), ATTRACTS, np.int8)
+    states = {"attractor_id": values, "status": np.ones_like(values), "decision": np.zeros_like(values)}
+    ids = xr.Dataset(
+        {**{name: (dims, v) for name, v in states.items()}, "stability": (("frequency", "attractor"), shown)},
+        {**coords, "attractor": [0, 1]},
+    )
     table = hysteresis(ds, ids)
     assert table["differs"].values.tolist() == [False, False, True, True, True, False]
     assert table["loop_from"].values.tolist() == [2.2]
@@ -321,6 +326,9 @@ def test_hysteresis__loop_and_jumps():
     assert jumps == {(1, 2.4, 2.5, 0, 1, 2), (-1, 2.2, 2.1, 1, 0, 1), (-1, 2.2, 2.0, 1, 0, 1)}
     with pytest.raises(ValueError, match="both"):
         hysteresis(ds.isel(branch=[0, 1]), ids.isel(branch=[0, 1]))
+    # what is not shown to attract makes no loop
+    ids["stability"][:, 0] = NOT_SETTLED
+    assert not hysteresis(ds, ids)["differs"].any()
 
 
 def test_identify__largest_exponent_of_bounded_sets_is_that_of_their_good_cells():
