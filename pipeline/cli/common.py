@@ -71,8 +71,11 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
         for line in table.lines:
             console.result(line)
     if csv not in (None, "-"):
-        with Path(str(csv)).open("w", newline="", encoding="utf-8") as file:
-            write_csv(table.rows, file)
+        from pipeline.layout.writing import write_atomically
+
+        text = io.StringIO()
+        write_csv(table.rows, text)
+        write_atomically(Path(str(csv)), text.getvalue())
         console.note(f"table: {csv}")
 
 

@@ -49,18 +49,21 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
     from pipeline.cli import console
     from pipeline.runs.drawing import drawn, ready
     from pipeline.store.errors import RefusedError
-    from pipeline.store.local import unwritable
+    from pipeline.store.local import make_folder, refuse_links, unwritable
 
     if options.out:
         check_figure_path(_target_of(options))
     run, wanted = ready(directory, name, options, console.note)
     target = _target_of(wanted) if wanted.out else _in_run(run.info.files, name, wanted)
+    if not wanted.out:
+        refuse_links(target.parent, target, target.with_suffix(".nc"))
     if problem := unwritable(target.parent):
         raise RefusedError(f"{problem}; give another place for the figure: --out FILE.")
     figure = drawn(run, name, wanted)
     from pipeline.plots import save_data, save_figure
 
-    target.parent.mkdir(parents=not wanted.out, exist_ok=True)
+    if not wanted.out:
+        make_folder(target.parent)
     console.result(f"figure: {save_figure(figure, target)}")
     console.result(f"data: {save_data(figure, target)}")
 

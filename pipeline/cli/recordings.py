@@ -12,6 +12,7 @@ from pipeline.cli.common import EXIT_HELP, Json, tell
 from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import speaking
 from pipeline.cli.plot import check_figure_path
+from pipeline.layout.writing import write_atomically
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -94,7 +95,7 @@ def convert(
     beside = _beside(out, text) if with_mapping else out
     console.result(f"recording: {write_recording(ds, out)}")
     if with_mapping:
-        beside.write_text(text, encoding="utf-8")
+        write_atomically(beside, text)
         console.result(f"mapping: {beside}")
 
 
@@ -115,7 +116,7 @@ def simulate(
     raw, mapping = simulated(load_rig(spec), is_csv=out.suffix.lower() == ".csv")
     beside = _beside(out, mapping.toml())
     console.result(f"recording: {write_raw(raw, out)}")
-    beside.write_text(mapping.toml(), encoding="utf-8")
+    write_atomically(beside, mapping.toml())
     console.result(f"mapping: {beside}")
 
 
@@ -143,7 +144,7 @@ def drive(
 
     check_target(out, (".csv",))
     made = drive_file(_read(file, mapping, window), kind, tolerance=tolerance)
-    out.write_text(made.text, encoding="utf-8")
+    write_atomically(out, made.text)
     for note in made.notes:
         console.note(note)
     if made.timing is not None:

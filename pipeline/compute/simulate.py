@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,7 @@ from magpend_core.models.model import Model, Quantity, State
 from magpend_core.models.presets import Preset
 from pipeline.layout.domains import check_states
 from pipeline.layout.vocabulary import model_attribute
+from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.spec.drives import RecordedDrive, load_drive
 from pipeline.spec.problems import SpecError, unknown_name
 from pipeline.spec.recorded import model_problems
@@ -288,11 +290,13 @@ def write_series(ds: xr.Dataset, path: Path) -> Path:
     """Write a series as CSV (names with units, 17 digits) or as NetCDF, by the suffix."""
     check_output(path)
     if path.suffix.lower() == ".nc":
-        ds.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
+        write_netcdf(path, ds)
         return path
     names = ["time", *map(str, ds.data_vars)]
     units = [re.sub(r"\W+", "_", ds[name].attrs["units"].replace("/", "_per_")) for name in names]
     table = np.column_stack([ds[name].values for name in names])
     header = ",".join(f"{name}_{unit}" for name, unit in zip(names, units, strict=True))
-    np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.17g")
+    text = io.StringIO()
+    np.savetxt(text, table, delimiter=",", header=header, comments="", fmt="%.17g")
+    write_atomically(path, text.getvalue())
     return path

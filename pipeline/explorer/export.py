@@ -17,9 +17,10 @@ from pipeline.explorer.copy_html import inline_html
 from pipeline.explorer.explored import ExploredRun
 from pipeline.explorer.gather import Column, Copied, add_planes, column, gather
 from pipeline.explorer.packing import packed, packed_json
+from pipeline.layout.writing import write_atomically
 from pipeline.products.reporting import track
 from pipeline.store.errors import RefusedError
-from pipeline.store.local import unwritable, write_atomically
+from pipeline.store.local import unwritable
 from pipeline.store.run import Run
 
 MOST_BYTES = 20_000_000

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, features
 
+from pipeline.layout.writing import temporary_beside, writing
 from pipeline.plots.animation import Animation, Pixels
 
 SUFFIXES = (".gif", ".webp", ".mp4")
@@ -69,11 +69,12 @@ def save_animation(film: Animation, path: str | Path) -> Path:
     path = Path(path)
     if problems := film_problems(path, film.fps):
         raise ValueError(" ".join(problems))
-    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    part = temporary_beside(path).with_suffix(path.suffix)  # Pillow and ffmpeg go by the suffix
     write = {".gif": _gif, ".webp": _webp, ".mp4": _mp4}[path.suffix.lower()]
     try:
-        write(film, part)
-        part.replace(path)
+        with writing(path):
+            write(film, part)
+            part.replace(path)
     finally:
         part.unlink(missing_ok=True)
     return path
