@@ -145,7 +145,17 @@ def _problems(
             return problems
     if checked is not None:
         return []
-    return _Motion(system, functions, packed[0], np.float64(frequency[0]), states).problems(linearised)
+    for i in _sampled(len(packed)):
+        if functions.has_values(frequency[i], packed[i]):
+            return _Motion(system, functions, packed[i], np.float64(frequency[i]), states).problems(
+                linearised
+            )
+    return []
+
+
+def _sampled(n: int) -> list[int]:
+    """Cells at which the motion is looked at if it has values there: the first, and others all over."""
+    return sorted({round(x) for x in np.linspace(0, n - 1, N_SAMPLES)})
 
 
 def _declaration(system: System, linearised: bool) -> Iterator[str]:
@@ -226,6 +236,10 @@ class _Functions:
         self.call("constants", frequency, p, out)
         return tuple(out)
 
+    def has_values(self, frequency: float, p: np.ndarray) -> bool:
+        """Whether a cell lies at no pole of the constants."""
+        return not self.system.has_poles or bool(np.isfinite(self.constants(np.float64(frequency), p)).all())
+
     def edges(self, frequency: np.float64, p: np.ndarray) -> np.ndarray:
         """Times, half-widths and jumps of a cell, shape (3, n_edges)."""
         table = np.full((3, self.system.n_edges), np.nan)
@@ -237,7 +251,7 @@ class _Functions:
         self.problems = []
         at = f"at frequency_hz = {frequency:g}"
         values = self.constants(frequency, p)
-        if not self.problems:
+        if not self.problems and not self.system.has_poles:
             bad = [f"number {i} is {c}" for i, c in enumerate(values) if not np.isfinite(c)]
             if bad:
                 self.problems.append(
