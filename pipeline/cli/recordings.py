@@ -11,6 +11,7 @@ import typer
 from pipeline.cli.common import EXIT_HELP, Json, tell
 from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import speaking
+from pipeline.cli.outputs import check_file
 from pipeline.cli.plot import check_figure_path
 from pipeline.layout.writing import write_atomically
 
@@ -88,6 +89,7 @@ def convert(
     from pipeline.rig.recordings.writing import check_target
 
     check_target(out)
+    check_file(out)
     _keep(file, out)
     ds = _smoothed(_read(file, mapping, window), smooth, smoothing_window)
     with_mapping = out.suffix.lower() != ".nc"
@@ -110,6 +112,7 @@ def simulate(
     from pipeline.spec.problems import SpecError
 
     check_target(out, SUFFIXES[:2])
+    check_file(out)
     beside = out.with_suffix(".toml")
     if beside.resolve() == spec.resolve():
         raise SpecError([f"--out {out}: its mapping would be written over {spec}; give another name."])
@@ -143,6 +146,7 @@ def drive(
     from pipeline.rig.recordings.writing import check_target
 
     check_target(out, (".csv",))
+    check_file(out)
     made = drive_file(_read(file, mapping, window), kind, tolerance=tolerance)
     write_atomically(out, made.text)
     for note in made.notes:

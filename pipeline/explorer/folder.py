@@ -19,7 +19,7 @@ from pipeline.layout.writing import sync_folder, temporary_beside, writing
 from pipeline.store.consolidate import Layer, write_cube
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import CUBE, entry_of
-from pipeline.store.local import remove_tree, unwritable
+from pipeline.store.local import refuse_place, remove_tree, unwritable
 from pipeline.store.run import Run
 
 INDEX, LIST, DATA, LICENCES = "index.html", "objects.json", "data", "LICENSES.txt"
@@ -96,6 +96,7 @@ def check_folder(out: Path, force: bool) -> None:
     """
     if not out.parent.is_dir():
         raise RefusedError(f"{out.parent}: no such folder; make it first.")
+    refuse_place(out.parent)
     if problem := unwritable(out.parent):
         raise RefusedError(f"{problem}; give another place.")
     if not (out.exists() or out.is_symlink()):

@@ -286,6 +286,31 @@ def run_around(path: Path) -> Path | None:
     return None
 
 
+def refuse_place(path: Path, option: str = "", within: str = "") -> None:
+    """Refuse a place for results that lies inside of a run directory, or is a link that leads nowhere.
+
+    Parameters
+    ----------
+    path
+        A file or a folder, there or not.
+    option
+        What names it, for the message.
+    within
+        Folder of a run directory in which it may lie.
+
+    Raises
+    ------
+    RefusedError
+        Saying which it is.
+    """
+    name = f"{option} {path}".strip()
+    if path.is_symlink() and not path.exists():
+        raise RefusedError(f"{name}: is a link that leads nowhere; remove it, or give another name.")
+    run = run_around(path)
+    if run is not None and not (within and path.absolute().parent.resolve() == run / within):
+        raise RefusedError(f"{name}: lies inside of the run directory {run}; give a place outside of it.")
+
+
 def remove_tree(path: Path) -> None:
     """Remove a file, a link (not what it leads to) or a folder; one that is gone already is no error."""
     with contextlib.suppress(FileNotFoundError):

@@ -42,7 +42,7 @@ from pipeline.store.files import (
     open_files,
     problems_of,
 )
-from pipeline.store.local import is_there, unreadable
+from pipeline.store.local import is_there, refuse_place, unreadable
 from pipeline.store.provenance import provenance, versions
 
 T = TypeVar("T")
@@ -215,6 +215,7 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
     """
     if directory.exists() and not directory.is_dir():
         raise RefusedError(f"{directory}: is a file; give another --out.")
+    refuse_place(directory, "--out")
     if not directory.exists():
         return None
     if not is_identification(directory):
