@@ -151,7 +151,7 @@ def made_run(tmp_path):
 @pytest.fixture(scope="module")
 def client(tmp_path_factory):
     found = Client(Run.open(finished(tmp_path_factory.mktemp("served"))))
-    found.service.rate = Rate(1e6, 1_000_000)
+    found.service.rate = found.service.strangers = found.service.files = Rate(1e6, 1_000_000)
     yield found
     found.close()
 
@@ -313,6 +313,53 @@ def test_zoom__takes_a_region_and_bounded_bodies(client):
         f"Content-Length: {server.MOST_BODY + 1}\r\nAuthorization: token {client.guard.token}\r\n\r\n"
     )
     assert b" 200 " not in client.raw(head.encode())
+
+
+def test_api__strangers_use_up_nothing_of_those_with_the_token(client, monkeypatch):
+    monkeypatch.setattr(client.service, "rate", Rate(0.001, 3))
+    monkeypatch.setattr(client.service, "files", Rate(0.001, 1))
+    monkeypatch.setattr(client.service, "strangers", Rate(0.001, 2))
+    wrong = {"Authorization": "token wrong"}
+    codes = [client.ask("/api/view", token=False, headers=wrong).code for _ in range(3)]
+    assert codes == [403, 403, 429]
+    assert client.ask("/static/explorer.css", token=False).code == 200
+    assert [client.ask("/api/view").code for _ in range(4)] == [200, 200, 200, 429]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/api/view?at.nonsense=0",
+        "/api/diagram?x=frequency&y=psi1&at.q=0&at.nonsense=0",
+        "/api/curves?x=frequency&at.q=0&at.nonsense=0",
+        "/api/attractors?at.frequency=0&at.q=0&at.nonsense=1",
+        "/api/orbit?cell=0&point=0&at.nonsense=0",
+        "/api/table?view=orbit&cell=0&point=0&at.nonsense=0",
+    ],
+)
+def test_api__unknown_axes_are_refused(client, path):
+    answer = client.ask(path)
+    assert answer.code == 400
+    assert "axis" in sentence(answer)
+    assert "nonsense" in sentence(answer)
+
+
+def test_zoom__unknown_axes_are_refused(client):
+    body = json.dumps({"x": [2.2, 2.6], "axes": ["frequency", "psi1"], "at": {"q": 0, "nonsense": 1}})
+    answer = client.ask("/api/zoom", method="POST", body=body)
+    assert answer.code == 400
+    assert "nonsense" in sentence(answer)
+
+
+def test_first_answers__what_fails_is_logged(client, monkeypatch, caplog):
+    from pipeline.explorer import answers
+
+    def fail(*arguments):
+        raise ValueError("no picture today")
+
+    monkeypatch.setattr(answers, "_diagram", fail)
+    answers.first_answers(client.service.run, None)
+    assert "no picture today" in caplog.text
 
 
 def test_api__is_bounded_in_rate_and_in_length(client, monkeypatch):
