@@ -300,7 +300,7 @@ def test_range__ten_million_points_take_seconds():
         {"start": 2.0, "stop": 2.8, "num": 10_000_000},
         {"start": 0.1234567890123456, "stop": 1.9876543210987654, "num": 3_000_000},
     ):
-        assert seconds_of(Range(**axis).array) < 5
+        assert seconds_of(Range(**axis).array) < 60
 
 
 @given(
