@@ -19,9 +19,9 @@ from pipeline.layout.domains import check_states
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.spec.drives import RecordedDrive, load_drive
-from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.spec.problems import SpecError, unknown_name, validated
 from pipeline.spec.recorded import model_problems
-from pipeline.spec.tables import FREQUENCY
+from pipeline.spec.tables import FREQUENCY, Integration
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -258,20 +258,16 @@ def _state_problems(model: Model, state: Sequence[float]) -> list[str]:
 
 
 def _problems(series: Series) -> list[str]:
-    found = []
-    for name, value in {"rtol": series.rtol, "atol": series.atol}.items():
-        if not (math.isfinite(value) and value > 0):
-            found.append(f"{name} = {value!r}: must be a finite number greater than 0.")
-    if 0 < series.rtol < 1e-13:
-        found.append(f"rtol = {series.rtol!r}: must be at least 1e-13.")
+    found: list[str] = []
+    try:
+        # what a specification has too has its bounds there
+        validated(Integration, {"rtol": series.rtol, "atol": series.atol, "n_transient": series.n_transient})
+    except SpecError as error:
+        found += error.problems
     n_periods = DEFAULT_PERIODS if series.n_periods is None else series.n_periods
-    counts = {
-        "n_transient": (series.n_transient, 0), "n_periods": (n_periods, 1),
-        "samples_per_period": (series.samples_per_period, 1),
-    }  # fmt: skip
-    for name, (number, least) in counts.items():
-        if number < least:
-            found.append(f"{name} = {number!r}: must be at least {least}.")
+    for name, number in {"n_periods": n_periods, "samples_per_period": series.samples_per_period}.items():
+        if number < 1:
+            found.append(f"{name} = {number!r}: must be at least 1.")
     samples = n_periods * series.samples_per_period
     if samples > MAX_SAMPLES:
         found.append(f"n_periods * samples_per_period = {samples}: must be at most {MAX_SAMPLES}.")
