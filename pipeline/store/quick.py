@@ -1,8 +1,8 @@
 """Reading very many small chunks: without a coroutine for every step of every chunk, as zarr has them.
 
-What is read and decoded here is what zarr would have read and decoded; all it cannot do goes to zarr. It builds
-on the class of pipeline that is registered, and on `read` as `zarr.abc.codec.CodecPipeline` describes it; a
-chunk that comes in another form goes to zarr too.
+What is read and decoded here is what zarr would have read and decoded; all it cannot do goes to zarr. It
+builds on the class of pipeline that is registered, and on `read` as `zarr.abc.codec.CodecPipeline` describes
+it; a chunk that comes in another form goes to zarr too.
 """
 
 from __future__ import annotations
