@@ -145,17 +145,10 @@ def _problems(
             return problems
     if checked is not None:
         return []
-    for i in _sampled(len(packed)):
-        if functions.has_values(frequency[i], packed[i]):
-            return _Motion(system, functions, packed[i], np.float64(frequency[i]), states).problems(
-                linearised
-            )
-    return []
-
-
-def _sampled(n: int) -> list[int]:
-    """Cells at which the motion is looked at if it has values there: the first, and others all over."""
-    return sorted({round(x) for x in np.linspace(0, n - 1, N_SAMPLES)})
+    for i in np.unique(np.linspace(0, len(packed) - 1, N_SAMPLES).astype(int)):
+        if functions.has_values(f := np.float64(frequency[i]), packed[i]):
+            return _Motion(system, functions, packed[i], f, states).problems(linearised)
+    return []  # every cell lies at a pole
 
 
 def _declaration(system: System, linearised: bool) -> Iterator[str]:
@@ -236,9 +229,9 @@ class _Functions:
         self.call("constants", frequency, p, out)
         return tuple(out)
 
-    def has_values(self, frequency: float, p: np.ndarray) -> bool:
+    def has_values(self, frequency: np.float64, p: np.ndarray) -> bool:
         """Whether a cell lies at no pole of the constants."""
-        return not self.system.has_poles or bool(np.isfinite(self.constants(np.float64(frequency), p)).all())
+        return not self.system.has_poles or bool(np.isfinite(self.constants(frequency, p)).all())
 
     def edges(self, frequency: np.float64, p: np.ndarray) -> np.ndarray:
         """Times, half-widths and jumps of a cell, shape (3, n_edges)."""

@@ -11,7 +11,7 @@ import typer
 from pipeline.cli.common import EXIT_HELP, Json, tell
 from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import speaking
-from pipeline.cli.outputs import check_file
+from pipeline.cli.outputs import check_file, check_place
 from pipeline.cli.plot import check_figure_path
 from pipeline.layout.writing import write_atomically
 
@@ -89,7 +89,7 @@ def convert(
     from pipeline.rig.recordings.writing import check_target
 
     check_target(out)
-    check_file(out)
+    _check_recording(out)
     _keep(file, out)
     ds = _smoothed(_read(file, mapping, window), smooth, smoothing_window)
     with_mapping = out.suffix.lower() != ".nc"
@@ -112,7 +112,7 @@ def simulate(
     from pipeline.spec.problems import SpecError
 
     check_target(out, SUFFIXES[:2])
-    check_file(out)
+    _check_recording(out)
     beside = out.with_suffix(".toml")
     if beside.resolve() == spec.resolve():
         raise SpecError([f"--out {out}: its mapping would be written over {spec}; give another name."])
@@ -171,6 +171,13 @@ def _keep(file: Path, out: Path) -> None:
 
     if out.exists() and file.exists() and out.samefile(file):
         raise SpecError([f"--out {out}: is the file that is read; give another name."])
+
+
+def _check_recording(out: Path) -> None:
+    """Refuse a file that magpend has not written; with a mapping beside it is told by that, see `_beside`."""
+    check_place(out)
+    if not out.with_suffix(".toml").exists():
+        check_file(out)
 
 
 def _beside(out: Path, text: str) -> Path:

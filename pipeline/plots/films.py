@@ -83,7 +83,9 @@ def save_animation(film: Animation, path: str | Path) -> Path:
 def _about(film: Animation) -> str:
     """What the file says of itself."""
     attrs = film.figure.data.attrs
-    return "; ".join(f"{k}: {v}" for k, v in attrs.items() if k in ("title", "source", "run", "cube_digest"))
+    return "magpend; " + "; ".join(
+        f"{k}: {v}" for k, v in attrs.items() if k in ("title", "source", "run", "cube_digest")
+    )
 
 
 def durations(n: int, fps: float, grain_ms: int) -> list[int]:
@@ -131,7 +133,7 @@ def _webp(film: Animation, path: Path) -> None:
     first = next(images)
     first.save(
         path, save_all=True, append_images=images, loop=0, duration=durations(film.n_frames, film.fps, 1),
-        quality=75, method=4,
+        quality=75, method=4, xmp=_about(film).encode("utf-8"),
     )  # fmt: skip
 
 
