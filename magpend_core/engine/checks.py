@@ -34,7 +34,6 @@ it where these converge slowly.
 TWICE = 2
 """A difference counts if it is seen at this many samples: one may lie within a layer."""
 
-
 _NOT_RUN = object()
 
 
@@ -84,6 +83,7 @@ def check_system(
     the forcing has the drive's period and that nothing changes as an angle goes round once; and the Jacobian
     against differences, if it is asked for or tangent vectors are carried along. All of it once for each
     system; constants and edges again where a parameter goes beyond the range in which they were looked at.
+    Functions without a form in plain Python (numba's intrinsics, say) are passed over.
 
     Parameters
     ----------
@@ -102,10 +102,6 @@ def check_system(
     ------
     SystemCheckError
         With all problems by name.
-
-    Notes
-    -----
-    Functions without a form in plain Python (numba's intrinsics, say) are passed over.
     """
     subject = system if system.tangents_of is None else system.tangents_of
     if subject.recorded_for is not None:  # a recording has no period; all else is the system's own
