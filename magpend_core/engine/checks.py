@@ -34,7 +34,6 @@ it where these converge slowly.
 TWICE = 2
 """A difference counts if it is seen at this many samples: one may lie within a layer."""
 
-
 _NOT_RUN = object()
 
 
@@ -84,6 +83,7 @@ def check_system(
     the forcing has the drive's period and that nothing changes as an angle goes round once; and the Jacobian
     against differences, if it is asked for or tangent vectors are carried along. All of it once for each
     system; constants and edges again where a parameter goes beyond the range in which they were looked at.
+    Functions without a form in plain Python (numba's intrinsics, say) are passed over.
 
     Parameters
     ----------
@@ -102,10 +102,6 @@ def check_system(
     ------
     SystemCheckError
         With all problems by name.
-
-    Notes
-    -----
-    Functions without a form in plain Python (numba's intrinsics, say) are passed over.
     """
     subject = system if system.tangents_of is None else system.tangents_of
     if subject.recorded_for is not None:  # a recording has no period; all else is the system's own
@@ -145,7 +141,10 @@ def _problems(
             return problems
     if checked is not None:
         return []
-    return _Motion(system, functions, packed[0], np.float64(frequency[0]), states).problems(linearised)
+    for i in np.unique(np.linspace(0, len(packed) - 1, N_SAMPLES).astype(int)):
+        if functions.has_values(f := np.float64(frequency[i]), packed[i]):
+            return _Motion(system, functions, packed[i], f, states).problems(linearised)
+    return []  # every cell lies at a pole
 
 
 def _declaration(system: System, linearised: bool) -> Iterator[str]:
@@ -226,6 +225,10 @@ class _Functions:
         self.call("constants", frequency, p, out)
         return tuple(out)
 
+    def has_values(self, frequency: np.float64, p: np.ndarray) -> bool:
+        """Whether a cell lies at no pole of the constants."""
+        return not self.system.has_poles or bool(np.isfinite(self.constants(frequency, p)).all())
+
     def edges(self, frequency: np.float64, p: np.ndarray) -> np.ndarray:
         """Times, half-widths and jumps of a cell, shape (3, n_edges)."""
         table = np.full((3, self.system.n_edges), np.nan)
@@ -237,7 +240,7 @@ class _Functions:
         self.problems = []
         at = f"at frequency_hz = {frequency:g}"
         values = self.constants(frequency, p)
-        if not self.problems:
+        if not self.problems and not self.system.has_poles:
             bad = [f"number {i} is {c}" for i, c in enumerate(values) if not np.isfinite(c)]
             if bad:
                 self.problems.append(

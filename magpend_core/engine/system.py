@@ -67,6 +67,8 @@ class System:
     constants : callable
         ``constants(frequency, p, out)``: from the drive frequency [Hz] and the packed parameters
         `p` to what `forcing`, `rhs` and `layers` use; fills all of `out` with finite numbers.
+    has_poles : bool
+        Whether constants need not be finite: cells that use one that is not end with a status.
     forcing : callable
         ``forcing(t, c)``: the explicit time dependence, a number, at time `t` [s] since the last
         section; `c` is the tuple of constants. It has the period 1/frequency. None for none: the system is
@@ -212,6 +214,7 @@ class System:
     has_layers: bool = True
     timed_layers: bool = False
     layers_fade: bool = False
+    has_poles: bool = False
     n_controlled: int | None = None
     n_known: int | None = None
     n_modes: int = 0

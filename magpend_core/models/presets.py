@@ -18,8 +18,8 @@ Those that ship name no model: several models of a room share them.
 from __future__ import annotations
 
 import json
-import os
 import tomllib
+import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -238,8 +238,9 @@ def write_preset(
     chosen = load_model(model)
     preset = Preset(path.stem, values, sources, chosen.name, shipped, title)
     chosen.load(preset)
-    whole = path.with_name(f".{path.name}.{os.getpid()}")
-    whole.write_text(_text(preset, chosen), "utf-8")
+    whole = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    with whole.open("x", encoding="utf-8") as file:
+        file.write(_text(preset, chosen))
     whole.replace(path)
     return path
 

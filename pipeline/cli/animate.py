@@ -84,11 +84,13 @@ def animate(
     jump. MP4 takes ffmpeg.
     """
     from pipeline.cli import console
+    from pipeline.cli.outputs import check_file
     from pipeline.plots.files import save_data
     from pipeline.plots.films import film_problems, save_animation
     from pipeline.runs.filming import animation
     from pipeline.spec.problems import SpecError
-    from pipeline.store.local import unwritable
+    from pipeline.store.files import FIGURES
+    from pipeline.store.local import make_folder, refuse_links, unwritable
     from pipeline.store.run import Run
 
     words = list(context.args)
@@ -105,7 +107,12 @@ def animate(
     problems += film_problems(target, 25.0 if fps is None else fps)
     if out is not None and not target.parent.is_dir():
         problems.append(f"{target.parent}: no such folder; make it first.")
-    elif problem := unwritable(target.parent):
+    if out is not None and not problems:
+        for file in (out, out.with_suffix(".nc")):
+            check_file(file, within=FIGURES)
+    if out is None and run is not None:
+        refuse_links(target.parent, target, target.with_suffix(".nc"))
+    if problem := unwritable(target.parent):
         problems.append(f"{problem}; give another place: --out FILE.")
     if problems:
         raise SpecError(problems)
@@ -114,7 +121,7 @@ def animate(
     )
     if target.exists():
         console.note(f"note: {target} was there already, and is replaced")
-    target.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(target.parent)
     console.note(f"{film.n_frames} frames, {film.n_frames / film.fps:.3g} s")
     console.result(f"animation: {save_animation(film, target)}")
     console.result(f"data: {save_data(film.figure, target)}")

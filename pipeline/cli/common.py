@@ -51,10 +51,13 @@ def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
 
 def check_csv(path: str | None) -> None:
     """Refuse a table that cannot be written, before anything is computed."""
+    from pipeline.cli.outputs import check_file
     from pipeline.spec.problems import SpecError
 
     if path not in (None, "-") and (Path(str(path)).is_dir() or not Path(str(path)).parent.is_dir()):
         raise SpecError([f"--csv {path}: must be a file in a folder that exists."])
+    if path not in (None, "-"):
+        check_file(Path(str(path)), "--csv")
 
 
 def tell(table: Table, csv: str | None, as_json: bool) -> None:
@@ -71,8 +74,13 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
         for line in table.lines:
             console.result(line)
     if csv not in (None, "-"):
-        with Path(str(csv)).open("w", newline="", encoding="utf-8") as file:
-            write_csv(table.rows, file)
+        from pipeline.cli.outputs import check_table
+        from pipeline.layout.writing import write_atomically
+
+        text = io.StringIO()
+        write_csv(table.rows, text)
+        check_table(Path(str(csv)), text.getvalue().partition("\n")[0])
+        write_atomically(Path(str(csv)), text.getvalue())
         console.note(f"table: {csv}")
 
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.cli.outputs import check_log
 from pipeline.products.reporting import reporting
 from pipeline.runs.progress import duration
 
@@ -90,6 +91,7 @@ def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
     stderr.setFormatter(_Visible())
     LOG.addHandler(stderr)
     if log is not None:
+        check_log(log)
         try:
             file = logging.FileHandler(log, encoding="utf-8")
         except OSError as error:

@@ -61,10 +61,12 @@ def fit_magnet(
 
 def _folder(path: Path) -> Path:
     """Refuse a place for results that cannot be, before anything is computed."""
+    from pipeline.cli.outputs import check_place
     from pipeline.spec.problems import SpecError
 
     if path.exists() and not path.is_dir():
         raise SpecError([f"--out {path}: is a file; give a folder."])
     if not path.parent.is_dir():
         raise SpecError([f"{path.parent}: no such folder; make it first."])
+    check_place(path)
     return path

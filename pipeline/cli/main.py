@@ -37,6 +37,9 @@ from pipeline.cli.simulate import EXTRA, simulate
 from pipeline.cli.submit import submit
 from pipeline.cli.zoom import zoom
 
+MOST_SAID, MOST_LINE = 2000, 600
+"""Bytes of a message, and characters of one of its lines."""
+
 app = typer.Typer(
     name="magpend",
     cls=TopGroup,
@@ -110,12 +113,26 @@ def _complain(error: BaseException) -> None:
 
     lines: list[Any] = getattr(error, "problems", None) or [str(error)]
     head = "magpend: " if len(lines) == 1 else f"magpend: {len(lines)} problems\n  "
-    text = head + "\n  ".join(map(str, lines))
+    text = _short(head + "\n  ".join(map(str, lines)))
     if LOG.handlers:
         LOG.error(text)
         LOG.debug("where it came from", exc_info=error)
     else:
         print(visible(text), file=sys.stderr)
+
+
+def _short(text: str) -> str:
+    """Cut a message to `MOST_SAID` bytes: long lines in the middle, then lines at the end."""
+    said: list[str] = []
+    size = 0
+    lines = visible(text).split("\n")
+    for n, line in enumerate(lines):
+        cut = line if len(line) <= MOST_LINE else f"{line[: MOST_LINE - 120]} ... {line[-115:]}"
+        size += len(cut.encode()) + 1
+        if size > MOST_SAID - 40:
+            return "\n".join([*said, f"  ... and {len(lines) - n} lines more."])
+        said.append(cut)
+    return "\n".join(said)
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ import typer
 from pipeline.cli.common import EXIT_HELP, Csv, Directory, Json, check_csv, json_rows, read_pairs, tell
 from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import speaking
+from pipeline.cli.outputs import check_place
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -229,6 +230,7 @@ def compare(
     from pipeline.runs.derive import AnalysedRun, refused
 
     _check_targets(None, csv)
+    check_place(out)
     way = _way(transient, window, window_s, hysteresis, max_period)
     pairs = read_pairs("--at", at or [], "q=1.5")
     run = AnalysedRun.of(directory, console.note)

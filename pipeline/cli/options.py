@@ -19,6 +19,7 @@ Command = Callable[..., None]
 
 QUIET = Annotated[bool, typer.Option("--quiet", "-q", help="Results and warnings alone.")]
 VERBOSE = Annotated[bool, typer.Option("--verbose", "-v", help="Say more, and show the trace of an error.")]
+FORCE = Annotated[bool, typer.Option("--force", help="Replace files that magpend has not written.")]
 LOGFILE = Annotated[
     Path | None, typer.Option("--log", metavar="FILE", help="Write a log, with times, to this file, too.")
 ]
@@ -35,11 +36,13 @@ _IMPORTED = "import_model"
 
 
 def speaking(command: Command) -> Command:
-    """Give a command ``--quiet``, ``--verbose``, ``--log`` and ``--import-model``, and show its progress."""
+    """Give a command the options that all have (see `_VOICES`), and show its progress."""
+    has_force = any(p.name == "force" for p in _own(command))
 
     def run(*args: Any, **given: Any) -> None:
-        from pipeline.cli import console
+        from pipeline.cli import console, outputs
 
+        outputs.allow(given["force"] if has_force else given.pop("force"))
         console.configure(**{name: given.pop(name) for name in _VOICES})
         if (path := given.pop(_IMPORTED)) is not None:
             from magpend_core.models import import_model
@@ -49,6 +52,8 @@ def speaking(command: Command) -> Command:
             command(*args, **given)
 
     voices = [_keyword(name, kind, default) for name, (kind, default) in _VOICES.items()]
+    if not has_force:
+        voices.append(_keyword("force", FORCE, False))
     voices.append(_keyword(_IMPORTED, IMPORT, None))
     return _signed(run, command, [*_own(command), *voices])
 

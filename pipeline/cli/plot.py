@@ -49,18 +49,22 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
     from pipeline.cli import console
     from pipeline.runs.drawing import drawn, ready
     from pipeline.store.errors import RefusedError
-    from pipeline.store.local import unwritable
+    from pipeline.store.files import FIGURES
+    from pipeline.store.local import make_folder, refuse_links, unwritable
 
     if options.out:
-        check_figure_path(_target_of(options))
+        check_figure_path(_target_of(options), FIGURES)
     run, wanted = ready(directory, name, options, console.note)
     target = _target_of(wanted) if wanted.out else _in_run(run.info.files, name, wanted)
+    if not wanted.out:
+        refuse_links(target.parent, target, target.with_suffix(".nc"))
     if problem := unwritable(target.parent):
         raise RefusedError(f"{problem}; give another place for the figure: --out FILE.")
     figure = drawn(run, name, wanted)
     from pipeline.plots import save_data, save_figure
 
-    target.parent.mkdir(parents=not wanted.out, exist_ok=True)
+    if not wanted.out:
+        make_folder(target.parent)
     console.result(f"figure: {save_figure(figure, target)}")
     console.result(f"data: {save_data(figure, target)}")
 
@@ -77,8 +81,9 @@ def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
     return folder / f"{name}{options.label()}.{options.format or 'png'}"
 
 
-def check_figure_path(path: Path) -> None:
-    """Refuse a path that cannot be written to, before anything is computed."""
+def check_figure_path(path: Path, within: str = "") -> None:
+    """Refuse a path that cannot be written to, before anything is computed; `within` as for `check_place`."""
+    from pipeline.cli.outputs import check_file
     from pipeline.spec.problems import SpecError
 
     suffixes = [f".{name}" for name in FORMATS]
@@ -86,3 +91,5 @@ def check_figure_path(path: Path) -> None:
         raise SpecError([f"{path}: the suffix must be one of {', '.join(suffixes)}."])
     if not path.parent.is_dir():
         raise SpecError([f"{path.parent}: no such folder; make it first."])
+    for file in (path, path.with_suffix(".nc")):
+        check_file(file, within=within)

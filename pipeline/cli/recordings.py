@@ -11,7 +11,9 @@ import typer
 from pipeline.cli.common import EXIT_HELP, Json, tell
 from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import speaking
+from pipeline.cli.outputs import check_file, check_place
 from pipeline.cli.plot import check_figure_path
+from pipeline.layout.writing import write_atomically
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -87,6 +89,7 @@ def convert(
     from pipeline.rig.recordings.writing import check_target
 
     check_target(out)
+    _check_recording(out)
     _keep(file, out)
     ds = _smoothed(_read(file, mapping, window), smooth, smoothing_window)
     with_mapping = out.suffix.lower() != ".nc"
@@ -94,7 +97,7 @@ def convert(
     beside = _beside(out, text) if with_mapping else out
     console.result(f"recording: {write_recording(ds, out)}")
     if with_mapping:
-        beside.write_text(text, encoding="utf-8")
+        write_atomically(beside, text)
         console.result(f"mapping: {beside}")
 
 
@@ -109,13 +112,14 @@ def simulate(
     from pipeline.spec.problems import SpecError
 
     check_target(out, SUFFIXES[:2])
+    _check_recording(out)
     beside = out.with_suffix(".toml")
     if beside.resolve() == spec.resolve():
         raise SpecError([f"--out {out}: its mapping would be written over {spec}; give another name."])
     raw, mapping = simulated(load_rig(spec), is_csv=out.suffix.lower() == ".csv")
     beside = _beside(out, mapping.toml())
     console.result(f"recording: {write_raw(raw, out)}")
-    beside.write_text(mapping.toml(), encoding="utf-8")
+    write_atomically(beside, mapping.toml())
     console.result(f"mapping: {beside}")
 
 
@@ -142,8 +146,9 @@ def drive(
     from pipeline.rig.recordings.writing import check_target
 
     check_target(out, (".csv",))
+    check_file(out)
     made = drive_file(_read(file, mapping, window), kind, tolerance=tolerance)
-    out.write_text(made.text, encoding="utf-8")
+    write_atomically(out, made.text)
     for note in made.notes:
         console.note(note)
     if made.timing is not None:
@@ -166,6 +171,13 @@ def _keep(file: Path, out: Path) -> None:
 
     if out.exists() and file.exists() and out.samefile(file):
         raise SpecError([f"--out {out}: is the file that is read; give another name."])
+
+
+def _check_recording(out: Path) -> None:
+    """Refuse a file that magpend has not written; with a mapping beside it is told by that, see `_beside`."""
+    check_place(out)
+    if not out.with_suffix(".toml").exists():
+        check_file(out)
 
 
 def _beside(out: Path, text: str) -> Path:

@@ -41,6 +41,7 @@ def report(
 
 def check_page(path: Path) -> None:
     """Refuse a page that cannot be written, before anything is computed."""
+    from pipeline.cli.outputs import check_file
     from pipeline.spec.problems import SpecError
     from pipeline.store.errors import RefusedError
     from pipeline.store.local import unwritable
@@ -49,5 +50,6 @@ def check_page(path: Path) -> None:
         raise SpecError([f"--out {path}: the suffix must be .html."])
     if path.is_dir() or not path.parent.is_dir():
         raise SpecError([f"--out {path}: must be a file in a folder that exists."])
+    check_file(path)
     if problem := unwritable(path.parent):
         raise RefusedError(f"{problem}; give another place for the page: --out FILE.")

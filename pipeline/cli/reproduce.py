@@ -73,12 +73,14 @@ def reproduce(
 
 def _check_folder(folder: Path) -> None:
     """Refuse a place that cannot be written to, before anything is computed."""
+    from pipeline.cli.outputs import check_place
     from pipeline.spec.problems import SpecError
     from pipeline.store.errors import RefusedError
     from pipeline.store.local import unwritable
 
     if folder.exists() and not folder.is_dir():
         raise SpecError([f"--out {folder}: is a file; give a folder."])
+    check_place(folder)
     there = next(place for place in (folder, *folder.absolute().parents) if place.is_dir())
     if problem := unwritable(there):
         raise RefusedError(f"{problem}; give another place: --out DIR.")

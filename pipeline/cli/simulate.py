@@ -71,12 +71,14 @@ def simulate(
     recording begins, and time is the recording's own.
     """
     from pipeline.cli import console
+    from pipeline.cli.outputs import check_file
     from pipeline.compute import simulate as simulation
     from pipeline.spec.models import find_model
     from pipeline.store.provenance import provenance, versions
 
     chosen = find_model(model, at="--model")
     simulation.check_output(out)
+    check_file(out)
     target = figure or out.with_suffix(".png")
     if not no_figure:
         check_figure_path(target)

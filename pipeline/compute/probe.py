@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
+from pipeline.layout.writing import TEMPORARY
 from pipeline.store.errors import StoreError
-from pipeline.store.files import COMMITS, TEMPORARY, open_files
+from pipeline.store.files import COMMITS, open_files
 
 PACKAGES = ("numpy", "numba", "zarr", "numcodecs", "dask", "distributed")
 _ROOMS = ("spec", "layout", "products", "compute", "store")

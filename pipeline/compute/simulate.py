@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -16,10 +17,11 @@ from magpend_core.models.model import Model, Quantity, State
 from magpend_core.models.presets import Preset
 from pipeline.layout.domains import check_states
 from pipeline.layout.vocabulary import model_attribute
+from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.spec.drives import RecordedDrive, load_drive
-from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.spec.problems import SpecError, unknown_name, validated
 from pipeline.spec.recorded import model_problems
-from pipeline.spec.tables import FREQUENCY
+from pipeline.spec.tables import FREQUENCY, Integration
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -256,20 +258,16 @@ def _state_problems(model: Model, state: Sequence[float]) -> list[str]:
 
 
 def _problems(series: Series) -> list[str]:
-    found = []
-    for name, value in {"rtol": series.rtol, "atol": series.atol}.items():
-        if not (math.isfinite(value) and value > 0):
-            found.append(f"{name} = {value!r}: must be a finite number greater than 0.")
-    if 0 < series.rtol < 1e-13:
-        found.append(f"rtol = {series.rtol!r}: must be at least 1e-13.")
+    found: list[str] = []
+    try:
+        # what a specification has too has its bounds there
+        validated(Integration, {"rtol": series.rtol, "atol": series.atol, "n_transient": series.n_transient})
+    except SpecError as error:
+        found += error.problems
     n_periods = DEFAULT_PERIODS if series.n_periods is None else series.n_periods
-    counts = {
-        "n_transient": (series.n_transient, 0), "n_periods": (n_periods, 1),
-        "samples_per_period": (series.samples_per_period, 1),
-    }  # fmt: skip
-    for name, (number, least) in counts.items():
-        if number < least:
-            found.append(f"{name} = {number!r}: must be at least {least}.")
+    for name, number in {"n_periods": n_periods, "samples_per_period": series.samples_per_period}.items():
+        if number < 1:
+            found.append(f"{name} = {number!r}: must be at least 1.")
     samples = n_periods * series.samples_per_period
     if samples > MAX_SAMPLES:
         found.append(f"n_periods * samples_per_period = {samples}: must be at most {MAX_SAMPLES}.")
@@ -288,11 +286,13 @@ def write_series(ds: xr.Dataset, path: Path) -> Path:
     """Write a series as CSV (names with units, 17 digits) or as NetCDF, by the suffix."""
     check_output(path)
     if path.suffix.lower() == ".nc":
-        ds.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
+        write_netcdf(path, ds)
         return path
     names = ["time", *map(str, ds.data_vars)]
     units = [re.sub(r"\W+", "_", ds[name].attrs["units"].replace("/", "_per_")) for name in names]
     table = np.column_stack([ds[name].values for name in names])
     header = ",".join(f"{name}_{unit}" for name, unit in zip(names, units, strict=True))
-    np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.17g")
+    text = io.StringIO()
+    np.savetxt(text, table, delimiter=",", header=header, comments="", fmt="%.17g")
+    write_atomically(path, text.getvalue())
     return path

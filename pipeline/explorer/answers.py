@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +21,8 @@ from pipeline.explorer.regions import zoom_toml
 from pipeline.explorer.tables import FORMATS, table
 from pipeline.explorer.verticals import verticals
 from pipeline.explorer.view import commands, describe_view
+
+LOG = logging.getLogger(__name__)
 
 JSON = "application/json; charset=utf-8"
 BINARY = "application/octet-stream"
@@ -153,6 +155,7 @@ def _zoom(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     except ValidationError as error:
         problems = [f"{'.'.join(map(str, p['loc'])) or 'body'}: {p['msg']}" for p in error.errors()[:5]]
         raise ExplorerError("; ".join(problems)) from None
+    run.check_axes(region.at)
     return Reply(zoom_toml(run, region).encode(), "text/plain; charset=utf-8")
 
 
@@ -174,8 +177,11 @@ ANSWERS: dict[str, Answer] = {
 
 def first_answers(run: ExploredRun, live: LiveRun | None) -> None:
     """Prepare what the page asks for first: the view, and the diagram that it begins with."""
-    with contextlib.suppress(Exception):  # whoever asks hears what is wrong
+    try:
         _view(run, Query({}), live)
         axis = next((a for a in run.axes if a.name == run.path), run.axes[0])
         at = {f"{_AT}{a.name}": "0" for a in run.axes if a.swept and a is not axis}
         _diagram(run, Query({"x": axis.name, "y": verticals(run)[0].name, **at}), live)
+    except Exception as error:  # whoever asks hears what is wrong, too
+        LOG.warning("the first picture could not be prepared: %s", error)
+        LOG.debug("where it came from", exc_info=True)

@@ -166,6 +166,13 @@ class ExploredRun(Run):
         """Sections that the cube keeps of each cell."""
         return int(self.plan.sizes["period_index"])
 
+    def check_axes(self, at: Mapping[str, int]) -> None:
+        """Refuse indices on axes that the run does not have; raises `ExplorerError`."""
+        known = [a.name for a in self.axes]
+        for name in at:
+            if name not in known:
+                raise ExplorerError(unknown_name("axis", name, known or ["none"]))
+
     def place(self, at: Mapping[str, int], *, but: str = "") -> dict[str, int]:
         """Return the index on every swept axis but one.
 

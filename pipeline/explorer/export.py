@@ -17,9 +17,10 @@ from pipeline.explorer.copy_html import inline_html
 from pipeline.explorer.explored import ExploredRun
 from pipeline.explorer.gather import Column, Copied, add_planes, column, gather
 from pipeline.explorer.packing import packed, packed_json
+from pipeline.layout.writing import write_atomically
 from pipeline.products.reporting import track
 from pipeline.store.errors import RefusedError
-from pipeline.store.local import unwritable, write_atomically
+from pipeline.store.local import refuse_place, unwritable
 from pipeline.store.run import Run
 
 MOST_BYTES = 20_000_000
@@ -140,6 +141,7 @@ def check_place(out: Path, force: bool) -> None:
     """
     if not out.parent.is_dir():
         raise RefusedError(f"{out.parent}: no such folder; make it first.")
+    refuse_place(out)
     if problem := unwritable(out.parent):
         raise RefusedError(f"{problem}; give another place.")
     if out.is_dir():

@@ -15,10 +15,11 @@ from pipeline.explorer.explored import ExploredRun
 from pipeline.explorer.export import MOST_ORBITS, Exported, add_all_orbits, finished, read_columns
 from pipeline.explorer.gather import Column, Copied, add_planes, gather, place_of
 from pipeline.explorer.verticals import vertical
+from pipeline.layout.writing import sync_folder, temporary_beside, writing
 from pipeline.store.consolidate import Layer, write_cube
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import CUBE, entry_of
-from pipeline.store.local import remove_tree, sync_folder, temporary_beside, unwritable
+from pipeline.store.local import refuse_place, remove_tree, unwritable
 from pipeline.store.run import Run
 
 INDEX, LIST, DATA, LICENCES = "index.html", "objects.json", "data", "LICENSES.txt"
@@ -68,8 +69,9 @@ def export_folder(
     check_folder(out, force)
     temporary = temporary_beside(out)
     try:
-        temporary.mkdir()
-        exported = _write(ExploredRun.of(source), temporary, quantities, most_orbits)
+        with writing(out):
+            temporary.mkdir()
+            exported = _write(ExploredRun.of(source), temporary, quantities, most_orbits)
         if out.exists():
             before = temporary_beside(out)
             out.rename(before)
@@ -94,6 +96,7 @@ def check_folder(out: Path, force: bool) -> None:
     """
     if not out.parent.is_dir():
         raise RefusedError(f"{out.parent}: no such folder; make it first.")
+    refuse_place(out.parent)
     if problem := unwritable(out.parent):
         raise RefusedError(f"{problem}; give another place.")
     if not (out.exists() or out.is_symlink()):

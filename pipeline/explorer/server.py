@@ -51,6 +51,8 @@ THREADS, MOST_WAITING = 3, 12
 """Requests that are worked on at once, and those that may wait besides."""
 
 PER_SECOND, BURST = 40.0, 120
+STRANGERS_PER_SECOND, STRANGERS_BURST = 4.0, 20
+"""Requests without the token, which are all refused."""
 """Requests that are answered."""
 
 STATIC = {
@@ -88,6 +90,8 @@ class Service:
 
         self.run = ExploredRun.of(run)
         self.guard, self.rate = guard, Rate(PER_SECOND, BURST)
+        self.strangers = Rate(STRANGERS_PER_SECOND, STRANGERS_BURST)
+        self.files = Rate(PER_SECOND, BURST)
         self.static = static_files()
         self.live_problem = live_problem(self.run)
         self.live = None if self.live_problem else LiveRun(self.run)
@@ -170,13 +174,19 @@ class Handler(web.RequestHandler):
     def prepare(self) -> None:
         """Refuse before anything is done."""
         guard, headers = self.service.guard, self.request.headers
-        if reason := guard.foreign(headers):
-            self.refuse(403, reason)
-        elif not self.service.rate.allows():
-            self.refuse(429, "too many requests; wait a moment")
-        elif len(self.request.uri or "") > MOST_ADDRESS:
+        if len(self.request.uri or "") > MOST_ADDRESS:
             self.refuse(414, "the address is too long")
-        elif self.needs_token and not guard.authorised(headers, self.get_query_argument("token", "")):
+            return
+        foreign = guard.foreign(headers)
+        known = not foreign and guard.authorised(headers, self.get_query_argument("token", ""))
+        # whoever has no token uses up nothing of those who have it
+        free = known or not self.needs_token
+        budget = self.service.rate if known else self.service.files if free else self.service.strangers
+        if foreign is None and not budget.allows():
+            self.refuse(429, "too many requests; wait a moment")
+        elif foreign is not None:
+            self.refuse(403, foreign)
+        elif not free:
             self.refuse(403, "the token is missing or wrong; use the address that magpend explore printed")
 
     def refuse(self, status: int, sentence: str) -> None:
@@ -257,6 +267,7 @@ class ApiHandler(Handler):
         def work() -> Any:
             if answer.fresh:
                 service.refresh()
+            service.run.check_axes(query.at)
             return answer.give(service.run, query, service.live)
 
         try:

@@ -19,6 +19,7 @@ from pipeline.explorer.overlays import attractors, branches, curves
 from pipeline.explorer.planes import plane_of
 from pipeline.explorer.verticals import vertical
 from pipeline.layout.vocabulary import told_by
+from pipeline.layout.writing import netcdf_bytes
 from pipeline.plots.files import with_provenance
 from pipeline.spec.problems import unknown_name
 from pipeline.store.run import Run
@@ -264,4 +265,4 @@ def _netcdf(run: ExploredRun, ds: xr.Dataset) -> bytes:
         "cube_digest": run.digest, **{k: str(v) for k, v in told_by(cube.attrs).items()},
     }  # fmt: skip
     filled = ds.drop_vars([name for name, variable in ds.variables.items() if variable.size == 0])
-    return bytes(with_provenance(filled, provenance).to_netcdf(engine="scipy", format="NETCDF3_64BIT"))
+    return netcdf_bytes(with_provenance(filled, provenance))

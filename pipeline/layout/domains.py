@@ -28,7 +28,8 @@ MOST_CORNERS = 64
 def check_starts(spec: Spec) -> None:
     """Refuse a run whose equations, as text, have no value at its starts.
 
-    They are evaluated at time 0 at all starts, or 4096 of them, for the ends of every axis.
+    They are evaluated at time 0 at all starts, or 4096 of them, for the ends of every axis. Where they have
+    values at some of the ends, cells without are told by their status.
 
     Raises
     ------
@@ -75,12 +76,20 @@ def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str,
     frequency = [p.get(FREQUENCY) or 1.0 for p in points]
     columns |= {"t": zero, "phase": zero, "f": np.repeat(frequency, n)}
     faults = domain_faults(model.definition, columns)
-    if faults:
+    parts = [{name: v[i * n : (i + 1) * n] for name, v in columns.items()} for i in range(len(points))]
+    # an axis may touch a pole: then cells of other parameters have values
+    if faults and (len(points) == 1 or all(domain_faults(model.definition, part) for part in parts)):
         raise SpecError([_sentence(model, fault, columns, n * len(points)) for fault in faults])
 
 
 def _sentence(model: Model, fault: Fault, columns: Mapping[str, np.ndarray], total: int) -> str:
     own = {n: v for n, v in fault.values.items() if n not in model.state_names}
+    if fault.is_constant:
+        at = ", ".join(f"{name} = {value:.6g}" for name, value in own.items())
+        return (
+            f"model.{fault.place}: {fault.part}: {fault.why}{' at ' if at else ''}{at}, in every state; "
+            "choose other values, or write the part otherwise."
+        )
     with_states = {name: columns[name][fault.row] for name in model.state_names}
     at = ", ".join(f"{name} = {value:.6g}" for name, value in {**with_states, **own}.items())
     share = f" ({fault.count} of {total} starts)" if total > 1 else ""

@@ -12,6 +12,7 @@ import matplotlib
 import xarray as xr
 from matplotlib.figure import Figure
 
+from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.plots.style import DPI, TEXT_LOCK, DataFigure
 
 SUFFIXES = (".png", ".pdf", ".svg")
@@ -64,7 +65,7 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
             fig.savefig(buffer, **options)
         else:
             _save_vectors(fig, buffer, options)
-    path.write_bytes(buffer.getvalue())
+    write_atomically(path, buffer.getvalue())
     return path
 
 
@@ -75,7 +76,7 @@ def save_data(fig: DataFigure, path: str | Path) -> Path:
     """
     target = Path(path).with_suffix(".nc")
     empty = [name for name, variable in fig.data.variables.items() if variable.size == 0]
-    fig.data.drop_vars(empty).to_netcdf(target, engine="scipy", format="NETCDF3_64BIT")
+    write_netcdf(target, fig.data.drop_vars(empty))
     return target
 
 

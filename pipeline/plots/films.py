@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, features
 
+from pipeline.layout.writing import temporary_beside, writing
 from pipeline.plots.animation import Animation, Pixels
 
 SUFFIXES = (".gif", ".webp", ".mp4")
@@ -69,11 +69,12 @@ def save_animation(film: Animation, path: str | Path) -> Path:
     path = Path(path)
     if problems := film_problems(path, film.fps):
         raise ValueError(" ".join(problems))
-    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    part = temporary_beside(path).with_suffix(path.suffix)  # Pillow and ffmpeg go by the suffix
     write = {".gif": _gif, ".webp": _webp, ".mp4": _mp4}[path.suffix.lower()]
     try:
-        write(film, part)
-        part.replace(path)
+        with writing(path):
+            write(film, part)
+            part.replace(path)
     finally:
         part.unlink(missing_ok=True)
     return path
@@ -82,7 +83,9 @@ def save_animation(film: Animation, path: str | Path) -> Path:
 def _about(film: Animation) -> str:
     """What the file says of itself."""
     attrs = film.figure.data.attrs
-    return "; ".join(f"{k}: {v}" for k, v in attrs.items() if k in ("title", "source", "run", "cube_digest"))
+    return "magpend; " + "; ".join(
+        f"{k}: {v}" for k, v in attrs.items() if k in ("title", "source", "run", "cube_digest")
+    )
 
 
 def durations(n: int, fps: float, grain_ms: int) -> list[int]:
@@ -130,7 +133,7 @@ def _webp(film: Animation, path: Path) -> None:
     first = next(images)
     first.save(
         path, save_all=True, append_images=images, loop=0, duration=durations(film.n_frames, film.fps, 1),
-        quality=75, method=4,
+        quality=75, method=4, xmp=_about(film).encode("utf-8"),
     )  # fmt: skip
 
 

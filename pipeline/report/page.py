@@ -195,7 +195,7 @@ def render(page: Page) -> str:
 
 def write(page: Page, path: Path) -> None:
     """Write a page; it is at its place whole or not at all."""
-    from pipeline.store.local import write_atomically
+    from pipeline.layout.writing import write_atomically
 
     write_atomically(path, render(page))
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.layout.writing import write_atomically
 from pipeline.report.measures import MEASURES, Estimate
 from pipeline.report.page import Block, Facts, Grid, Note, Outcome, Page, Part, Text, write
 from pipeline.report.pictures import picture
@@ -20,7 +21,6 @@ from pipeline.report.study import ClaimTable, FigureTable, Study
 from pipeline.report.verdicts import Verdict, judged
 from pipeline.runs.stopping import stoppable
 from pipeline.spec.problems import SpecError, unknown_name
-from pipeline.store.local import write_atomically
 from pipeline.store.provenance import versions
 
 PAGE, CLAIMS = "report.html", "claims.json"

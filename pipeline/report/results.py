@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.layout.writing import write_atomically
 from pipeline.report.study import Study
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
@@ -120,7 +121,7 @@ class Results:
             place = self.folder / "recordings" / f"{name}.csv"
             place.parent.mkdir(parents=True, exist_ok=True)
             write_raw(raw, place)
-            place.with_suffix(".toml").write_text(mapping.toml(), "utf-8")
+            write_atomically(place.with_suffix(".toml"), mapping.toml())
             self._recordings[name] = read_recording(place, mapping)
         return self._recordings[name]
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import itertools
 import math
+import tempfile
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -30,6 +32,22 @@ CLOSING_S = 0.8
 
 LEAST_PERIODS = 8
 NEVER_CLOSES = 1e-300
+
+
+START_S = 4.0
+"""Time until worker processes have started and have read what they need [s]."""
+
+DISPATCH_S = 0.02
+"""Time that handing out a task and taking its result takes, in all processes together [s]."""
+
+WRITTEN, WRITING_S = 20, 0.5
+"""Tasks that are written to see how long that takes, and the most time for it [s]."""
+
+MOST_WRITTEN_BYTES, MOST_WRITTEN_CELLS = 20_000_000, 1_000_000
+"""Size of a task and of a run beyond which writing is taken by the rule."""
+
+FILE_S = 0.004
+"""Time for writing a file by the rule [s]."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +92,56 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
         how += f"; a cell takes {periods:.0f} of at most {most:.0f} periods until it has closed"
     per_cell = ratio * mean_seconds_per_period(spec) * (periods + products)
     return Estimate(per_cell * plan.n_cells, how, compiled_s)
+
+
+def writing_seconds(spec: Spec, plan: Plan) -> float:
+    """Measure what writing a task takes, in a folder for temporary files; the run's disk may be slower.
+
+    Returns
+    -------
+    float
+        Time of a task's files and its commit record [s].
+    """
+    from pipeline.runs.run import identity_here
+    from pipeline.store.commits import write_task
+    from pipeline.store.keys import keys_of
+    from pipeline.store.setup import create
+
+    n_files = len(keys_of(plan, 0)) + 1
+    if plan.n_cells > MOST_WRITTEN_CELLS or plan.n_bytes / plan.n_tasks > MOST_WRITTEN_BYTES:
+        return n_files * FILE_S
+    rng, taken = np.random.default_rng(0), []
+    with tempfile.TemporaryDirectory(prefix="magpend-estimate-") as folder:
+        info = create(Path(folder) / "run", spec, plan, identity_here(spec, plan), "")
+        for index in range(min(WRITTEN, plan.n_tasks)):
+            shape = tuple(s.stop - s.start for s in plan.task(index))
+            values = {
+                v.name: rng.uniform(1, 5, (*shape, *(plan.sizes[d] for d in v.own_dims))).astype(v.dtype)
+                for v in plan.variables
+            }
+            started = time.perf_counter()
+            write_task(info, plan, index, values, {"bounded": plan.cells_in(index)})
+            taken.append(time.perf_counter() - started)
+            if sum(taken) > WRITING_S:
+                break
+    return float(np.median(taken))
+
+
+def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
+    """Time that a run takes by the clock [s].
+
+    Parameters
+    ----------
+    core_seconds
+        Time on one core, with writing [s].
+    n_tasks
+        Tasks that are left.
+    workers
+        Processes; 0 stands for this one.
+    """
+    if not workers:
+        return core_seconds
+    return START_S + (core_seconds + n_tasks * DISPATCH_S) / min(workers, n_tasks)
 
 
 def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *, pairs: bool) -> Inputs:

@@ -19,6 +19,7 @@ from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.writing import sync_folder
 from pipeline.runs.preview import time_line
 from pipeline.runs.progress import size
 from pipeline.runs.run import Echo, carry_out, identity_here
@@ -30,7 +31,6 @@ from pipeline.spec.parsing import Spec, load_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import EXTENDED, TIMINGS, Files, open_files
-from pipeline.store.local import sync_folder
 from pipeline.store.run import Run
 from pipeline.store.runfile import is_run
 

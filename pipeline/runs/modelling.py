@@ -17,6 +17,7 @@ from pipeline.spec.models import find_model, is_model_file
 from pipeline.spec.parsing import KINDS, Spec, load_spec
 from pipeline.spec.problems import SpecError
 from pipeline.spec.tables import FREQUENCY
+from pipeline.store.local import refuse_place
 
 if TYPE_CHECKING:
     from magpend_core.models.showing import Description
@@ -101,6 +102,7 @@ def write_template(path: Path | None) -> str:
         raise SpecError([f"{path}: the suffix must be .toml."])
     if not path.parent.is_dir():
         raise SpecError([f"{path.parent}: no such folder; make it first."])
+    refuse_place(path)
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)

@@ -9,7 +9,7 @@ from pipeline.layout.domains import check_starts
 from pipeline.layout.limits import check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
-from pipeline.runs.estimate import estimate
+from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.progress import duration, size
 from pipeline.runs.run import identity_here
 from pipeline.runs.workflows import default_directory, find_spec
@@ -111,14 +111,17 @@ def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int |
     if not share:
         return "time: nothing is left to compute"
     found = estimate(spec, plan)
-    seconds = share * found.core_seconds
-    cores = max(1, min(default_workers() if workers is None else workers, n_tasks))
+    writing_s = writing_seconds(spec, plan)
+    seconds = share * found.core_seconds + n_tasks * writing_s
+    used = default_workers() if workers is None else workers
+    cores, by_clock = max(1, min(used, n_tasks)), wall_seconds(seconds, n_tasks, used)
     bound = "about" if spec.refine is None else "at most"
     compiled = (
         f"; the kernel was compiled for it in {duration(found.compiled_s)}" if found.compiled_s > 1 else ""
     )
     whole = duration(found.core_seconds)
+    rests = f"{found.how}; writing a task takes {1000 * writing_s:.0f} ms{compiled}"
     return (
-        f"time: {bound} {duration(seconds)} of one core, {duration(seconds / cores)} on {cores} "
-        f"({found.how}{compiled}); analyse attractors may extend cells for up to {whole} of one core after it"
+        f"time: {bound} {duration(seconds)} of one core, {duration(by_clock)} on {cores} ({rests}); "
+        f"analyse attractors may extend cells for up to {whole} of one core after it"
     )

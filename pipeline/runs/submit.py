@@ -16,6 +16,7 @@ from pathlib import Path
 from pipeline.compute.jobqueue import jobs_folder
 from pipeline.layout.domains import check_starts
 from pipeline.layout.plan import make_plan
+from pipeline.layout.writing import write_atomically
 from pipeline.runs.batch import WORDS, coordinator_script, is_whole
 from pipeline.runs.run import identity_here
 from pipeline.runs.workflows import default_directory, find_spec
@@ -25,7 +26,6 @@ from pipeline.spec.problems import SpecError
 from pipeline.store.commits import read_commits
 from pipeline.store.errors import LockedError
 from pipeline.store.files import open_files
-from pipeline.store.local import write_atomically
 from pipeline.store.setup import check
 
 CLUSTER_FILE = "MAGPEND_CLUSTER"

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pipeline.layout.plan import make_plan
 from pipeline.spec.parsing import kept_spec
-from pipeline.store.checking import Verification, verify
-from pipeline.store.files import DERIVED
+from pipeline.store.checking import ODD, Verification, verify
+from pipeline.store.files import ASIDE, DERIVED
 from pipeline.store.packing import withdraw
 from pipeline.store.products import remove_product
 from pipeline.store.runfile import read_run
@@ -44,6 +44,8 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
         return verify(info, plan)
     with info.files.lock():
         found = verify(info, plan)
+        for key in found.odd:
+            info.files.move_aside(key)
         rest = rebuild_skeleton(info, spec, plan)
         withdraw(info, found.damaged)
         for name in found.derived:
@@ -55,8 +57,10 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
 def describe(found: Verification, directory: str | Path, *, repaired: bool) -> list[str]:
     """Return the lines to print."""
     lines = [f"{directory}: {found.n_committed} of {found.n_tasks} tasks committed and intact"]
+    odd = [f"{key}: {ODD}" for key in found.odd]
     lines += [
-        f"  damaged: {text}" for text in (*found.damaged.values(), *found.skeleton, *found.derived.values())
+        f"  damaged: {text}"
+        for text in (*odd, *found.damaged.values(), *found.skeleton, *found.derived.values())
     ]
     lines += [f"  rebuilt: {text}" for text in found.rebuilt]
     if found.leftovers:
@@ -72,6 +76,10 @@ def describe(found: Verification, directory: str | Path, *, repaired: bool) -> l
     if found.damaged and repaired:
         lines.append(
             f"{len(found.damaged)} records withdrawn: run the specification again to compute these tasks."
+        )
+    if found.odd:
+        lines.append(
+            f"{len(found.odd)} moved into {directory}/{ASIDE}." if repaired else "--repair moves these aside."
         )
     if found.derived and repaired:
         lines.append(f"{len(found.derived)} products removed: they are computed again when asked for.")

@@ -16,6 +16,7 @@ from pipeline.spec.problems import SpecError, unknown_name
 from pipeline.spec.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
 from pipeline.spec.tables import FREQUENCY, Range
 from pipeline.spec.toml import toml_key, toml_value
+from pipeline.store.local import refuse_place
 
 MARK = "(zoom)"
 _ORDER = ("parameters", "axes", "initial_conditions", "continuation", "integration", "products", "execution")
@@ -128,6 +129,7 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
         raise SpecError([f"{out}: the suffix must be .toml."])
     if not out.parent.is_dir():
         raise SpecError([f"{out.parent}: no such folder; make it first."])
+    refuse_place(out, "--out")
     spec, notes = zoom(source.spec, changes)
     text = f"# Zoom. Derived from {_one_line(source.origin)}.\n{to_toml(spec)}"
     if isinstance(spec.reference, Mapping) and (place := spec.reference.get(KEY)):

@@ -9,7 +9,9 @@ from typing import Any
 
 from pipeline.spec.problems import SpecError
 
-MOST_BYTES = 32_000_000
+MOST_BYTES = 1_000_000
+MOST_ELEMENTS = 100_000
+"""Elements of an array."""
 MOST_DEPTH = 32
 MOST_KEY = 200
 """Characters of a key."""
@@ -79,6 +81,11 @@ def odd_data(data: Any) -> list[str]:
                     return [f"{key[:40]}...: this key has {len(key)} characters; {MOST_KEY} are the most."]
                 todo.append((f"{place}.{key}" if place else key, inner, depth + 1))
         elif isinstance(value, (list, tuple)):
+            if len(value) > MOST_ELEMENTS:
+                return [
+                    f"{place[:MOST_KEY]}: has {len(value)} elements; {MOST_ELEMENTS} are the most of an "
+                    "array. Give ranges, or random starts with a seed."
+                ]
             todo += [(place, v, depth + 1) for v in value if not isinstance(v, (float, str, bool))]
         elif isinstance(value, int) and value not in WHOLE_NUMBERS:
             bits = value.bit_length()

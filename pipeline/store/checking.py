@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from pipeline.layout.plan import Plan
 from pipeline.products.reporting import report
 from pipeline.store.commits import absent_objects, leftover_keys, scan
 from pipeline.store.errors import DamagedError
-from pipeline.store.files import COMMITS, CUBE, DERIVED, problems_of
+from pipeline.store.files import COMMITS, CUBE, DERIVED, Files, problems_of
 from pipeline.store.products import products_in, read_product_attrs
 from pipeline.store.records import Records, marker_key
 from pipeline.store.runfile import RunInfo
+
+ODD = "is a folder where a file should be, or a file where a folder should be"
 
 _TASKS_PER_REPORT = 50
 
@@ -34,6 +37,8 @@ class Verification:
         Problem by name of products that are not what was written.
     rebuilt : list of str
         Problems of the skeleton that have been mended.
+    odd : list of str
+        Folders at the places of files, and files at the places of folders.
     """
 
     n_tasks: int
@@ -43,11 +48,12 @@ class Verification:
     leftovers: list[str]
     derived: dict[str, str] = field(default_factory=dict)
     rebuilt: list[str] = field(default_factory=list)
+    odd: list[str] = field(default_factory=list)
 
     @property
     def sound(self) -> bool:
         """Whether all that is committed is intact, and all products are."""
-        return not self.damaged and not self.skeleton and not self.derived
+        return not (self.damaged or self.skeleton or self.derived or self.odd)
 
 
 def verify(info: RunInfo, plan: Plan) -> Verification:
@@ -70,7 +76,22 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
         skeleton=problems_of(info.files.below(CUBE), info.skeleton),
         leftovers=sorted(key for key in leftovers if key not in named),
         derived=damaged_products(info),
+        odd=odd_keys(info.files, info.skeleton),
     )
+
+
+def odd_keys(files: Files, skeleton: Iterable[str]) -> list[str]:
+    """Return folders at the places of files, and files at the places of folders.
+
+    Parameters
+    ----------
+    files
+        Of the run directory.
+    skeleton
+        Keys of the set-up's files, below the cube.
+    """
+    folders = dict.fromkeys(key.rpartition("/")[0] for key in skeleton)
+    return files.odd([CUBE, *(f"{CUBE}/{folder}" for folder in folders if folder), COMMITS])
 
 
 def name_of(index: int) -> str:

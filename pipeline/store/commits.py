@@ -20,8 +20,9 @@ import numpy as np
 import zarr
 
 from pipeline.layout.plan import Plan
-from pipeline.store.errors import DamagedError
-from pipeline.store.files import COMMITS, CUBE, TIMINGS, Files, LinkError, entries_of, problems_of
+from pipeline.layout.writing import NoFileError, writing
+from pipeline.store.errors import DamagedError, RefusedError, UnreadableError
+from pipeline.store.files import COMMITS, CUBE, RUN_FILE, TIMINGS, Files, entries_of, problems_of
 from pipeline.store.keys import Owners, chunk_keys
 from pipeline.store.records import (
     BLOCK,
@@ -40,6 +41,9 @@ from pipeline.store.records import (
 from pipeline.store.runfile import RunInfo
 
 Echo = Callable[[str], None]
+
+_MOST_SCANS = 100
+"""Times that records are read anew because some were packed meanwhile."""
 
 
 # ---- writing -----------------------------------------------------------------------------------
@@ -81,6 +85,10 @@ def write_task(
         "status": dict(counts),
         "objects": entries_of(cube, objects),
     }
+    # in an object store nobody removes a folder under a run, and every question is a request
+    if info.files.local is not None and not info.files.is_there(RUN_FILE):
+        cube.remove(objects)
+        raise RefusedError(f"{info.name}: was removed while it was computed; give the command again.")
     if not is_packed(info, index):  # else somebody has committed these very bytes before
         info.files.write_once(marker_key(index), record_text(record).encode())
 
@@ -118,7 +126,9 @@ def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarr
             f"{name}: {values.dtype} {values.shape} where the store has {array.dtype} {expected}."
         )
     keys = chunk_keys(name, region, array.chunks, array.shape)
-    array[region] = values
+    cube.refuse_links(*keys)
+    with writing(f"{cube.name}/{name}"):
+        array[region] = values
     return keys
 
 
@@ -198,19 +208,23 @@ def scan(info: RunInfo, plan: Plan, blocks: Container[int] | None = None) -> tup
     info.files.refuse_links(COMMITS)
     folder = info.files.below(COMMITS)
     names = _names(folder)
-    while True:
+    for _ in range(_MOST_SCANS):
         found = _Scan(info, plan, blocks)
         vanished = found.read(folder, names)
         before, names = names, _names(folder)
         # while this was reading, the records of a block may have moved into their pack
         if not vanished and _packs(before) == _packs(names):
             return Records(info.files, info.digest, found.singles, found.packs), found.rejected
+    raise UnreadableError(
+        f"{folder.name}: changes while it is read, {_MOST_SCANS} times in a row; look who writes there, then "
+        "give the same command again."
+    )
 
 
 def _names(folder: Files) -> list[str]:
     try:
         return folder.names()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return []
 
 
@@ -251,8 +265,8 @@ class _Scan:
         return self._asked(int(stem) // BLOCK) and (pack is None or int(stem) in pack.without)
 
     def _take(self, name: str, content: bytes | FileNotFoundError, read: Callable[[str, bytes], str]) -> bool:
-        if isinstance(content, LinkError):
-            self.rejected[name] = "is a link"
+        if isinstance(content, NoFileError):
+            self.rejected[name] = str(content)
         elif isinstance(content, FileNotFoundError):
             return True
         elif problem := read(name, content):

@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from pipeline.layout.writing import TEMPORARY, NoFileError
 from pipeline.store.errors import RefusedError
 
 if TYPE_CHECKING:
@@ -16,16 +17,12 @@ if TYPE_CHECKING:
 
 RUN_FILE, CUBE, COMMITS, LOCK, TIMINGS = "run.json", "cube.zarr", "commits", "lock", "timings.jsonl"
 HOLDER = "lock.json"
-DERIVED, FIGURES, EXTENDED = "derived", "figures", "extended.json"
-OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, HOLDER, TIMINGS, DERIVED, FIGURES, EXTENDED})
-TEMPORARY = ".tmp"
+DERIVED, FIGURES, EXTENDED, ASIDE = "derived", "figures", "extended.json", "aside"
+OWN_FILES = (RUN_FILE, HOLDER, TIMINGS, EXTENDED)
+OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, HOLDER, TIMINGS, DERIVED, FIGURES, EXTENDED, ASIDE})
 
 # one letter before the colon is a drive; pathlib makes one slash of two
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
-
-
-class LinkError(FileNotFoundError):
-    """A link is where a file should be; it is not followed."""
 
 
 class Files(Protocol):
@@ -79,8 +76,8 @@ class Files(Protocol):
         ------
         FileNotFoundError
             If there is none.
-        LinkError
-            If a link is there.
+        NoFileError
+            If a link, a folder or another thing that is no file is there.
         """
         ...
 
@@ -118,6 +115,20 @@ class Files(Protocol):
 
     def prepare(self, prefix: str) -> None:
         """Make a folder, where there are folders."""
+        ...
+
+    def odd(self, folders: Iterable[str]) -> list[str]:
+        """Keys of folders at the places of files, and of files at the places of folders.
+
+        Parameters
+        ----------
+        folders
+            All that should be folders.
+        """
+        ...
+
+    def move_aside(self, key: str) -> str:
+        """Move something out of the way, into a folder `ASIDE`; returns where it lies now."""
         ...
 
     def refuse_links(self, *prefixes: str) -> None:
@@ -221,8 +232,8 @@ def problems_of(files: Files, objects: Mapping[str, Mapping[str, Any]]) -> list[
     """
     problems = []
     for key, content in files.read_each(objects):
-        if isinstance(content, LinkError):
-            problems.append(f"{key}: is a link")
+        if isinstance(content, NoFileError):
+            problems.append(f"{key}: {content}")
         elif isinstance(content, FileNotFoundError):
             problems.append(f"{key}: missing")
         elif entry_of(content) != dict(objects[key]):

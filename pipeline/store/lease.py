@@ -49,6 +49,11 @@ def _holder_in(content: bytes) -> dict[str, Any] | None:
     return data if all(text.isprintable() for text in (data["host"], data["since"])) else None
 
 
+def is_note(content: bytes) -> bool:
+    """Whether a content says who holds a lock."""
+    return _holder_in(content) is not None
+
+
 def _has_ended(content: bytes) -> bool:
     """Whether a holder was a process of this machine that is no more."""
     found = _holder_in(content)

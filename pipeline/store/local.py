@@ -17,8 +17,9 @@ from pathlib import Path
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
+from pipeline.layout.writing import open_plain, sync_folder, write_atomically, writing
 from pipeline.store.errors import LockedError, RefusedError, UnreadableError
-from pipeline.store.files import HOLDER, LOCK, TEMPORARY, LinkError
+from pipeline.store.files import ASIDE, COMMITS, CUBE, HOLDER, LOCK, OWN_FILES, OWN_NAMES, RUN_FILE
 from pipeline.store.lease import holder, in_words
 
 
@@ -59,13 +60,9 @@ class LocalFiles:
     def read(self, key: str) -> bytes:
         """Content of a plain file."""
         path = self.root / key
-        with unreadable(path):
-            mode = path.lstat().st_mode
-            if stat.S_ISLNK(mode):
-                raise LinkError(f"{path}: is a link")
-            if not stat.S_ISREG(mode):
-                raise FileNotFoundError(f"{path}: is no file")
-            return path.read_bytes()
+        with unreadable(path), open_plain(path, "rb") as file:
+            content: bytes = file.read()
+        return content
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
         """Contents, or why there is none, in the order of the keys."""
@@ -78,7 +75,9 @@ class LocalFiles:
     def write(self, key: str, content: bytes) -> None:
         """Write a file whole or not at all, durable when this returns."""
         path = self.root / key
-        make_folder(path.parent)
+        with writing(path):
+            self.root.stat()  # one that somebody has removed is not made again
+            make_folder(path.parent)
         write_atomically(path, content)
 
     def write_once(self, key: str, content: bytes) -> None:
@@ -87,20 +86,21 @@ class LocalFiles:
 
     def append(self, key: str, line: str) -> None:
         """Add a line to a file that is no part of the result; not synced."""
-        with (self.root / key).open("a", encoding="utf-8") as file:
+        path = self.root / key
+        with writing(path), open_plain(path, "a", encoding="utf-8") as file:
             file.write(line + "\n")
 
     def sizes(self) -> dict[str, int]:
         """Size of every plain file below by key; nothing if there is no folder."""
         self.refuse_links("")
         found: dict[str, int] = {}
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             _measure(self.root, "", found)
         return found
 
     def everything(self) -> list[str]:
         """Keys of all that is below and is no folder, links too; nothing if there is no folder."""
-        with unreadable(self.root), contextlib.suppress(FileNotFoundError):
+        with unreadable(self.root), contextlib.suppress(FileNotFoundError, NotADirectoryError):
             return [path.relative_to(self.root).as_posix() for path in files_below(self.root)]
         return []
 
@@ -108,9 +108,10 @@ class LocalFiles:
         """Remove files and links, not what these lead to; one that is gone already is no error."""
         paths = [self.root / key for key in keys]
         for path in paths:
-            path.unlink(missing_ok=True)
+            with writing(path):
+                path.unlink(missing_ok=True)
         for folder in sorted({path.parent for path in paths}):
-            with contextlib.suppress(FileNotFoundError):
+            with contextlib.suppress(FileNotFoundError), writing(folder):
                 sync_folder(folder)
 
     def sync(self, keys: Iterable[str]) -> None:
@@ -120,7 +121,33 @@ class LocalFiles:
     def prepare(self, prefix: str) -> None:
         """Make a folder if it is not there; it and this one are durable then."""
         make_folder(self.root / prefix)
-        sync_folder(self.root.parent)
+        with writing(self.root):
+            sync_folder(self.root.parent)
+
+    def odd(self, folders: Iterable[str]) -> list[str]:
+        """Folders at the places of files, and files at the places of folders."""
+        found, expected = [], list(folders)
+        for folder in expected:
+            path = self.root / folder
+            if path.is_dir():
+                with unreadable(path), os.scandir(path) as entries:
+                    below = sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
+                found += [key for name in below if (key := f"{folder}/{name}") not in expected]
+            elif os.path.lexists(path) and not path.is_symlink():
+                found.append(folder)
+        return found + [name for name in OWN_FILES if os.path.isdir(self.root / name)]
+
+    def move_aside(self, key: str) -> str:
+        """Move something into a folder of this one."""
+        path = self.root / key
+        target = self.root / ASIDE / f"{key.replace('/', '-')}.{uuid.uuid4().hex[:8]}"
+        refuse_links(target.parent)
+        make_folder(target.parent)
+        with writing(path):
+            path.rename(target)
+            sync_folder(path.parent)
+            sync_folder(target.parent)
+        return str(target)
 
     def refuse_links(self, *prefixes: str) -> None:
         """Refuse folders that are links."""
@@ -165,23 +192,15 @@ def make_folder(path: Path) -> None:
     if path.is_dir():
         return
     make_folder(path.parent)
-    path.mkdir(exist_ok=True)
-    sync_folder(path.parent)
+    with writing(path):
+        path.mkdir(exist_ok=True)
+        sync_folder(path.parent)
 
 
 def sync_file(path: Path) -> None:
     """Have a file's content on the disk."""
-    with path.open("rb") as file:
+    with writing(path), open_plain(path, "rb") as file:
         os.fsync(file.fileno())
-
-
-def sync_folder(path: Path) -> None:
-    """Have a folder's entries on the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def sync(files: Iterable[Path], top: Path) -> None:
@@ -191,28 +210,8 @@ def sync(files: Iterable[Path], top: Path) -> None:
         sync_file(file)
         folders.update(p for p in file.parents if p == top or top in p.parents)
     for folder in sorted(folders, key=lambda p: -len(p.parts)):
-        sync_folder(folder)
-
-
-def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a small file so that after a crash it is there whole or not at all."""
-    temporary = temporary_beside(path)
-    try:
-        with temporary.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
-
-
-def temporary_beside(path: Path) -> Path:
-    """A name that nobody else has, in the same folder."""
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
+        with writing(folder):
+            sync_folder(folder)
 
 
 def files_below(folder: Path) -> Iterator[Path]:
@@ -262,20 +261,54 @@ def unreadable(path: Path) -> Iterator[None]:
         ) from error
 
 
-def refuse_links(*folders: Path) -> None:
-    """Refuse to work below a link: what it leads to is not the run's own.
+def refuse_links(*paths: Path) -> None:
+    """Refuse a link: what it leads to is not the run's own.
 
     Raises
     ------
     RefusedError
         Naming the link.
     """
-    for folder in folders:
-        if folder.is_symlink():
+    for path in paths:
+        if path.is_symlink():
             raise RefusedError(
-                f"{folder}: is a link, which magpend does not follow inside of a run directory; put the "
-                "folder itself there. The run directory as a whole may be a link."
+                f"{path}: is a link, which magpend does not follow inside of a run directory; remove it, or "
+                "put the file or folder itself there. The run directory as a whole may be a link."
             )
+
+
+def run_around(path: Path) -> Path | None:
+    """Return the run directory that a path lies in, or is; None if it lies in none."""
+    real = path.absolute().resolve()
+    for folder in (real, *real.parents):
+        if sum(os.path.lexists(folder / name) for name in (RUN_FILE, CUBE, COMMITS)) >= 2:
+            return folder
+    return None
+
+
+def refuse_place(path: Path, option: str = "", within: str = "") -> None:
+    """Refuse a place for results that lies inside of a run directory, or is a link that leads nowhere.
+
+    Parameters
+    ----------
+    path
+        A file or a folder, there or not.
+    option
+        What names it, for the message.
+    within
+        Folder of a run directory in which it may lie.
+
+    Raises
+    ------
+    RefusedError
+        Saying which it is.
+    """
+    name = f"{option} {path}".strip()
+    if path.is_symlink() and not path.exists():
+        raise RefusedError(f"{name}: is a link that leads nowhere; remove it, or give another name.")
+    run = run_around(path)
+    if run is not None and not (within and path.absolute().parent.resolve() == run / within):
+        raise RefusedError(f"{name}: lies inside of the run directory {run}; give a place outside of it.")
 
 
 def remove_tree(path: Path) -> None:
@@ -300,14 +333,16 @@ def writer_lock(directory: Path) -> Iterator[bool]:
     """
     from filelock import FileLock, Timeout
 
-    directory.mkdir(parents=True, exist_ok=True)
+    with writing(directory):
+        directory.mkdir(parents=True, exist_ok=True)
+    refuse_links(*(directory / name for name in sorted(OWN_NAMES)))
     lock = FileLock(directory / LOCK)
     try:
         lock.acquire(timeout=0)
     except Timeout:
         said = b""
-        with contextlib.suppress(OSError):
-            said = (directory / HOLDER).read_bytes()
+        with contextlib.suppress(OSError), open_plain(directory / HOLDER, "rb") as file:
+            said = file.read()
         raise LockedError(
             f"{directory}: another magpend run is writing here{in_words(said)}. Wait for it or stop it, then "
             "run again."
@@ -328,10 +363,12 @@ def _named(path: Path) -> Iterator[None]:
     """Say beside a lock who holds it, for those who ask in vain; a process that is killed leaves it there."""
     content = json.dumps(holder()).encode()
     with contextlib.suppress(OSError):
-        path.write_bytes(content)
+        write_atomically(path, content)
     try:
         yield
     finally:
         with contextlib.suppress(OSError):
-            if path.read_bytes() == content:  # the folder may have been renamed meanwhile
+            with open_plain(path, "rb") as file:
+                is_own = file.read() == content  # the folder may have been renamed meanwhile
+            if is_own:
                 path.unlink()

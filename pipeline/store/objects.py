@@ -253,6 +253,14 @@ class ObjectFiles:
     def prepare(self, prefix: str) -> None:
         """Do nothing: there are no folders."""
 
+    def odd(self, folders: Iterable[str]) -> list[str]:
+        """Return nothing: there are no folders."""
+        return []
+
+    def move_aside(self, key: str) -> str:
+        """Do nothing: there are no folders in the way."""
+        return key
+
     def refuse_links(self, *prefixes: str) -> None:
         """Do nothing: there are no links."""
 

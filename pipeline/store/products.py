@@ -22,18 +22,12 @@ from zarr.core.buffer import cpu
 from zarr.storage import LocalStore, MemoryStore
 
 from pipeline.layout.attributes import netcdf_safe
+from pipeline.layout.writing import TEMPORARY, sync_folder, temporary_beside, writing
 from pipeline.store.arrays import create_array
 from pipeline.store.declared import product_problem
 from pipeline.store.errors import DamagedError, UnreadableError
-from pipeline.store.files import TEMPORARY, Files, open_files
-from pipeline.store.local import (
-    files_below,
-    refuse_links,
-    remove_tree,
-    sync,
-    sync_folder,
-    temporary_beside,
-)
+from pipeline.store.files import Files, open_files
+from pipeline.store.local import files_below, refuse_links, remove_tree, sync
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -42,6 +36,9 @@ SEAL = "content_sha256"
 """Attribute of a product: digest of its other attributes and of all its files but the one that holds it."""
 
 _WORDS = "words"
+_MOST_TRIES = 20
+"""Times that a product at the place of a new one is removed before the new one is given up."""
+
 _PRODUCT_CHUNK_BYTES = 16_000_000
 _GROUP = "zarr.json"
 
@@ -69,13 +66,14 @@ def write_product(place: Place, ds: xr.Dataset) -> None:
         return
     path = files.local
     refuse_links(path.parent)
-    path.parent.mkdir(exist_ok=True)
     temporary = temporary_beside(path)
     try:
-        attrs = _write_group(LocalStore(temporary), ds, lambda: _digests(open_files(temporary)))
-        sync(files_below(temporary), temporary)
-        _put_in_place(temporary, path, attrs)
-        sync_folder(path.parent)
+        with writing(path):
+            path.parent.mkdir(exist_ok=True)
+            attrs = _write_group(LocalStore(temporary), ds, lambda: _digests(open_files(temporary)))
+            sync(files_below(temporary), temporary)
+            _put_in_place(temporary, path, attrs)
+            sync_folder(path.parent)
     finally:
         remove_tree(temporary)
 
@@ -219,7 +217,7 @@ def products_in(files: Files) -> list[Files]:
     files.refuse_links("")
     try:
         names = files.names()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return []
     return [files.below(name) for name in names if name.endswith(".zarr") and not name.startswith(".")]
 
@@ -230,17 +228,18 @@ def _own(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 
 def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None:
     """Rename a finished product; a damaged or another one at its place makes way."""
-    while True:
+    for _ in range(_MOST_TRIES):
         try:
             temporary.rename(path)
             return
         except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
                 raise
         with contextlib.suppress(FileNotFoundError, DamagedError):
             if _own(read_product_attrs(path)) == attrs:
                 return
         remove_product(path)
+    temporary.rename(path)
 
 
 def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -> dict[str, Any]:

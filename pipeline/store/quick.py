@@ -1,6 +1,8 @@
 """Reading very many small chunks: without a coroutine for every step of every chunk, as zarr has them.
 
-What is read and decoded here is what zarr would have read and decoded; all it cannot do goes to zarr.
+What is read and decoded here is what zarr would have read and decoded; all it cannot do goes to zarr. It
+builds on the class of pipeline that is registered, and on `read` as `zarr.abc.codec.CodecPipeline` describes
+it; a chunk that comes in another form goes to zarr too.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ import numcodecs.blosc
 import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
-from zarr.core.codec_pipeline import BatchedCodecPipeline
-from zarr.registry import register_pipeline
+from zarr.registry import get_pipeline_class, register_pipeline
+from zarr.storage import StorePath
 
 from pipeline.store.view import CommittedStore
 
@@ -24,13 +26,16 @@ _BATCH = 200
 _CHECKSUM_BYTES = 4
 
 
-class QuickPipeline(BatchedCodecPipeline):
+_Registered: Any = get_pipeline_class()
+
+
+class QuickPipeline(_Registered):  # type: ignore[misc]
     """zarr's own way to read, but for small chunks of a `CommittedStore` in a local folder."""
 
     async def read(self, batch_info: Iterable[Any], out: Any, drop_axes: tuple[int, ...] = ()) -> None:
         """Put chunks where they belong in `out`; see zarr."""
         items = list(batch_info)
-        if len(items) > 1 and not drop_axes and tuple(type(codec) for codec in self) == _CHAIN:
+        if len(items) > 1 and not drop_axes and _codecs_of(self) == _CHAIN:
             target = out.as_ndarray_like()
             batches = [items[i : i + _BATCH] for i in range(0, len(items), _BATCH)]
             # threads: a disk, or a server, is asked for many files at a time
@@ -40,6 +45,11 @@ class QuickPipeline(BatchedCodecPipeline):
             await super().read(items, out, drop_axes)
 
 
+def _codecs_of(pipeline: Any) -> tuple[type, ...]:
+    """Types of a pipeline's codecs in their order; none if it does not list them."""
+    return tuple(type(codec) for codec in pipeline) if isinstance(pipeline, Iterable) else ()
+
+
 def _put_all(items: list[Any], target: np.ndarray) -> list[Any]:
     """Decode chunks into an array; returns those that are left to zarr."""
     return [item for item in items if not _put(item, target)]
@@ -47,7 +57,7 @@ def _put_all(items: list[Any], target: np.ndarray) -> list[Any]:
 
 def _put(item: Any, target: np.ndarray) -> bool:
     place, spec, chunk_selection, selection, *_ = item
-    if not isinstance(place.store, CommittedStore):
+    if not (isinstance(place, StorePath) and isinstance(place.store, CommittedStore)):
         return False
     content = place.store.small_chunk(place.path)
     if content is None:

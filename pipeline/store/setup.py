@@ -10,23 +10,28 @@ from typing import Any
 from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan
 from pipeline.spec.parsing import Spec
-from pipeline.store.checking import verify
+from pipeline.store.checking import ODD, odd_keys, verify
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import (
     COMMITS,
     CUBE,
+    HOLDER,
     OWN_NAMES,
     RUN_FILE,
+    TIMINGS,
     Files,
     is_temporary,
     open_files,
 )
+from pipeline.store.lease import is_note
+from pipeline.store.local import run_around
 from pipeline.store.packing import withdraw
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
 from pipeline.store.skeleton import (
     GROUP_KEY,
     entries_of,
     skeleton_files,
+    skeleton_keys,
     skeleton_problems,
     write_skeleton,
 )
@@ -48,13 +53,15 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
         If another run is there (with the difference), or something else.
     """
     files = open_files(place)
+    if files.local is not None:
+        _refuse_place(files.local)
     try:
         names = files.names()
     except NotADirectoryError:
         raise RefusedError(f"{files.name}: is a file; give another --out.") from None
     except FileNotFoundError:
         return None
-    files.refuse_links(CUBE, COMMITS)
+    files.refuse_links(*sorted(OWN_NAMES))
     try:
         info = read_run(files) if is_run(files) else None
     except DamagedError:
@@ -71,6 +78,15 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
     return info
 
 
+def _refuse_place(folder: Path) -> None:
+    """Refuse a link that leads nowhere, and a place inside of another run directory."""
+    if folder.is_symlink() and not folder.exists():
+        raise RefusedError(f"{folder}: is a link that leads nowhere; remove it, or give another --out.")
+    outer = run_around(folder.absolute().resolve().parent)
+    if outer is not None:
+        raise RefusedError(f"{folder}: lies inside of the run directory {outer}; give another --out.")
+
+
 def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
     """Refuse a directory without a sound ``run.json`` unless it is empty or provably this run's."""
     foreign = [name for name in names if not _is_own(name)]
@@ -80,6 +96,7 @@ def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
         )
     held = [name for name in (RUN_FILE, CUBE, COMMITS) if _holds_something(files, name)]
     if not held:
+        _refuse_notes(files)
         return
     found = _digests(files)
     if found - {digest}:
@@ -95,8 +112,25 @@ def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
         )
 
 
+def _refuse_notes(files: Files) -> None:
+    """Refuse a lock's note or timings that no run has left: they would be replaced, or added to."""
+    for name, is_own in ((HOLDER, is_note), (TIMINGS, _is_timings)):
+        for _, content in files.read_each([name]):
+            if isinstance(content, bytes) and not is_own(content):
+                raise RefusedError(f"{files.name}: has a {name} that no run has left; give another --out.")
+
+
+def _is_timings(content: bytes) -> bool:
+    """Whether a file begins as ``timings.jsonl`` does, or is empty."""
+    try:
+        first = json.loads(content.split(b"\n")[0] or b'{"task": 0}')
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(first, dict) and "task" in first
+
+
 def _is_own(name: str) -> bool:
-    return name in OWN_NAMES or (name.startswith(f".{RUN_FILE}") and is_temporary(name))
+    return name in OWN_NAMES or (name.startswith((f".{RUN_FILE}", f".{HOLDER}")) and is_temporary(name))
 
 
 def _names(files: Files) -> list[str]:
@@ -107,13 +141,14 @@ def _names(files: Files) -> list[str]:
 
 
 def _holds_something(files: Files, name: str) -> bool:
-    """Whether something is there but an empty folder, or what a set-up was writing when it was stopped."""
+    """Whether something is there but empty folders, or what a set-up was writing when it was stopped."""
     if name not in _names(files):
         return False
     try:
-        return not all(is_temporary(below) for below in files.below(name).names())
+        files.below(name).names()
     except (FileNotFoundError, NotADirectoryError):
         return True
+    return not all(is_temporary(key.rpartition("/")[2]) for key in files.below(name).everything())
 
 
 def _digests(files: Files) -> set[str]:
@@ -176,10 +211,13 @@ def establish(
         As `check`.
     """
     files = open_files(place)
+    for key in odd_keys(files, skeleton_keys(spec, plan)):
+        echo(f"{key}: {ODD}; moved to {files.move_aside(key)}")
     info = check(files, identity)
     names = _names(files)
     if alone:  # else somebody may be writing it just now
-        files.remove([name for name in names if name.startswith(f".{RUN_FILE}.")])
+        left = (f".{RUN_FILE}.", f".{HOLDER}.")
+        files.remove([name for name in names if name.startswith(left)])
     if COMMITS not in names:
         files.prepare(COMMITS)
     if info is None:

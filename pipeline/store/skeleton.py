@@ -61,6 +61,12 @@ def skeleton_files(
     return {key: data[key].to_bytes() for key in keys}
 
 
+def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
+    """Keys of the metadata of all variables and coordinates."""
+    names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(spec), *_labels(spec))]
+    return [f"{name}/{GROUP_KEY}" for name in names]
+
+
 def _labels(spec: Spec) -> list[Coordinate]:
     """Names along the dims that are not cell dims."""
     model = spec.model

@@ -51,6 +51,7 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
         layers=functions["layers"] if derived.layers else None,  # type: ignore[arg-type]
         has_layers=bool(derived.layers),
         timed_layers=derived.timed_layers,
+        has_poles=True,  # what is bad input was refused before: see `domains`
         layers_fade=all(layer.steep.form in FADING for layer in derived.layers),
         n_modes=source.n_modes,
         n_switches=n_switches,

@@ -6,7 +6,7 @@ Looked for before anything is derived or compiled, by numpy on the text as it wa
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,8 @@ class Fault:
         Values there of the names in the part.
     count : int
         Number of the points at which it happens.
+    is_constant : bool
+        Whether it needs neither state nor time: then it is no matter of the start.
     """
 
     place: str
@@ -45,6 +47,7 @@ class Fault:
     row: int
     values: Mapping[str, float]
     count: int
+    is_constant: bool = False
 
 
 def domain_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fault]:
@@ -61,8 +64,67 @@ def domain_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
     -------
     list of Fault
         The innermost part of each, in the order of the text. A branch of `where` counts at the points where
-        it is taken.
+        it is taken; in parts without states and time, which impacts and quantities have too, also where the
+        state may take it later.
     """
+    return (_constant_faults(definition, values) or _start_faults(definition, values))[:MAX_FAULTS]
+
+
+def _constant_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fault]:
+    """Find parts of a text that need no state and no time, and have no finite value."""
+    places = {f"equations.{name}": tree for name, tree in definition.equations.items()}
+    for i, impact in enumerate(definition.impacts):
+        places[f"impacts[{i}].of"] = impact.of
+        places |= {f"impacts[{i}].set.{name}": tree for name, tree in impact.set.items()}
+    places |= {f"quantities.{name}": tree for name, tree in definition.quantities.items()}
+    changing = {"t", "phase", *(s.name for s in definition.states)}
+    fixed = {name: np.asarray(v, np.float64) for name, v in values.items() if name not in changing}
+    known: dict[str, Any] = {"pi": np.pi, **fixed}
+    used = [name for name in definition.used(places.values()) if name in definition.define]
+    for name in used:
+        if _is_constant(definition.define[name], known):
+            known[name] = value_of(definition.define[name], known)
+    every = np.ones(max((v.size for v in fixed.values()), default=1), bool)
+    found: list[Fault] = []
+    for place, tree in {**{f"define.{name}": definition.define[name] for name in used}, **places}.items():
+        before = len(found)
+        _look_at_constants(tree, place, {"pi": np.pi}, every, found, guards=False)
+        if len(found) == before:
+            _look_at_constants(tree, place, known, every, found, guards=True)
+    return [replace(fault, is_constant=True) for fault in found]
+
+
+def _is_constant(tree: Tree, known: Mapping[str, Any]) -> bool:
+    return all(name in known for name, _ in names(tree))
+
+
+def _look_at_constants(
+    tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault], *, guards: bool
+) -> None:
+    """Add the faults of the parts in which known names stand alone.
+
+    With `guards` a branch of `where` counts where a condition of known names takes it.
+    """
+    if _is_constant(tree, known) and (guards or not _has_guards(tree)):
+        _look(tree, place, known, rows, found)
+        return
+    for arg in tree.args if tree.kind == "product" else ():
+        if arg.kind == "inverse" and _is_constant(arg, known):
+            zero = rows & (_values(arg.args[0], known, rows) == 0.0)
+            if zero.any():
+                found.append(_fault(tree, place, "division by 0", zero, known))
+    is_guard = guards and tree.kind == "call" and tree.value == "where" and _is_constant(tree.args[0], known)
+    taken = _taken(tree, known, rows) if is_guard else [rows] * len(tree.args)
+    for arg, own in zip(tree.args, taken, strict=True):
+        _look_at_constants(arg, place, known, own, found, guards=guards)
+
+
+def _has_guards(tree: Tree) -> bool:
+    return (tree.kind == "call" and tree.value == "where") or any(map(_has_guards, tree.args))
+
+
+def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fault]:
+    """Find parts of the equations that have no finite value at the starts."""
     known: dict[str, Any] = {"pi": np.pi, **{name: np.asarray(v, np.float64) for name, v in values.items()}}
     n = max((v.size for v in known.values() if isinstance(v, np.ndarray)), default=1)
     equations = {f"equations.{name}": tree for name, tree in definition.equations.items()}
@@ -79,7 +141,7 @@ def domain_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
     found: list[Fault] = []
     for place, tree in places.items():
         _look(tree, place, known, bad, found)
-    return found[:MAX_FAULTS]
+    return found
 
 
 def _look(
@@ -136,7 +198,7 @@ def _why(tree: Tree, known: Mapping[str, Any], new: np.ndarray) -> str:
 
 def _fault(tree: Tree, place: str, why: str, rows: np.ndarray, known: Mapping[str, Any]) -> Fault:
     row = int(np.argmax(rows))
-    involved = dict.fromkeys(name for name, _ in names(tree) if name != "pi")
+    involved = dict.fromkeys(name for name, _ in names(tree) if name != "pi" and name in known)
     values = {name: float(np.broadcast_to(known[name], rows.shape)[row]) for name in involved}
     return Fault(place, readable(tree), why, row, values, int(rows.sum()))
 

@@ -8,6 +8,7 @@ no state, and what needs neither state nor time, are parts of their own.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterable, Mapping
 
 CONSTANT, TIMED, STATED = 0, 1, 2
@@ -63,6 +64,19 @@ _AT_ZERO = {
     "sin": 0.0, "cos": 1.0, "tan": 0.0, "atan": 0.0, "tanh": 0.0, "sinh": 0.0, "cosh": 1.0, "exp": 1.0,
     "asin": 0.0, "sign": 0.0,
 }  # fmt: skip
+
+
+def _finite(function: Callable[[float, float], float], a: float, b: float) -> float:
+    """Value of a function of two numbers; raises `GraphError` if it is too large."""
+    try:
+        value = function(a, b)
+    except OverflowError:
+        value = math.inf
+    if not math.isfinite(value):
+        raise GraphError(
+            f"the equations, or their derivatives, have a number too large to compute with ({a:g}, {b:g})"
+        )
+    return value
 
 
 class Graph:
@@ -156,7 +170,7 @@ class Graph:
                 negative = not negative
                 pending.append(factor.args[0])
             elif factor.op == "number":
-                total *= factor.value
+                total = _finite(operator.mul, total, factor.value)
             elif factor.op == "mul" and factor.args[0].kind < factor.kind:
                 pending += factor.args[::-1]
             else:
@@ -165,7 +179,7 @@ class Graph:
             return self.zero
         if total < 0.0:
             total, negative = -total, not negative
-        if total != 1.0 and math.isfinite(total):
+        if total != 1.0:
             groups[CONSTANT].insert(0, self.number(total))
         parts = [self._chain(g) for g in groups if g]
         found = self._chain(parts) if parts else self.one
@@ -205,9 +219,7 @@ class Graph:
             if twice == math.floor(twice) and abs(twice) <= 2 * MAX_POWER:
                 return self._halves(base, int(twice))
             if base.op == "number" and base.value > 0.0:
-                value = base.value**exponent.value
-                if math.isfinite(value):
-                    return self.number(value)
+                return self.number(_finite(operator.pow, base.value, exponent.value))
         if base.is_number(1.0):
             return self.one
         return self.node("power", base, exponent)

@@ -26,6 +26,7 @@ from magpend_core import kernel_version
 from magpend_core.meaning import meaning_digest
 from magpend_core.models.imported import is_object_path
 from pipeline.layout.identity import canonical, differences, digest_of
+from pipeline.layout.writing import sync_folder, write_atomically
 from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.recordings import load_mapping
 from pipeline.spec.models import is_model_file
@@ -41,7 +42,7 @@ from pipeline.store.files import (
     open_files,
     problems_of,
 )
-from pipeline.store.local import is_there, sync_folder, unreadable, write_atomically
+from pipeline.store.local import is_there, refuse_place, unreadable
 from pipeline.store.provenance import provenance, versions
 
 T = TypeVar("T")
@@ -214,6 +215,7 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
     """
     if directory.exists() and not directory.is_dir():
         raise RefusedError(f"{directory}: is a file; give another --out.")
+    refuse_place(directory, "--out")
     if not directory.exists():
         return None
     if not is_identification(directory):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core.sampling import Drive
+from pipeline.layout.writing import write_netcdf
 from pipeline.products.reporting import report, track
 from pipeline.rig.identify import directory as store
 from pipeline.rig.identify import identifiability, reports
@@ -30,7 +31,7 @@ from pipeline.runs.stopping import stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.problems import SpecError
 from pipeline.store.files import FIGURES, local_path
-from pipeline.store.local import writer_lock
+from pipeline.store.local import make_folder, refuse_links, writer_lock
 
 Echo = Callable[[str], None]
 
@@ -112,14 +113,15 @@ def _write(
     residuals = reports.residuals_of(spec, found)
     if built.simulated:
         residuals = residuals.assign_attrs(simulated=1)
-    residuals.to_netcdf(folder / store.RESIDUALS, engine="scipy", format="NETCDF3_64BIT")
+    write_netcdf(folder / store.RESIDUALS, residuals)
     result = reports.result_of(spec, found, sources, digest, built.findings)
     files = [store.PRESET, store.RESIDUALS]
     if figures:
         from pipeline.rig.identify.figures import draw_all
 
         report("drawing", 0, 0)
-        (folder / FIGURES).mkdir(exist_ok=True)
+        refuse_links(folder / FIGURES)
+        make_folder(folder / FIGURES)
         files += [f"{FIGURES}/{name}" for name in draw_all(folder / FIGURES, residuals, result)]
     store.write_result(folder, result, files)
     return store.read_result(folder)

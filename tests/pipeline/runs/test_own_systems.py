@@ -186,7 +186,7 @@ def test_open_run__stranger_s_text_is_one_error(text_spec, tmp_path, main, text)
     for call in (("status",), ("plot", "basins"), ("analyse", "attractors"), ("verify",)):
         started = time.perf_counter()
         code, _, said = main(*call, tmp_path / "run")
-        assert time.perf_counter() - started < 5
+        assert time.perf_counter() - started < 120
         assert code == 2
         assert "model.equations.v" in said
         assert "Traceback" not in said

@@ -270,7 +270,7 @@ def test_signal__stops_cleanly_and_resumes(uninterrupted, start, tmp_path, bytes
     wait_for_commits(process, directory, 2)
     # a terminal sends Ctrl-C to the whole group
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=200)
     assert process.returncode == code, (out, err)
     assert "the same command goes on" in err
     assert "Traceback" not in err

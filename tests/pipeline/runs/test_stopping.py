@@ -73,12 +73,12 @@ def wait_for(process, found):
 def ended(process, folder, code):
     """What it said; that it ended with this code, and left nothing."""
     running = psutil.Process(process.pid).children(recursive=True)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=200)
     assert process.returncode == code, (out, err)
     for sign in ("Traceback", "leaked", "Error", "distributed"):
         assert sign not in err, err
     assert err.count("magpend: ") == 1, err
-    assert psutil.wait_procs(running, timeout=10)[1] == []
+    assert psutil.wait_procs(running, timeout=100)[1] == []
     assert list((folder / "temporary").rglob("*")) == []
     return err
 

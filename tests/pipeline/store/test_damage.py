@@ -21,6 +21,7 @@ from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
 from pipeline.runs.zoom import read_source
+from pipeline.store import local
 from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import DamagedError, IncompleteError, RefusedError, UnreadableError
 from pipeline.store.files import local_path
@@ -47,14 +48,14 @@ def everything(directory):
 
 def fail_reading(monkeypatch, part, number=errno.EIO):
     """Let reading of files fail whose path contains `part`."""
-    original = Path.read_bytes
+    original = local.open_plain
 
-    def read_bytes(self):
-        if part in self.as_posix():
-            raise OSError(number, os.strerror(number), str(self))
-        return original(self)
+    def open_plain(path, mode, **options):
+        if part in path.as_posix():
+            raise OSError(number, os.strerror(number), str(path))
+        return original(path, mode, **options)
 
-    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    monkeypatch.setattr(local, "open_plain", open_plain)
 
 
 def fail_listing(monkeypatch, name, number=errno.EACCES):

@@ -75,3 +75,15 @@ def test_open_run__reads_no_chunk_before_it_is_used(made, monkeypatch):
 def test_open_run__no_run_there(tmp_path):
     with pytest.raises(RefusedError, match="no run directory"):
         open_run(tmp_path)
+
+
+def test_quick__builds_on_what_zarr_makes_public():
+    """No module of `zarr.core`: what is there may change with any version."""
+    import ast
+    from pathlib import Path
+
+    from pipeline.store import quick
+
+    tree = ast.parse(Path(quick.__file__).read_text("utf-8"))
+    modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert not {name for name in modules if name and name.startswith("zarr.core")}

@@ -13,10 +13,10 @@ from magpend_core.models.text.numeric import value_of
 
 def faults(rate, define=None, **values):
     table = {
-        "name": "probe", "states": {"x": "1", "v": "1"}, "parameters": {"k": 1.0, "g": 2.0},
+        "name": "probe", "states": {"x": "1", "v": "1"}, "parameters": {"k": 1.0, "g": 2.0, "z": 0.0},
         "define": define or {}, "equations": {"x": "v", "v": rate},
     }  # fmt: skip
-    given = {"x": 0.0, "v": 0.0, "k": 1.0, "g": 2.0, "t": 0.0, "f": 1.0, "phase": 0.0, **values}
+    given = {"x": 0.0, "v": 0.0, "k": 1.0, "g": 2.0, "z": 0.0, "t": 0.0, "f": 1.0, "phase": 0.0, **values}
     n = max(np.size(v) for v in given.values())
     columns = {name: np.broadcast_to(np.asarray(v, float), n) for name, v in given.items()}
     return domain_faults(load_model(table).definition, columns)
@@ -41,6 +41,48 @@ def test_domain_faults__names_the_innermost_part(rate, part, why):
     assert fault.place == "equations.v"
     assert fault.why == why
     assert fault.part == part
+
+
+@pytest.mark.parametrize(
+    ("rate", "part", "why"),
+    [
+        ("x + 1/0", "1/0", "division by 0"),
+        ("x + v/0", "v/0", "division by 0"),
+        ("x + v/z", "v/z", "division by 0"),
+        ("where(x < 100, v, log(0))", "log(0)", "logarithm of 0"),
+        ("where(x < 100, v, v/z)", "v/z", "division by 0"),
+        ("where(1 < 2, v, 0**(-1))", "0**(-1)", "0 to the power -1"),
+        ("where(x < 1, v, (-1)**0.5)", "(-1)**0.5", "-1 to the power 0.5, which is no whole number"),
+        ("where(x < 1, v, 10**400)", "10**400", "too large a number"),
+        ("where(k > 5, 1/0, v)", "1/0", "division by 0"),
+        ("where(k < 5, 1/z, v)", "1/z", "division by 0"),
+    ],
+)
+def test_domain_faults__constant_parts_count_in_every_branch(rate, part, why):
+    """A branch that is not taken at the start is computed all the same; a guard without a state is one."""
+    (fault,) = faults(rate, x=[0.5, 0.6])
+    assert (fault.place, fault.part, fault.why, fault.is_constant) == ("equations.v", part, why, True)
+    assert fault.values == ({"z": 0.0} if "z" in part else {})
+
+
+@pytest.mark.parametrize(
+    "rate", ["where(z > 0, v/z, v)", "where(z > 0, log(z), 1)*v", "where(not z < 1, 1/z, x)"]
+)
+def test_domain_faults__none_behind_a_guard_without_a_state(rate):
+    assert faults(rate) == []
+
+
+def test_domain_faults__impacts_and_quantities():
+    table = {
+        "name": "probe", "states": {"x": "1", "v": "1"}, "parameters": {"d": 0.0}, "define": {"g": "1/d"},
+        "equations": {"x": "v", "v": "-x"}, "quantities": {"q": "x*sqrt(-1)"},
+        "impacts": [{"of": "x - log(d)", "direction": "up", "set": {"v": "-v*g"}}],
+    }  # fmt: skip
+    zeros = dict.fromkeys(("x", "v", "d", "t", "f", "phase"), np.zeros(1))
+    found = domain_faults(load_model(table).definition, zeros)
+    assert [(f.place, f.part) for f in found] == [
+        ("define.g", "1/d"), ("impacts[0].of", "log(d)"), ("quantities.q", "sqrt(-1)"),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("rate", ["k + x", "where(x > 0, 1/x, 0)", "where(x > 0, log(x), -x)", "atan2(v, x)"])

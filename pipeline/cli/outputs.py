@@ -1,0 +1,107 @@
+"""Where commands may write: not inside of a run directory, and not over what somebody else has written."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+_LOOKED_AT = 100_000
+"""Bytes at both ends of a file in which it says who wrote it."""
+
+_HEADER = re.compile(rb"[A-Za-z_][\w.]*(,[A-Za-z_][\w.]*)*")
+_LOG_LINE = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ ")
+
+_forced = False
+
+
+def allow(force: bool) -> None:
+    """Take whether files of somebody else may be replaced, for the command at hand."""
+    global _forced
+    _forced = force
+
+
+def check_place(path: Path, option: str = "--out", within: str = "") -> None:
+    """Refuse a place that nothing may be written to, before anything is computed.
+
+    Parameters
+    ----------
+    path
+        A file or a folder, there or not.
+    option
+        What names it.
+    within
+        Folder of a run directory in which the command writes by itself.
+
+    Raises
+    ------
+    RefusedError
+        If it lies inside of a run directory, or is a link that leads nowhere.
+    """
+    from pipeline.store.local import refuse_place
+
+    refuse_place(path, option, within)
+
+
+def check_file(path: Path, option: str = "--out", within: str = "") -> None:
+    """Refuse a place as `check_place`, and a file there that magpend has not written.
+
+    Raises
+    ------
+    RefusedError, SpecError
+        Saying what is wrong, and the remedy; of a file not if ``--force`` is given.
+    """
+    check_place(path, option, within)
+    if path.is_file() and not _is_own(path):
+        _refuse(path, option)
+
+
+def check_table(path: Path, header: str, option: str = "--csv") -> None:
+    """Refuse to replace a table with other columns, which nobody can tell from a stranger's.
+
+    Raises
+    ------
+    SpecError
+        Unless ``--force`` is given.
+    """
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        first = file.readline(_LOOKED_AT).rstrip(b"\r\n")
+    if first and first != header.encode():
+        _refuse(path, option)
+
+
+def check_log(path: Path) -> None:
+    """Refuse to add to a file that is no log.
+
+    Raises
+    ------
+    SpecError
+        Unless ``--force`` is given.
+    """
+    check_place(path, "--log")
+    if path.is_file():
+        with path.open("rb") as file:
+            first = file.readline(_LOOKED_AT)
+        if first and not _LOG_LINE.match(first):
+            _refuse(path, "--log")
+
+
+def _refuse(path: Path, option: str) -> None:
+    from pipeline.spec.problems import SpecError
+
+    if not _forced:
+        raise SpecError([
+            f"{option} {path}: is there already, and magpend has not written it; give another name, or "
+            "--force to replace it."
+        ])  # fmt: skip
+
+
+def _is_own(path: Path) -> bool:
+    """Whether a file says that magpend wrote it, is empty, or may be a table: see `check_table`."""
+    with path.open("rb") as file:
+        begin = file.read(_LOOKED_AT)
+        file.seek(max(0, path.stat().st_size - _LOOKED_AT))
+        end = file.read()
+    is_table = path.suffix.lower() == ".csv" and _HEADER.fullmatch(begin.partition(b"\n")[0].rstrip(b"\r"))
+    return not begin or b"magpend" in begin or b"magpend" in end or bool(is_table)

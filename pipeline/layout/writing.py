@@ -1,0 +1,162 @@
+"""Files written whole: no link is followed, and an error names the file and what to do."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+TEMPORARY = ".tmp"
+
+# absent on Windows
+_NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
+_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
+
+_REMEDIES = {
+    errno.ENOSPC: "make room on its disk",
+    errno.EDQUOT: "make room within the quota of its disk",
+    errno.EFBIG: "raise the limit on the size of a file",
+    errno.EROFS: "make its disk writable, or give another place",
+    errno.EACCES: "change the access rights, or give another place",
+    errno.EPERM: "change the access rights, or give another place",
+    errno.ENOENT: "its folder is gone: make it again, or give another place",
+    errno.ENOTDIR: "a file is where its folder should be: remove it, or give another place",
+    errno.EISDIR: "a folder is at its place: remove it, or give another place",
+    errno.EEXIST: "something else is at its place: remove it, or give another place",
+}
+
+
+class NoFileError(FileNotFoundError):
+    """Something that is no plain file is where a file should be; the message is why."""
+
+
+class LinkError(NoFileError):
+    """A link is where a file should be; it is not followed."""
+
+
+class WritingError(OSError):
+    """A file could not be written; the message names it, the cause and the remedy. `errno` is the cause's."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
+@contextlib.contextmanager
+def writing(path: Path | str) -> Iterator[None]:
+    """Turn an error of the file system into one that names what was written, and the remedy.
+
+    Raises
+    ------
+    WritingError
+        For any `OSError`.
+    """
+    try:
+        yield
+    except WritingError:
+        raise
+    except NoFileError as error:
+        raise WritingError(
+            errno.EEXIST,
+            f"{path}: cannot be written (what is there {error}); remove it, then repeat the command.",
+        ) from None
+    except OSError as error:
+        remedy = _REMEDIES.get(error.errno or 0, "look after its disk")
+        raise WritingError(
+            error.errno,
+            f"{error.filename2 or error.filename or path}: cannot be written ({error.strerror or error}); "
+            f"{remedy}, then give the same command again.",
+        ) from error
+
+
+def open_plain(path: Path, mode: str, **options: Any) -> IO[Any]:
+    """Open a plain file. A link is not followed; a folder, a pipe or a device is not opened.
+
+    Parameters
+    ----------
+    path, mode, options
+        As for `open`.
+
+    Raises
+    ------
+    LinkError
+        If a link is there.
+    NoFileError
+        If something else than a plain file is there.
+    FileNotFoundError
+        If nothing is there.
+    """
+    return open(path, mode, opener=_open_plain, **options)
+
+
+def _open_plain(path: str, flags: int) -> int:
+    if not _NO_FOLLOW and os.path.islink(path):
+        raise LinkError("is a link")
+    try:
+        handle = os.open(path, flags | _NO_FOLLOW | _NO_WAIT, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise LinkError("is a link") from None
+        if error.errno == errno.ENXIO:  # a socket, or a pipe that nobody reads
+            raise NoFileError("is no file") from None
+        if error.errno == errno.ENOTDIR:
+            raise NoFileError("lies below a file") from None
+        raise
+    if stat.S_ISREG(os.fstat(handle).st_mode):
+        return handle
+    os.close(handle)
+    raise NoFileError("is no file")
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file so that after a crash it is there whole or not at all; a link at its place is replaced.
+
+    Raises
+    ------
+    WritingError
+        If it cannot be written.
+    """
+    temporary = temporary_beside(path)
+    with writing(path):
+        try:
+            with temporary.open("xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except OSError:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+        sync_folder(path.parent)
+
+
+def temporary_beside(path: Path) -> Path:
+    """A name that nobody else has, in the same folder."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
+
+
+def sync_folder(path: Path) -> None:
+    """Have a folder's entries on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_netcdf(path: Path, ds: xr.Dataset) -> None:
+    """Write a dataset as NetCDF, as `write_atomically` does."""
+    write_atomically(path, netcdf_bytes(ds))
+
+
+def netcdf_bytes(ds: xr.Dataset) -> bytes:
+    """Return a dataset as the bytes of a NetCDF file."""
+    return bytes(ds.to_netcdf(engine="scipy", format="NETCDF3_64BIT"))
