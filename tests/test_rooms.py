@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
-
-import pytest
 
 from magpend_core.models import load_model, model_names
 from magpend_core.models.text.views import DEFAULT_PRESET
@@ -48,33 +47,39 @@ def name_of(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-@pytest.mark.parametrize("path", PIPELINE, ids=name_of)
-def test_pipeline__knows_no_model(path):
+def test_pipeline__knows_no_model():
     """Nothing outside a model's own room names its states, its parts or its presets."""
-    name = name_of(path)
+    assert {name_of(path): words for path in PIPELINE if (words := words_of_a_model(path))} == {}
+
+
+def words_of_a_model(path: Path) -> dict[str, list[str]]:
+    """Words of one model that a file uses and may not."""
+    name, text = name_of(path), path.read_text("utf-8")
     allowed = {what for at, (what, _) in KNOWS_A_PART.items() if name == at or name.startswith(f"{at}/")}
     found = {
-        what: sorted({match[0] for match in re.finditer(pattern, path.read_text("utf-8"))})
+        what: sorted({match[0] for match in re.finditer(pattern, text)})
         for what, pattern in PENDULUM.items()
         if what not in allowed
     }
-    assert not {what: words for what, words in found.items() if words}
+    return {what: words for what, words in found.items() if words}
 
 
-@pytest.mark.parametrize("path", [*PIPELINE, *CORE], ids=name_of)
-def test_module__is_not_too_long(path):
-    if name_of(path) not in LONG_MODULES:
-        assert len(path.read_text("utf-8").splitlines()) <= MAX_MODULE
+def test_modules__are_not_too_long():
+    lengths = {name_of(path): len(path.read_text("utf-8").splitlines()) for path in (*PIPELINE, *CORE)}
+    assert {n: lines for n, lines in lengths.items() if lines > MAX_MODULE and n not in LONG_MODULES} == {}
 
 
-@pytest.mark.parametrize("path", PIPELINE, ids=name_of)
-def test_function__is_not_too_long(path):
+def test_functions__are_not_too_long():
     """Docstrings do not count: they say what a reader needs."""
+    assert {name: n for path in PIPELINE for name, n in lengths_in(path) if n > MAX_FUNCTION} == {}
+
+
+def lengths_in(path: Path) -> Iterator[tuple[str, int]]:
+    """Names and lengths of a file's functions."""
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.FunctionDef):
             first = node.body[1] if ast.get_docstring(node) and len(node.body) > 1 else node.body[0]
-            length = (node.end_lineno or 0) - first.lineno + 1
-            assert length <= MAX_FUNCTION, f"{node.name}: {length} lines"
+            yield f"{name_of(path)}: {node.name}", (node.end_lineno or 0) - first.lineno + 1
 
 
 def test_exceptions__are_still_needed():
