@@ -34,6 +34,6 @@ _SENTENCES = {
     Exit.DAMAGED: "stored data are damaged",
     Exit.CONTRADICTED: "a study's required claim is contradicted; its report says which",
     Exit.INTERRUPTED: "stopped by Ctrl-C; what is committed stays, the same command goes on",
-    Exit.TERMINATED: "stopped by SIGTERM; likewise",
-    Exit.HUNG_UP: "stopped because its terminal was closed; likewise",
+    Exit.TERMINATED: "stopped by SIGTERM; what is committed stays, the same command goes on",
+    Exit.HUNG_UP: "its terminal was closed; what is committed stays, the same command goes on",
 }

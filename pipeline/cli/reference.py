@@ -192,7 +192,9 @@ def identification() -> str:
     return "\n\n".join(_keys(*part) for part in parts)
 
 
-_STATES = "Beside these: each state of the model by name, or with `_deg` if it is an angle or its rate: {}."
+_STATES = (
+    "Give each state of the model under its own name: {}. For an angle or its rate, `NAME_deg` takes degrees."
+)
 
 
 def products() -> str:
