@@ -195,7 +195,7 @@ def run_branches(
 
 
 def sections(
-    parameters: Parameters,
+    parameters: Parameters | Sequence[Parameters],
     frequency_hz: np.ndarray | float | None,
     initial_states: np.ndarray,
     *,
@@ -205,17 +205,18 @@ def sections(
     atol: float = 1e-8,
     **options: Any,
 ) -> Sections:
-    """Stroboscopic sections of many independent trajectories with common parameters.
+    """Stroboscopic sections of many independent trajectories of one model.
 
     Parameters
     ----------
     parameters
-        See `load_preset`.
+        Of all cells, or one set for each: ``load_model(...).load(...)``.
     frequency_hz
         Drive frequency of each cell, shape (n,), or one number for all [Hz]; None with a section by
         crossing.
     initial_states
-        Shape (n, 4): psi1, psi2, psi1_dot, psi2_dot at a rising edge of the drive [rad, rad/s].
+        Shape (n, n_states), in the order of the model's `state_names` and in SI units, at the instant t = 0
+        of the drive.
     n_transient, n_keep, rtol, atol
         As for `run_branches`.
     options
@@ -224,12 +225,12 @@ def sections(
     Returns
     -------
     Sections
-        With leading dim (cell,): ``section`` is (n, n_keep, 4).
+        With leading dim (cell,): ``section`` is (n, n_keep, n_states).
 
     Raises
     ------
     ValueError
-        If an argument has the wrong shape or is out of bounds.
+        If an argument has the wrong shape or is out of bounds, or the sets of parameters are of two models.
 
     Examples
     --------
@@ -237,7 +238,11 @@ def sections(
     >>> result.section.shape
     (1, 1, 4)
     """
-    system = parameters.model.system
+    several = [parameters] if isinstance(parameters, Parameters) else list(parameters)
+    models = {one.model.name: one.model for one in several}
+    if len(models) != 1 or any(one.model.system != several[0].model.system for one in several):
+        raise ValueError(f"parameters: must be of one model, and are of {len(models)}: {', '.join(models)}.")
+    system = several[0].model.system
     initial = check_states(initial_states, 2, system.n_states, "initial_states")
     if frequency_hz is None:
         if options.get("section") is None:
@@ -248,7 +253,10 @@ def sections(
         frequency = np.full(len(initial), frequency) if frequency.ndim == 0 else frequency
         frequency = frequency[:, None]
     n = len(initial) if frequency is None else len(frequency)
-    packed = np.broadcast_to(parameters.pack(), (n, 1, len(parameters.names)))
+    if len(several) not in (1, n):
+        raise ValueError(f"parameters: {len(several)} sets for {n} cells; give one, or one for each cell.")
+    rows = np.stack([one.pack() for one in several])[:, None]
+    packed = np.broadcast_to(rows, (n, *rows.shape[1:]))
     result = run_branches(
         packed, frequency, initial, n_transient=n_transient, n_keep=n_keep,
         rtol=rtol, atol=atol, system=system, **options,

@@ -60,7 +60,7 @@ def _silent(_: str) -> None:
     pass
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class AnalysedRun(Run):
     """A run as analyses see it: with the other analyses of the same cells.
 

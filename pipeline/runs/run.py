@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +19,8 @@ from pipeline.runs.mending import sound_commits
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
-from pipeline.runs.workflows import default_directory, find_spec
-from pipeline.spec.parsing import Spec, load_spec
+from pipeline.runs.workflows import read_given
+from pipeline.spec.parsing import Spec
 from pipeline.store.checking import damaged_records, name_of
 from pipeline.store.commits import log_timing, sweep
 from pipeline.store.errors import IncompleteError
@@ -41,7 +41,7 @@ Sources = Sequence[tuple[str, str]]
 
 
 def run(
-    spec: str | Path,
+    spec: str | Path | Mapping[str, Any],
     out: str | Path | None = None,
     *,
     workers: int | None = None,
@@ -59,9 +59,10 @@ def run(
     Parameters
     ----------
     spec
-        Path of a TOML file, or the name of a shipped workflow.
+        Path of a TOML file, or the name of a shipped workflow; or a specification as TOML text or as a table,
+        whose files are looked for in the current folder.
     out
-        Run directory; by default ``runs/<name>``.
+        Run directory; by default ``runs/<name>``, where a text or table has its model's name and a digest.
     workers
         See `execute.run_tasks`.
     scheduler, cluster, dashboard
@@ -93,13 +94,12 @@ def run(
     """
     from pipeline.compute.clients import Where
 
-    path = find_spec(spec)
-    parsed = load_spec(path, smoke=smoke)
-    files = open_files(out if out is not None else default_directory(path, smoke))
+    parsed, text, default = read_given(spec, smoke=smoke)
+    files = open_files(out if out is not None else default)
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)
-    carry_out(parsed, path.read_text("utf-8"), files, workers=workers, where=where, echo=echo)
+    carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
     return state(files)
 
 

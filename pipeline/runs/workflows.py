@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import tomllib
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
-from pipeline.spec.parsing import IDENTIFICATION
+from pipeline.spec.files import toml_tables
+from pipeline.spec.given import is_toml_text, toml_of
+from pipeline.spec.parsing import IDENTIFICATION, Spec, load_spec, spec_of_tables
 from pipeline.spec.problems import SpecError, unknown_name
 
 
@@ -25,6 +30,38 @@ def find_spec(name: str | Path) -> Path:
     if str(name) in shipped:
         return shipped[str(name)]
     raise SpecError([f"{name}: no such file; {unknown_name('workflow', str(name), shipped)}"])
+
+
+def read_given(spec: str | Path | Mapping[str, Any], *, smoke: bool = False) -> tuple[Spec, str, Path]:
+    """Read a specification: a file, a workflow that ships, a TOML text or a table.
+
+    Parameters
+    ----------
+    spec
+        As `pipeline.runs.run.run` takes it.
+    smoke
+        Take the small size of its ``[smoke]`` table.
+
+    Returns
+    -------
+    spec : Spec
+    text : str
+        As TOML.
+    directory : Path
+        Where its run goes unless told otherwise.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once.
+    """
+    if not isinstance(spec, Mapping) and not is_toml_text(spec):
+        path = find_spec(spec)
+        return load_spec(path, smoke=smoke), path.read_text("utf-8"), default_directory(path, smoke)
+    text = toml_of(spec) if isinstance(spec, Mapping) else str(spec)
+    read = spec_of_tables(toml_tables(text.encode(), "the specification"), Path(), smoke=smoke)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return read, text, default_directory(Path(f"{read.model.name}-{digest}"), smoke)
 
 
 def shipped_workflows() -> dict[str, Path]:

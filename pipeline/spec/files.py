@@ -29,19 +29,33 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     try:
         with open(path, "rb") as file:
             content = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise SpecError([f"{path}: {_unreadable(error)}"]) from None
+    return toml_tables(content, str(path))
+
+
+def toml_tables(content: bytes, name: str) -> dict[str, Any]:
+    """Return the tables of a TOML text, which messages call `name`.
+
+    Raises
+    ------
+    SpecError
+        As for `read_toml`.
+    """
+    try:
         if len(content) > MOST_BYTES:
             raise SpecError([
-                f"{path}: has more than {MOST_BYTES // 1_000_000} MB, the most that a specification has; "
+                f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the most that a specification has; "
                 "give ranges, or random starts with a seed, instead of lists."
             ])  # fmt: skip
         data = tomllib.loads(content.decode("utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         if isinstance(error, SpecError):
             raise
-        raise SpecError([f"{path}: {_unreadable(error)}"]) from None
+        raise SpecError([f"{name}: {_unreadable(error)}"]) from None
     problems = odd_data(data)
     if problems:
-        raise SpecError([f"{path}: {problem}" for problem in problems])
+        raise SpecError([f"{name}: {problem}" for problem in problems])
     return data
 
 

@@ -140,8 +140,12 @@ def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
     SpecError
         With all problems at once; also if the file cannot be read or is not TOML.
     """
-    folder = Path(path).parent
-    return parse_spec(_with_smoke(read_toml(path), smoke, folder), folder)
+    return spec_of_tables(read_toml(path), Path(path).parent, smoke=smoke)
+
+
+def spec_of_tables(data: dict[str, Any], folder: Path, *, smoke: bool = False) -> Spec:
+    """Validate what a file or a text holds, its ``[smoke]`` table included; see `load_spec`."""
+    return parse_spec(_with_smoke(data, smoke, folder), folder)
 
 
 def kept_spec(data: Mapping[str, Any]) -> Spec:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,22 @@ if TYPE_CHECKING:
 
     from magpend_core.models.model import Model
     from magpend_core.models.parameters import Parameters
+
+
+_NEXT = (
+    "next",
+    "  run.cube()                                 the cube, an xarray.Dataset",
+    '  magpend.figure(run, "bifurcation")         a figure; also "basins", "section", "attractors", ...',
+    "  magpend.table(magpend.attractors(run))     what attracts, and what has been shown of it",
+)
+"""Lines that say how one goes on from a run in Python."""
+
+MOST_SHOWN = 70
+"""Most characters of a list of names in a line."""
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 4]} ..."
 
 
 @dataclass(frozen=True)
@@ -70,6 +87,35 @@ class Run:
         plan = make_plan(spec)
         check_plan(plan)
         return cls(info, spec, plan, read_commits(info, plan))
+
+    def __repr__(self) -> str:
+        return "\n".join(
+            [self._title, *(f"  {name:9s} {text}" for name, text in self._facts.items()), *_NEXT]
+        )
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(text)}</td></tr>"
+            for name, text in self._facts.items()
+        )
+        return f"<b>{escape(self._title)}</b><table>{rows}</table><pre>{escape(chr(10).join(_NEXT))}</pre>"
+
+    @property
+    def _title(self) -> str:
+        return f"magpend run {self.name}" + (f": {self.spec.title}" if self.spec.title else "")
+
+    @property
+    def _facts(self) -> dict[str, str]:
+        """What a person wants to know of it first, by name."""
+        states, plan = ", ".join(self.model.state_names), self.plan
+        shape = " x ".join(f"{dim} ({n})" for dim, n in zip(plan.dims, plan.shape, strict=True))
+        here = sum(plan.cells_in(i) for i in self.commits)
+        missing = "" if self.complete else "; run the specification again to complete it"
+        return {
+            "model": f"{self.model.name}; states {_short(states)}",
+            "cells": f"{plan.n_cells}: {shape}",
+            "computed": f"{here} of {plan.n_cells}{missing}",
+        }
 
     @property
     def directory(self) -> Path:

@@ -2,11 +2,13 @@
 
     import magpend
 
-    magpend.run("quickstart")                                # or any specification
-    ds = magpend.open_run("runs/quickstart")                 # the cube, an xarray.Dataset
-    found = magpend.attractors("runs/quickstart")            # an analysis, kept in the run directory
-    magpend.figure("runs/quickstart", "bifurcation")         # what the command line draws
-    magpend.sections(magpend.load_preset(q=1.6), [2.2], [[0.2, 0.2, 0, 0]], n_transient=300, n_keep=50)
+    run = magpend.run("quickstart")              # a name, a path, TOML text or a dict; shows what to do next
+    ds = run.cube()                              # an xarray.Dataset
+    found = magpend.attractors(run)              # an analysis, kept in the run directory
+    magpend.table(found)                         # a row per attractor and parameter point, as pandas
+    magpend.figure(run, "bifurcation")           # what the command line draws
+    duffing = magpend.load_model("duffing").load(amplitude=0.4)
+    magpend.sections(duffing, 0.2, [[0.1, 0.0]], n_transient=300, n_keep=50)
 
 Every name is imported when it is first used; ``dir(magpend)`` lists them. Analyses take a run directory, or
 an opened `Run`, and the options of ``magpend analyse``; ``plot_`` functions take datasets.
@@ -19,7 +21,7 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    "magpend_core.models": ("import_model", "load_model", "load_preset", "model_names", "preset_names"),
+    "magpend_core.models": ("import_model", "load_preset", "model_names", "preset_names"),
     "magpend_core.models.model": ("Model",),
     "magpend_core.models.parameters": ("ParameterError", "Parameters"),
     "magpend_core.models.presets": ("write_preset",),
@@ -37,7 +39,9 @@ _HOMES = {
     "pipeline.store.run": ("Run",),
     "pipeline.store.reading": ("open_run",),
     "pipeline.compute.simulate": ("simulate",),
-    "pipeline.runs.run": ("run", "state"),
+    "pipeline.runs.python": ("run", "table"),
+    "pipeline.spec.given": ("load_model",),
+    "pipeline.runs.status": ("state",),
     "pipeline.runs.verify": ("verify_run",),
     "pipeline.runs.extend": ("extend",),
     "pipeline.runs.zoom": ("zoom",),

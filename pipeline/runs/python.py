@@ -1,0 +1,90 @@
+"""What `import magpend` gives beyond the commands: runs that are opened, and tidy tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.products.product import function_of
+from pipeline.products.registry import ANALYSES
+from pipeline.runs.run import run as complete
+from pipeline.runs.workflows import read_given
+from pipeline.store.run import Run
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+
+def run(
+    spec: str | Path | Mapping[str, Any],
+    out: str | Path | None = None,
+    *,
+    smoke: bool = False,
+    echo: Callable[[str], None] = print,
+    **options: Any,
+) -> Run:
+    """Run a specification, or what is missing of it, and open the run.
+
+    Parameters
+    ----------
+    spec
+        Path of a TOML file, the name of a shipped workflow, TOML text, or a table (a dict).
+    out
+        Run directory; by default ``runs/<name>``. A text or table has its model's name and a digest, so that
+        the same one goes on where it was.
+    smoke
+        Take the small size of the specification's ``[smoke]`` table.
+    echo
+        Prints a line.
+    options
+        ``workers``, ``scheduler``, ``cluster`` and ``dashboard``, see `pipeline.runs.run.run`.
+
+    Returns
+    -------
+    Run
+        For `attractors` and the other analyses, for `figure`; ``run.cube()`` is the Dataset.
+
+    Raises
+    ------
+    SpecError
+        If the specification is wrong, before anything is computed; all problems at once.
+    Exception
+        As `pipeline.runs.run.run`.
+
+    Examples
+    --------
+    >>> run("quickstart").cube().section.sel(frequency=2.2)  # doctest: +SKIP
+    """
+    if out is None:
+        _, _, out = read_given(spec, smoke=smoke)
+    complete(spec, out, smoke=smoke, echo=echo, **options)
+    return Run.open(out)
+
+
+def table(found: xr.Dataset) -> pd.DataFrame:
+    """Return the result of an analysis as a tidy table, as ``magpend analyse NAME --csv`` writes it.
+
+    Parameters
+    ----------
+    found
+        What `attractors`, `basins`, `branches`, ... returned.
+
+    Returns
+    -------
+    DataFrame
+        Of `attractors` a row for each attractor at each parameter point; numbers in SI units, unrounded.
+
+    Raises
+    ------
+    ValueError
+        If it is not the result of an analysis.
+    """
+    import pandas as pd
+
+    name = str(found.attrs.get("derived_product", ""))
+    if name not in ANALYSES or not ANALYSES[name].table:
+        known = ", ".join(key for key, analysis in ANALYSES.items() if analysis.table)
+        raise ValueError(f"the Dataset is not the result of an analysis that has a table ({known}).")
+    return pd.DataFrame(function_of(ANALYSES[name].table)(found).rows)

@@ -1,0 +1,66 @@
+"""Models and specifications as they are given in Python: names, paths, TOML text, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magpend_core.models import load_model as named_model
+from magpend_core.models.model import Model
+from pipeline.spec.files import read_toml, toml_tables
+from pipeline.spec.models import find_model, is_model_file
+from pipeline.spec.toml import toml_key, toml_value
+
+
+def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -> Model:
+    """Return a model, wherever it is written down.
+
+    Parameters
+    ----------
+    reference
+        Name of a model that ships; path of a model's file or of a specification; either of them as TOML text;
+        a table with the keys of ``[model]``. A model is returned as it is.
+
+    Raises
+    ------
+    ModelError, SpecError
+        If there is none, with the nearest names; if it is wrong, with all its problems.
+    """
+    if isinstance(reference, str) and not reference.lstrip().startswith("{") and is_toml_text(reference):
+        return _model_in(toml_tables(reference.encode(), "the text"), Path())
+    if isinstance(reference, Path) or is_model_file(reference):
+        path = Path(reference)
+        tables = read_toml(path)
+        return find_model(str(path)) if "equations" in tables else _model_in(tables, path.parent)
+    return named_model(reference)
+
+
+def _model_in(tables: Mapping[str, Any], folder: Path) -> Model:
+    """Return the model of a specification, or that whose table stands alone."""
+    if "equations" in tables:
+        return find_model({"name": "model", **tables}, folder)
+    return find_model(tables["model"], folder) if "model" in tables else named_model()
+
+
+def is_toml_text(given: Any) -> bool:
+    """Whether something is TOML text, and neither a path nor a name."""
+    return isinstance(given, str) and ("\n" in given or "=" in given)
+
+
+def toml_of(table: Mapping[str, Any]) -> str:
+    """Return a table as TOML text, a line for each key."""
+    return "".join(f"{toml_key(key)} = {toml_value(value)}\n" for key, value in _plain(table).items())
+
+
+def _plain(given: Any) -> Any:
+    """Return tables and lists of plain numbers and words: numpy's numbers and arrays as Python's."""
+    if isinstance(given, Mapping):
+        return {str(key): _plain(value) for key, value in given.items()}
+    if isinstance(given, list | tuple):
+        return [_plain(value) for value in given]
+    if isinstance(given, np.ndarray | np.generic):
+        return given.tolist()
+    return str(given) if isinstance(given, Path) else given
