@@ -89,13 +89,13 @@ class Run:
         return cls(info, spec, plan, read_commits(info, plan))
 
     def __repr__(self) -> str:
-        return "\n".join(
-            [self._title, *(f"  {name:9s} {text}" for name, text in self._facts.items()), *_NEXT]
-        )
+        facts = (f"  {name:9s} {text}" for name, text in self._facts.items())
+        return "\n".join([self._title, *facts, *_NEXT])
 
     def _repr_html_(self) -> str:
+        left = "style='text-align:left'"
         rows = "".join(
-            f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(text)}</td></tr>"
+            f"<tr><th {left}>{escape(name)}</th><td {left}>{escape(text)}</td></tr>"
             for name, text in self._facts.items()
         )
         return f"<b>{escape(self._title)}</b><table>{rows}</table><pre>{escape(chr(10).join(_NEXT))}</pre>"
