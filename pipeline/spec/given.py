@@ -31,7 +31,7 @@ def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -
     """
     if isinstance(reference, str) and not reference.lstrip().startswith("{") and is_toml_text(reference):
         return _model_in(toml_tables(reference.encode(), "the text"), Path())
-    if isinstance(reference, Path) or is_model_file(reference):
+    if isinstance(reference, Path) or (isinstance(reference, str) and is_model_file(reference)):
         path = Path(reference)
         tables = read_toml(path)
         return find_model(str(path)) if "equations" in tables else _model_in(tables, path.parent)

@@ -68,7 +68,7 @@ def test_run__of_a_text_goes_on_where_it_was(tmp_path, monkeypatch):
 
 
 def test_run__of_a_text_refuses_with_all_problems(tmp_path):
-    with pytest.raises(SpecError, match="axes.B") as caught:
+    with pytest.raises(SpecError, match=r"axes\.B") as caught:
         run_quietly(
             TEXT.replace("A = { values", "B = { values").replace("n_keep = 4", "n_keep = 0"), tmp_path / "r"
         )
@@ -90,7 +90,7 @@ def test_table__has_a_row_per_attractor_and_parameter_point(made):
     found = magpend.table(magpend.attractors(made))
     assert len(found) == 3
     assert found["A"].tolist() == [0.1, 0.2, 0.3]
-    assert set(found["kind"]) == {"periodic orbit"}
+    assert set(found["kind"]) == {"periodic_orbit"}
     with pytest.raises(ValueError, match="not the result of an analysis"):
         magpend.table(made.cube())
 
