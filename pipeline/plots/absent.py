@@ -15,7 +15,8 @@ from pipeline.plots.points import Survey
 # Greys instead of hatching: some readers of SVG paint its patterns black.
 LOOKS: dict[str, dict[str, Any]] = {
     "pending": {"facecolor": "0.92", "edgecolor": "0.6", "linewidth": 0.4},
-    "failed": {"facecolor": "0.1", "edgecolor": "0.1", "linewidth": 0.8},
+    "diverged": {"facecolor": "0.1", "edgecolor": "0.1", "linewidth": 0.8},
+    "failed": {"facecolor": "0.3", "edgecolor": "0.3", "linewidth": 0.8},
     "not reached": {"facecolor": "0.62", "edgecolor": "0.62", "linewidth": 0.8},
     "no return": {"facecolor": "0.8", "edgecolor": "0.3", "linewidth": 0.6},
     "chatter": {"facecolor": "0.45", "edgecolor": "0.1", "linewidth": 0.6},
@@ -56,8 +57,13 @@ def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Se
 
 
 def absent_handles(survey: Survey) -> list[Patch]:
-    """Handles of a legend for what became of cells without a point."""
-    return [Patch(label=name, **LOOKS[name]) for name, counts in survey.absent.items() if counts.any()]
+    """Handles of a legend for what became of cells without a point, and of how many."""
+    n_cells = int(survey.cells.sum())
+    return [
+        Patch(label=f"{name}: {int(counts.sum())} of {n_cells}", **LOOKS[name])
+        for name, counts in survey.absent.items()
+        if counts.any()
+    ]
 
 
 def say_empty(ax: Axes, survey: Survey, shown: str = "") -> None:

@@ -58,7 +58,7 @@ def plot_lyapunov(
     -------
     DataFigure
         Points are cells, bands one standard error on either side of them; open points are cells
-        whose exponents were flagged. Its `data` hold ``exponent_value``, ``exponent_stderr``,
+        whose exponents were flagged, and crosses at the lower edge mark where cells have none. Its `data` hold ``exponent_value``, ``exponent_stderr``,
         ``lyapunov_flag``, and ``motion`` where motions are told apart; with the suffix ``_diagram``
         what is drawn above.
 
@@ -148,11 +148,25 @@ def _draw_exponents(
         for code, colour in enumerate(colours):
             own = np.where(motion == code, value[..., 0], np.nan)
             _draw_class(ax, x, own, error[..., 0], flag, colour, f"exponent:{code}")
+    none = ~np.isfinite(value[..., 0])
+    if none.any():
+        handles.append(_draw_without(ax, x, none))
     if ((flag > GOOD) & np.isfinite(value[..., 0])).any():
         handles.append(style.dot("flagged", "0.3", 4.0, face="none"))
     name = "exponents" if spectrum else "largest exponent"
     style.label_axes(ax, y=f"{name} [{rate_unit(data)}]")
     return handles
+
+
+def _draw_without(ax: Axes, x: np.ndarray, none: np.ndarray) -> Any:
+    """Mark at the lower edge where cells have no exponents; returns the legend's handle."""
+    where = x[none.any(axis=1)]
+    (marks,) = ax.plot(
+        where, np.full(where.size, 0.025), transform=ax.get_xaxis_transform(), linestyle="none", marker="x",
+        markersize=3.0, markeredgewidth=0.7, color="0.1", zorder=2.5, clip_on=False,
+        label=f"no exponents: {int(none.sum())} of {none.size}", gid="without",
+    )  # fmt: skip
+    return marks
 
 
 def _draw_class(

@@ -96,3 +96,13 @@ def test_plot_lyapunov__over_a_parameter_at_a_fixed_frequency():
     assert figure.axes[1].get_ylim() == (-2.0, 2.0)
     assert figure.axes[0].get_ylabel() == "$x$ [m]"
     assert "x_diagram" in figure.data
+
+
+def test_plot_lyapunov__marks_where_cells_have_no_exponents():
+    ds = make_cube(3, ("F",), (6,))
+    assert not [a for a in plot_lyapunov(ds).findobj() if a.get_gid() == "without"]
+    ds["lyapunov"][dict(F=2, initial_condition=[0, 1])] = np.nan
+    figure = plot_lyapunov(ds)
+    (marks,) = [a for a in figure.findobj() if a.get_gid() == "without"]
+    assert marks.get_xdata().tolist() == [ds["F"].values[2]]
+    assert marks.get_label() == "no exponents: 2 of 18"
