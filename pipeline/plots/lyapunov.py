@@ -58,7 +58,8 @@ def plot_lyapunov(
     -------
     DataFigure
         Points are cells, bands one standard error on either side of them; open points are cells
-        whose exponents were flagged, and crosses at the lower edge mark where cells have none. Its `data` hold ``exponent_value``, ``exponent_stderr``,
+        whose exponents were flagged, and crosses at the lower edge mark where cells have none. Its
+        `data` hold ``exponent_value``, ``exponent_stderr``,
         ``lyapunov_flag``, and ``motion`` where motions are told apart; with the suffix ``_diagram``
         what is drawn above.
 
