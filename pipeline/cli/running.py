@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pipeline.cli.common import Directory, Json
 from pipeline.cli.exits import Exit
 from pipeline.cli.options import completing
+
+if TYPE_CHECKING:
+    from pipeline.store.run import Run
 
 
 def workflow_names() -> Iterable[str]:
@@ -68,40 +71,56 @@ def run(
     ] = False,
     plot: Annotated[
         bool,
-        typer.Option("--plot", help="Draw the bifurcation diagram of one parameter at the end."),
+        typer.Option("--plot", help="Draw what the run has at the end: a diagram, its exponents, or a map."),
     ] = False,
 ) -> None:
     """Compute what a specification asks for, or what is missing of it.
 
     Stop it whenever you like: the same command goes on where it was, and the finished files are the same.
+    At the end it counts the cells by status. Cells that diverged or failed are results, with exit code 0; a
+    warning tells of them if they are more than 1 %.
     """
     from pipeline.cli import console
-    from pipeline.runs import preview
+    from pipeline.runs import outcome, preview
     from pipeline.runs import run as runs
+    from pipeline.store.run import Run
 
     if dry_run:
         for line in preview.describe_plan(spec, out, workers=workers, smoke=smoke):
             console.result(line)
         return
-    if plot:
-        preview.check_diagram(spec, smoke=smoke)
     state = runs.run(
         spec, out, workers=workers, scheduler=scheduler, cluster=cluster, dashboard=dashboard, smoke=smoke,
         echo=console.note,
     )  # fmt: skip
+    done = Run.open(state.files)
     console.result(f"cube: {state.files.below('cube.zarr').name}")
+    for line in outcome.summary(done):
+        console.result(line)
+    if text := outcome.warning(done):
+        console.LOG.warning(text)
     if plot:
-        _diagram(state.name)
-    else:
-        console.result(f"plot it with: {preview.figure_command(state.plan, state.name)}")
+        _plot(done)
 
 
-def _diagram(directory: str) -> None:
+def _plot(run: Run) -> None:
+    """Draw what shows a finished run best; a figure that cannot be drawn is a note, no error."""
+    from pipeline.cli import console
     from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES
+    from pipeline.runs.preview import figure_command, shown
+    from pipeline.spec.problems import SpecError
+    from pipeline.store.errors import RefusedError
 
-    options = FIGURES["bifurcation"].options
-    draw(directory, "bifurcation", options())
+    name, options, left_out = shown(run)
+    try:
+        draw(run.name, name, FIGURES[name].options(**options))
+    except (SpecError, RefusedError) as error:
+        console.result(f"no figure: {error}")
+        console.result(f"the run is complete; draw it with: {figure_command(run.plan, run.name)}")
+    else:
+        if left_out:
+            console.result(left_out)
 
 
 def status(directory: Directory, json: Json = False) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from pipeline.layout.domains import check_starts
 from pipeline.layout.limits import check_space
@@ -14,9 +15,9 @@ from pipeline.runs.progress import duration, size
 from pipeline.runs.run import identity_here
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.spec.parsing import Spec, load_spec
-from pipeline.spec.problems import SpecError
 from pipeline.store.commits import read_commits
 from pipeline.store.files import open_files
+from pipeline.store.run import Run
 from pipeline.store.setup import check
 
 MANY_SECTIONS = 500
@@ -54,22 +55,38 @@ def _long(plan: Plan) -> tuple[int, int]:
     return sum(not is_start_dim(d) for d in long), sum(is_grid_dim(d) for d in long)
 
 
-def check_diagram(spec: str | Path, *, smoke: bool = False) -> None:
-    """Refuse a specification whose run is not drawn as a bifurcation diagram.
+def shown(run: Run) -> tuple[str, dict[str, Any], str]:
+    """Say what ``magpend run --plot`` draws of a run: never more than the run has.
 
-    Raises
-    ------
-    SpecError
-        Naming the figure that is.
+    Returns
+    -------
+    name : str
+        Of the figure.
+    options : dict
+        Its options.
+    left_out : str
+        One sentence on what the run has beside it, with the command that draws it; else empty.
     """
-    figure = first_figure(make_plan(load_spec(find_spec(spec), smoke=smoke)))
-    if figure != "bifurcation":
-        raise SpecError(
-            [
-                "--plot: a bifurcation diagram is drawn over one parameter; drop it, "
-                f"and use: magpend plot {figure} DIR"
-            ]
-        )
+    plan, cube = run.plan, run.cube()
+    name = first_figure(plan)
+    options: dict[str, Any] = {}
+    sizes = {d: n for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1 and not is_start_dim(d)}
+    swept = list(sizes)
+    as_map = name == "lyapunov" and len(swept) >= 2
+    if name == "regimes":  # a map of regimes would ask for an analysis, which may take long
+        name = "bifurcation"
+    if len(swept) >= 2:
+        options["at"] = {d: float(cube[d].values[sizes[d] // 2]) for d in swept[2 if as_map else 1 :]}
+    left = [f"{d} is drawn at {v:.6g}, one of {sizes[d]} values" for d, v in options.get("at", {}).items()]
+    more = f"magpend plot {first_figure(plan)} {run.name}"
+    if as_map:
+        options["as_map"] = True
+        left.append("the sections are not in the map")
+        more = f"magpend plot bifurcation {run.name} --at " + " --at ".join(f"{d}=VALUE" for d in swept[1:])
+    elif name == "lyapunov" and cube.sizes.get("exponent", 1) > 1:
+        left.append("all exponents but the largest")
+        more += " --spectrum"
+    return name, options, f"left out: {'; '.join(left)}. See: {more}" if left else ""
 
 
 def describe_plan(

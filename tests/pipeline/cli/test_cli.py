@@ -150,12 +150,31 @@ def test_figure_command__fits_the_products(axes, products, n_keep, command):
     assert figure_command(make_plan(parse_spec(spec)), Path("run")) == command
 
 
-def test_run__plot_of_a_map_is_refused_before_it_is_computed(main, write_spec, sweep_text, tmp_path):
+def test_run__plot_of_two_parameters_draws_a_diagram_and_says_what_is_left(main, write_spec, sweep_text):
     write_spec(sweep_text)
-    code, _, err = main("run", "spec.toml", "--plot")
-    assert code == Exit.REFUSED
-    assert "magpend plot regimes" in err
-    assert not (tmp_path / "runs").exists()
+    code, out, err = main("run", "spec.toml", "--workers", "0", "--plot")
+    assert code == 0, err
+    assert out.splitlines()[-3:] == [
+        "figure: runs/spec/figures/bifurcation_psi1_q_1.6.png",
+        "data: runs/spec/figures/bifurcation_psi1_q_1.6.nc",
+        "left out: q is drawn at 1.6, one of 2 values. See: magpend plot regimes runs/spec",
+    ]
+
+
+def test_run__plot_that_cannot_be_drawn_is_no_error(main, write_spec, walk_text, monkeypatch):
+    """A finished run is a finished run: the command ends with 0, the reason and the command that draws."""
+    from pipeline.plots import bifurcation
+
+    def refuse(*_, **__):
+        raise ValueError("no paint left")
+
+    monkeypatch.setattr(bifurcation, "plot_bifurcation", refuse)
+    write_spec(walk_text + "\n[smoke]\ninitial_conditions.n = 2\n")
+    code, out, _ = main("run", "spec.toml", "--smoke", "--workers", "0", "--plot")
+    assert code == 0
+    assert "no figure:" in out
+    assert "no paint left" in out
+    assert "draw it with: magpend plot bifurcation runs/spec-smoke" in out
 
 
 def test_run__status__verify__plot(main, write_spec, walk_text, tmp_path):

@@ -1,0 +1,134 @@
+"""What became of the cells of a run: how many, where, and the command that looks closer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magpend_core.status import Status
+from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, parameter_name, split_dims
+from pipeline.runs.preview import figure_command
+from pipeline.store.run import Run
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+WORTH_A_WARNING = 0.01
+"""Share of cells that diverged or failed from which a run ends with a warning."""
+
+Range = tuple[str, float, float, str]
+"""Axis, its least and largest value, its unit."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Cells of a run that have one status.
+
+    Attributes
+    ----------
+    status : Status
+    n_cells : int
+    share : float
+        Of all cells of the run.
+    where : tuple of Range
+        Of each swept parameter the range of values that such cells have, unless they have all of them.
+    """
+
+    status: Status
+    n_cells: int
+    share: float
+    where: tuple[Range, ...]
+
+    @property
+    def word(self) -> str:
+        """The status in words."""
+        return self.status.name.lower().replace("_", " ")
+
+    @property
+    def place(self) -> str:
+        """Where the cells are, such as ``frequency = 2.4 to 2.5 Hz``; empty if they are everywhere."""
+        return ", ".join(
+            f"{name} = {low:.6g}" + (f" to {high:.6g}" if high > low else "") + (f" {unit}" if unit else "")
+            for name, low, high, unit in self.where
+        )
+
+    @property
+    def line(self) -> str:
+        """One line of a summary."""
+        text = f"  {self.word:15s} {self.n_cells:>10d} {100 * self.share:>6.1f} %"
+        return text + (f"  {self.place}" if self.where else "")
+
+
+def outcomes_of(run: Run) -> list[Outcome]:
+    """Return what became of a run's cells, by status; reads ``status`` of every cell."""
+    status = run.cube()["status"].load()
+    codes = np.flatnonzero(np.bincount(status.values.ravel().astype(np.int64)))
+    return [_outcome(status, Status(int(code))) for code in codes]
+
+
+def _outcome(status: xr.DataArray, code: Status) -> Outcome:
+    there = status == code
+    n_cells = int(there.sum())
+    ranges = []
+    for dim in split_dims(status)[0]:
+        values = status[dim].values.astype(np.float64)
+        own = values[there.any([d for d in status.dims if d != dim]).values]
+        if 0 < own.size < values.size:
+            unit = str(status[dim].attrs.get("units", ""))
+            ranges.append((dim, float(own.min()), float(own.max()), "" if unit == "1" else unit))
+    return Outcome(code, n_cells, n_cells / max(status.size, 1), tuple(ranges))
+
+
+def summary(run: Run) -> list[str]:
+    """Return the lines with which ``magpend run`` ends: cells by status, where they are, what to do next."""
+    found = outcomes_of(run)
+    lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found)]
+    lines.append(f"plot it with: {figure_command(run.plan, run.name)}")
+    lost = lost_cells(found)
+    if lost:
+        lines.append(f"what each status means: magpend status {run.name}")
+        zoom = _zoom(lost, run)
+        lines += [f"look closer at the cells that were lost: {zoom}"] if zoom else []
+    return lines
+
+
+def lost_cells(found: Iterable[Outcome]) -> list[Outcome]:
+    """Return those of the outcomes that are no motion to look at: cells that diverged or failed."""
+    return [o for o in found if o.status in (DIVERGED, *FAILED)]
+
+
+def warning(run: Run) -> str:
+    """Return a warning if more cells were lost than `WORTH_A_WARNING`; else an empty text."""
+    found = outcomes_of(run)
+    lost, computed = lost_cells(found), sum(o.n_cells for o in found if o.status != PENDING)
+    n_lost = sum(o.n_cells for o in lost)
+    if n_lost <= WORTH_A_WARNING * computed:
+        return ""
+    told = "; ".join(
+        f"{o.n_cells} {o.word}" + (f" at {o.place}" if o.where else "") + f": {o.status.sentence}"
+        for o in lost
+    )
+    return (
+        f"warning: {n_lost} of {computed} cells ({100 * n_lost / computed:.1f} %) diverged or failed; "
+        f"figures leave them out. {told}."
+    )
+
+
+def _zoom(lost: list[Outcome], run: Run) -> str:
+    """Command that makes a specification of the range of lost cells; empty if it is no range."""
+    whole = dict(zip(run.plan.dims, run.plan.shape, strict=True))
+    spans: dict[str, tuple[float, float]] = {}
+    for dim in (d for d, n in whole.items() if n > 1):
+        ranges = [r for o in lost for r in o.where if r[0] == dim]
+        if len(ranges) == len(lost):  # none of them is everywhere
+            spans[dim] = min(r[1] for r in ranges), max(r[2] for r in ranges)
+    words = " ".join(
+        f"--axis {parameter_name(dim)}={low:.10g}:{high:.10g}"
+        if high > low
+        else f"--at {parameter_name(dim)}={low:.10g}"
+        for dim, (low, high) in spans.items()
+    )
+    return f"magpend zoom {run.name} {words} --out closer.toml" if words else ""
