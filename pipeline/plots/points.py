@@ -17,7 +17,8 @@ from pipeline.products.reporting import track
 DRAWN = (vocabulary.PERIODIC, vocabulary.BOUNDED, vocabulary.INFERRED)
 ABSENT = {
     "pending": (vocabulary.PENDING,),
-    "failed": (vocabulary.DIVERGED, vocabulary.STEP_LIMIT, vocabulary.STEP_UNDERFLOW),
+    "diverged": (vocabulary.DIVERGED,),
+    "failed": (vocabulary.STEP_LIMIT, vocabulary.STEP_UNDERFLOW),
     "not reached": (vocabulary.UNREACHED,),
     "no return": (vocabulary.NO_RETURN,),
     "chatter": (vocabulary.CHATTER,),

@@ -150,8 +150,8 @@ def test_plot_bifurcation__absent_cells_are_not_drawn_but_shown(status, stale):
     want = expected(set_status(ds, 1, 2, status), 1)
     assert len(want) == 12
     np.testing.assert_allclose(drawn(fig)["up:right"], want)
-    name = {PENDING: "pending", UNREACHED: "not reached"}.get(status, "failed")
-    assert name in legend_labels(fig)
+    name = {PENDING: "pending", UNREACHED: "not reached", DIVERGED: "diverged"}.get(status, "failed")
+    assert f"{name}: 1 of 20 cells" in legend_labels(fig)
     (path,) = next(a for a in fig.findobj() if a.get_gid() == f"absent:{name}").get_paths()
     low, high = path.get_extents().min, path.get_extents().max
     np.testing.assert_allclose([low, high], [[2.15, 0.0], [2.25, 0.25]], atol=1e-12)
@@ -182,7 +182,7 @@ def test_plot_bifurcation__empty_cube_says_so():
     assert [t.get_text() for t in fig.axes[0].texts] == ["nothing to draw yet: all 20 cells are pending"]
     ds["status"][0] = DIVERGED
     fig = plot_bifurcation(ds, layout="side")
-    assert fig.axes[0].texts[0].get_text() == "nothing to draw: of 20 cells, 15 pending, 5 failed"
+    assert fig.axes[0].texts[0].get_text() == "nothing to draw: of 20 cells, 15 pending, 5 diverged"
 
 
 def test_plot_bifurcation__sweep_pools_initial_conditions():
