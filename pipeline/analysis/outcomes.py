@@ -105,6 +105,11 @@ def _cells(ids: xr.Dataset, name: str) -> np.ndarray:
     return np.asarray(ids[name].transpose(*_dims(ids)).values)
 
 
+def left_out(ids: xr.Dataset) -> str:
+    """Return `sentence` if there are cells that end on no attractor; else an empty text."""
+    return sentence(ids) if other_cells(ids) else ""
+
+
 def sentence(ids: xr.Dataset) -> str:
     """One sentence on how many cells end on attractors, and what the others do."""
     total = ids["attractor_id"].size

@@ -15,11 +15,12 @@ from pipeline.plots.points import Survey
 # Greys instead of hatching: some readers of SVG paint its patterns black.
 LOOKS: dict[str, dict[str, Any]] = {
     "pending": {"facecolor": "0.92", "edgecolor": "0.6", "linewidth": 0.4},
-    "diverged": {"facecolor": "0.1", "edgecolor": "0.1", "linewidth": 0.8},
-    "failed": {"facecolor": "0.3", "edgecolor": "0.3", "linewidth": 0.8},
+    "diverged": {"facecolor": "0.0", "edgecolor": "0.0", "linewidth": 0.8},
+    "failed": {"facecolor": "0.28", "edgecolor": "0.28", "linewidth": 0.8},
     "not reached": {"facecolor": "0.62", "edgecolor": "0.62", "linewidth": 0.8},
     "no return": {"facecolor": "0.8", "edgecolor": "0.3", "linewidth": 0.6},
     "chatter": {"facecolor": "0.45", "edgecolor": "0.1", "linewidth": 0.6},
+    "without exponent": {"facecolor": "1.0", "edgecolor": "0.3", "linewidth": 0.6},
 }
 
 
@@ -49,18 +50,25 @@ def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Se
     strip.set_yticks([0.5], ["absent"])
     strip.tick_params(axis="y", which="both", right=False, left=False)
     strip.tick_params(axis="x", which="both", top=False)
-    blank = (floor >= 1.0 - 1e-12).astype(float)
+    shade_blank(ax, x, survey, layers)
+
+
+def shade_blank(ax: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
+    """Shade a diagram where no cell is left to draw; arguments as for `draw_absent`."""
+    shown = list(layers)
+    absent = sum((counts[shown].sum(0) for counts in survey.absent.values()), np.zeros(x.size, np.int64))
+    blank = (absent >= np.maximum(survey.cells[shown].sum(0), 1)).astype(float)
     if blank.any():
         looks = {"facecolor": "0.955", "linewidth": 0.0, "zorder": 1.5}
-        area = style.fill_columns(ax, edges, np.zeros(blank.size), blank, looks, "blank")
+        area = style.fill_columns(ax, style.edges(x), np.zeros(blank.size), blank, looks, "blank")
         area.set_transform(ax.get_xaxis_transform())
 
 
 def absent_handles(survey: Survey) -> list[Patch]:
-    """Handles of a legend for what became of cells without a point, and of how many."""
-    n_cells = int(survey.cells.sum())
+    """Handles of a legend for cells that are left out: why, and how many."""
+    total = int(survey.cells.sum())
     return [
-        Patch(label=f"{name}: {int(counts.sum())} of {n_cells}", **LOOKS[name])
+        Patch(label=f"{name}: {int(counts.sum())} of {total} cells", **LOOKS[name])
         for name, counts in survey.absent.items()
         if counts.any()
     ]

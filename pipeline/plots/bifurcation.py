@@ -41,8 +41,8 @@ def plot_bifurcation(
 
     Everything is read from the cube; nothing is integrated. The kinds of motion are those that the
     model's classifier tells apart; without one, all points have one colour. Where cells are pending,
-    failed or not reached, a strip below the diagram shows their share at each value of the parameter, and
-    the diagram is shaded where no cell at all is left to draw.
+    diverged, failed or not reached, a strip below the diagram shows their share at each value of the
+    parameter, the legend gives their numbers, and the diagram is shaded where no cell at all is left to draw.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ class Diagram:
             return max(low - margin, -reach), min(high + margin, reach)
         return low - margin, high + margin
 
-    def handles(self, *, layers: bool = True) -> list[Any]:
+    def handles(self, *, layers: bool = True, absent: bool = True) -> list[Any]:
         """Handles of a legend: motions, directions, absent cells."""
         motions, kinds = self.view.motions, {code for _, code in self.survey.classes}
         found: list[Any] = []
@@ -180,7 +180,7 @@ class Diagram:
         if layers and len(self.view.layers) > 1 and not self.survey.empty:
             for i, look in pixels.looks(1.0, range(len(self.view.layers))).items():
                 found.append(style.dot(self.view.layers[i], style.tinted("black", look.tint), 3.0 + 3.0 * i))
-        return found + absent_handles(self.survey)
+        return found + (absent_handles(self.survey) if absent else [])
 
     def draw(self, panels: Sequence[pixels.Panel]) -> xr.Dataset:
         """Draw the points into axes whose places are final, and return what was drawn."""

@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
+from pipeline.analysis.outcomes import left_out
 from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES
@@ -83,7 +84,7 @@ def plot_coexisting(
     style.limits(ax, frame, style.span(data[parameter].values))
     labels.angle_ticks(ax, measure)
     style.label_axes(ax, labels.parameter_label(data[parameter]), measure.label)
-    style.complete(fig, ax, labels.caption(part, drop=[parameter]))
+    style.complete(fig, ax, style.join([labels.caption(part, drop=[parameter]), left_out(part)]))
     return fig
 
 

@@ -16,7 +16,7 @@ from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.layout.words import period_of, periods_of
 from pipeline.plots import labels, style
 from pipeline.plots.door import Run, frame_of, noted, values_of
-from pipeline.plots.lyapunov import UNITS
+from pipeline.plots.lyapunov import UNITS, left_out
 from pipeline.products.figures import ConvergenceOptions
 
 MOST_LINES = 24
@@ -103,7 +103,7 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
     summary = summarise(part)
     if not 1 <= exponent <= part.sizes["exponent"]:
         raise ValueError(f"exponent is {exponent}, and the cube has 1 to {part.sizes['exponent']}")
-    place = labels.caption(part, with_start=False)
+    place = style.join([labels.caption(part, with_start=False), left_out(part)])
     model = model_of(part)
     scale = period_seconds(part) if per == "period" else 1.0
     chosen = xr.Dataset(

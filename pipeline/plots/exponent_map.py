@@ -9,13 +9,15 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import swept_parameters
-from pipeline.plots.lyapunov import UNITS, demand, exponent_values, rate_unit
+from pipeline.plots.lyapunov import UNITS, demand, exponent_values, left_out, rate_unit
 from pipeline.plots.selection import at_points
 
+_NO_EXPONENT = "0.8"
 _SHOWN = 0.98
 """Share of the points whose exponents the scale holds, so that a few do not pale all others."""
 
@@ -45,7 +47,8 @@ def plot_lyapunov_map(
     DataFigure
         At each point the largest exponent that any of its cells has: chaos shows wherever one of
         the coexisting attractors is chaotic. White is 0, and the same distance from it has the same
-        depth of colour on both sides. Grey where no cell has one. Its `data` hold ``exponent_value`` and
+        depth of colour on both sides. Grey where no cell has one; the line above says how many cells have
+        none, and why. Its `data` hold ``exponent_value`` and
         ``chaotic_share``, the share of cells whose exponent is positive.
 
     Raises
@@ -76,7 +79,7 @@ def plot_lyapunov_map(
     ax = fig.add_subplot()
     style.style_axes(ax, inside=False)
     _draw_map(fig, ax, data, part, swept)
-    style.caption(ax, labels.caption(part, drop=swept))
+    style.caption(ax, style.join([labels.caption(part, drop=swept), left_out(part)]))
     style.limits(ax, frame, *(style.span(part[d].values) for d in swept))
     style.finish(fig)
     return fig
@@ -86,10 +89,12 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
     grid = data["exponent_value"].values
     x, y = (style.edges(part[d].values.astype(np.float64)) for d in swept)
     norm, extend = _scale(grid)
-    ax.set_facecolor("0.8")
+    ax.set_facecolor(_NO_EXPONENT)
     image = ax.pcolormesh(x, y, np.ma.masked_invalid(grid), cmap="PuOr_r", norm=norm, rasterized=True)
     image.set_gid("map")
     style.label_axes(ax, *(labels.parameter_label(part[d]) for d in swept))
+    if not np.isfinite(grid).all():
+        style.legend_above(fig, [Patch(facecolor=_NO_EXPONENT, label="no cell has an exponent")])
     bar = fig.colorbar(
         ScalarMappable(norm, "PuOr_r"), ax=ax, extend=extend, pad=0.015, aspect=32, ticks=MaxNLocator(7)
     )

@@ -15,9 +15,11 @@ from pipeline.analysis.chaos.lyapunov import GOOD, period_seconds
 from pipeline.layout.vocabulary import model_of
 from pipeline.layout.words import period_of
 from pipeline.plots import labels, pixels, style
+from pipeline.plots.absent import absent_handles, draw_absent, shade_blank
 from pipeline.plots.bifurcation import Diagram, with_diagram
 from pipeline.plots.door import Run, frame_of, noted, values_of
 from pipeline.plots.motions import motion_codes, motions_of
+from pipeline.plots.points import ABSENT, DRAWN, Survey
 from pipeline.products.figures import LyapunovFigureOptions
 
 UNITS = ("s", "period")
@@ -58,10 +60,10 @@ def plot_lyapunov(
     -------
     DataFigure
         Points are cells, bands one standard error on either side of them; open points are cells
-        whose exponents were flagged, and crosses at the lower edge mark where cells have none. Its
-        `data` hold ``exponent_value``, ``exponent_stderr``,
-        ``lyapunov_flag``, and ``motion`` where motions are told apart; with the suffix ``_diagram``
-        what is drawn above.
+        whose exponents were flagged. Where cells have none, a strip below shows their share at each value
+        of the parameter, and the legend says how many there are and why. Its `data` hold ``exponent_value``,
+        ``exponent_stderr``, ``lyapunov_flag``, and ``motion`` where motions are told apart; with the
+        suffix ``_diagram`` what is drawn above.
 
     Raises
     ------
@@ -74,20 +76,57 @@ def plot_lyapunov(
     part = diagram.view.ds
     part = part.squeeze([d for d in part["status"].dims if d != diagram.parameter and part.sizes[d] == 1])
     data = exponent_values(part, per, spectrum)
+    lost = _lost(diagram, data)
+    with_strip = any(counts.any() for counts in lost.absent.values())
     fig = style.new_figure(5.6, data, frame)
-    grid = fig.add_gridspec(2, 1, height_ratios=[1.25, 1.0])
+    grid = fig.add_gridspec(
+        3 if with_strip else 2, 1, height_ratios=[1.25, 1.0, 0.08][: 3 if with_strip else 2]
+    )
     top = fig.add_subplot(grid[0])
     diagram.dress(top)
-    bottom = fig.add_subplot(grid[1], sharex=top)
+    bottom = lowest = fig.add_subplot(grid[1], sharex=top)
     low_handles = _draw_exponents(bottom, data, diagram.parameter, spectrum, motions_of(part).colours)
     top.tick_params(labelbottom=False)
     if frame.ylim:
         bottom.set_ylim(*style.check_range("ylim", frame.ylim))
-    style.label_axes(bottom, x=labels.parameter_label(part[diagram.parameter]))
+    if with_strip:
+        lowest = fig.add_subplot(grid[2], sharex=top)
+        _draw_lost(top, bottom, lowest, diagram, lost)
+    style.label_axes(lowest, x=labels.parameter_label(part[diagram.parameter]))
     fig.align_ylabels([top, bottom])
-    style.complete(fig, top, diagram.caption, [*diagram.handles(), *low_handles])
+    handles = [*diagram.handles(absent=False), *low_handles, *absent_handles(lost)]
+    style.complete(fig, top, diagram.caption, handles)
     fig.data = with_diagram(data, diagram.draw([pixels.Panel(top, diagram.layers)]))
     return fig
+
+
+def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
+    """The diagram's absent cells, and those that have points but no exponent."""
+    found = diagram.survey
+    value = data["exponent_value"].isel(exponent=0)
+    others = [d for d in value.dims if d != diagram.parameter]
+    without = np.zeros_like(found.cells)
+    without[0] = (~np.isfinite(value)).sum(others).values
+    without[0] -= sum(counts.sum(0) for counts in found.absent.values())
+    return replace(found, absent={**found.absent, "without exponent": np.maximum(without, 0)})
+
+
+def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Survey) -> None:
+    """Draw the share of lost cells in a strip, and shade both panels where they show nothing."""
+    style.style_axes(strip, minor=False)
+    shade_blank(top, diagram.x, diagram.survey, diagram.layers)
+    draw_absent(bottom, strip, diagram.x, lost, diagram.layers)
+    bottom.tick_params(labelbottom=False)
+
+
+def left_out(part: xr.Dataset) -> str:
+    """Say how many cells have no exponent, by what became of them; empty if all have one."""
+    status = part["status"]
+    missing = ~np.isfinite(part["lyapunov"].isel(exponent=0, drop=True)).transpose(*status.dims)
+    counts = {name: int((missing & status.isin(codes)).sum()) for name, codes in ABSENT.items()}
+    counts["without exponent"] = int((missing & status.isin(DRAWN)).sum())
+    listed = style.join(f"{n} {name}" for name, n in counts.items() if n)
+    return f"left out of {status.size} cells: {listed}" if listed else ""
 
 
 def demand(ds: xr.Dataset) -> None:
@@ -149,25 +188,11 @@ def _draw_exponents(
         for code, colour in enumerate(colours):
             own = np.where(motion == code, value[..., 0], np.nan)
             _draw_class(ax, x, own, error[..., 0], flag, colour, f"exponent:{code}")
-    none = ~np.isfinite(value[..., 0])
-    if none.any():
-        handles.append(_draw_without(ax, x, none))
     if ((flag > GOOD) & np.isfinite(value[..., 0])).any():
         handles.append(style.dot("flagged", "0.3", 4.0, face="none"))
     name = "exponents" if spectrum else "largest exponent"
     style.label_axes(ax, y=f"{name} [{rate_unit(data)}]")
     return handles
-
-
-def _draw_without(ax: Axes, x: np.ndarray, none: np.ndarray) -> Any:
-    """Mark at the lower edge where cells have no exponents; returns the legend's handle."""
-    where = x[none.any(axis=1)]
-    (marks,) = ax.plot(
-        where, np.full(where.size, 0.025), transform=ax.get_xaxis_transform(), linestyle="none", marker="x",
-        markersize=3.0, markeredgewidth=0.7, color="0.1", zorder=2.5, clip_on=False,
-        label=f"no exponents: {int(none.sum())} of {none.size}", gid="without",
-    )  # fmt: skip
-    return marks
 
 
 def _draw_class(

@@ -48,7 +48,7 @@ OTHERS = "#C8E6C0"
 GREYS = {
     "not settled": "0.7", "on a transient set": "0.82", "on an unstable orbit or equilibrium": "#6b5d4f",
     "on a neutral set": "#acbfd2", "diverged": "0.0", "failed": "0.45", "no return": "0.17",
-    "chatter": "#3d3325", "pending": "0.95",
+    "chatter": "#320836", "pending": "0.95",
 }  # fmt: skip
 """Cells that do not end on an attractor, with their greys; see `pipeline.analysis.outcomes`.
 

@@ -15,7 +15,7 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex, t
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import basin_fractions
-from pipeline.analysis.outcomes import outcomes, share_interval
+from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import ATTRACTS
@@ -79,7 +79,7 @@ def plot_regimes(
     data = _regimes(part, x, y, show)
     titles = {"periods": "periods of the coexisting attractors", "attractors": "coexisting attractors"}
     fixed = labels.caption(part, drop=[x, y])
-    text = style.join([titles.get(show, "number of attractors"), fixed, _about(data)])
+    text = style.join([titles.get(show, "number of attractors"), fixed, _about(data), left_out(part)])
     several = show != "number" and np.unique(data["regime"]).size > len(palette.COLOURS)
     if several:
         return _draw_multiples(data, x, y, show, text, frame, palette.cast_of(attractors, part))

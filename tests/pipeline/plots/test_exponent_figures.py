@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from magpend_core.status import Status
 from pipeline.plots import Frame, plot_convergence, plot_lyapunov, plot_lyapunov_map
 from pipeline.plots.convergence import MOST_LINES
 from pipeline.plots.exponent_map import _scale
@@ -98,11 +99,50 @@ def test_plot_lyapunov__over_a_parameter_at_a_fixed_frequency():
     assert "x_diagram" in figure.data
 
 
-def test_plot_lyapunov__marks_where_cells_have_no_exponents():
-    ds = make_cube(3, ("F",), (6,))
-    assert not [a for a in plot_lyapunov(ds).findobj() if a.get_gid() == "without"]
-    ds["lyapunov"][dict(F=2, initial_condition=[0, 1])] = np.nan
+def lose(ds, index, status):
+    """Give a cell a status, and no section and no exponent."""
+    ds["status"][index] = status
+    for name in ("section", "lyapunov", "lyapunov_stderr", "lyapunov_blocks"):
+        ds[name][index] = np.nan
+    ds["lyapunov_flag"][index] = 0
+
+
+def boxes(axes, gid):
+    """Range of x of what has an identifier."""
+    found = [c for c in axes.collections if c.get_gid() == gid]
+    xs = np.concatenate([path.vertices[:, 0] for c in found for path in c.get_paths()] or [np.empty(0)])
+    return (xs.min(), xs.max()) if xs.size else None
+
+
+def test_plot_lyapunov__shows_where_cells_were_lost_and_why():
+    """Cells that diverged were no more than a gap, and were called failed in the panel above."""
+    ds = make_cube(2, ("F",), (6,))
+    for cell in range(2):
+        lose(ds, (4, cell), Status.DIVERGED)
+    lose(ds, (5, 0), Status.STEP_LIMIT)
+    ds["status"][0, 0] = Status.INFERRED  # has a section, and no exponent
+    ds["lyapunov"][0, 0] = np.nan
     figure = plot_lyapunov(ds)
-    (marks,) = [a for a in figure.findobj() if a.get_gid() == "without"]
-    assert marks.get_xdata().tolist() == [ds["F"].values[2]]
-    assert marks.get_label() == "no exponents: 2 of 18"
+    labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert labels[-3:] == [
+        "diverged: 2 of 12 cells", "failed: 1 of 12 cells", "without exponent: 1 of 12 cells"
+    ]  # fmt: skip
+    top, bottom, strip = figure.axes
+    assert boxes(strip, "absent:diverged") == (3.5, 4.5)
+    assert boxes(strip, "absent:without exponent") == (-0.5, 0.5)
+    assert boxes(top, "blank") == boxes(bottom, "blank") == (3.5, 4.5)
+    assert strip.get_xlabel() == "F"
+    assert len(plot_lyapunov(make_cube(2, ("F",), (6,))).axes) == 2
+
+
+def test_left_out__figures_of_exponents_say_how_many_cells_and_why():
+    ds = make_cube(3, ("F", "delta"), (4, 3))
+    assert "left out" not in plot_lyapunov_map(ds).axes[0].get_title(loc="left")
+    for cell in range(3):
+        lose(ds, (1, 1, cell), Status.DIVERGED)
+    lose(ds, (0, 0, 0), Status.STEP_UNDERFLOW)
+    figure = plot_lyapunov_map(ds)
+    assert figure.axes[0].get_title(loc="left").endswith("left out of 36 cells: 3 diverged, 1 failed")
+    assert [t.get_text() for t in figure.legends[0].get_texts()] == ["no cell has an exponent"]
+    at_point = plot_convergence(ds, at={"F": 0.0, "delta": 0.0})
+    assert at_point.axes[0].get_title(loc="left").endswith("left out of 3 cells: 1 failed")

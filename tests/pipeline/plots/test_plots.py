@@ -151,7 +151,7 @@ def test_plot_bifurcation__absent_cells_are_not_drawn_but_shown(status, stale):
     assert len(want) == 12
     np.testing.assert_allclose(drawn(fig)["up:right"], want)
     name = {PENDING: "pending", UNREACHED: "not reached", DIVERGED: "diverged"}.get(status, "failed")
-    assert f"{name}: 1 of 20" in legend_labels(fig)
+    assert f"{name}: 1 of 20 cells" in legend_labels(fig)
     (path,) = next(a for a in fig.findobj() if a.get_gid() == f"absent:{name}").get_paths()
     low, high = path.get_extents().min, path.get_extents().max
     np.testing.assert_allclose([low, high], [[2.15, 0.0], [2.25, 0.25]], atol=1e-12)

@@ -531,6 +531,21 @@ def test_plot_regimes__each_point_has_its_regime(map_of_two):
     assert fig.data["n_attractors"].transpose("frequency", "q").values.tolist() == [[1, 2, 1], [1, 1, 0]]
 
 
+def test_attractor_figures__say_how_many_cells_are_left_out_and_why(map_of_two, sweep):
+    """Which cells a map of regimes does not count, and a diagram does not show, stood nowhere."""
+    map_of_two["status"][0, 2, 0] = Status.DIVERGED
+    map_of_two["attractor_id"][0, 2, 0] = -1
+    total = map_of_two["attractor_id"].size
+    others = palette.other_cells(map_of_two)
+    n = total - sum(int(which.sum()) for which in others.values())
+    told = caption_of(plot_regimes(map_of_two))
+    assert f"{n} of {total} cells end on attractors; 1 diverged" in told
+    told = caption_of(plot_coexisting(sweep))
+    assert "26 of 30 cells end on attractors; 1 diverged, 2 not settled, 1 pending" in told
+    settled = sweep.isel(frequency=[0])
+    assert "cells end on attractors" not in caption_of(plot_coexisting(settled))
+
+
 def test_plot_regimes__only_what_attracts_is_counted(map_of_two):
     map_of_two["stability"][0, 1, 1] = vocabulary.NOT_SETTLED
     fig = plot_regimes(map_of_two)
