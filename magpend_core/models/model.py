@@ -207,6 +207,11 @@ class Model:
         return self.name if self.text is None else self.text
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on what looks like an oversight in the model's text, such as a parameter without use."""
+        return ()
+
+    @property
     def crossing(self) -> Crossing | None:
         """The section by crossing that the model is seen through; None at the period of a drive."""
         return None

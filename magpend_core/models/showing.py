@@ -78,7 +78,7 @@ def _written(model: Model) -> tuple[dict[str, str], dict[str, str], list[str]]:
     from magpend_core.models.text.latex import equations_of
 
     own = model.definition
-    needed = own.used(own.equations.values())
+    needed = own.used(own.dynamics)
     written = {name: str(text) for name, text in own.table.get("define", {}).items() if name in needed}
     equations = {name: str(own.table["equations"][name]) for name in own.equations}
     return written, equations, equations_of(own)

@@ -97,6 +97,8 @@ def _lines(model: Model, found: Description) -> list[str]:
         "found",
         *(f"  {line}" for line in found.found or ["no edges, layers, switches or impacts"]),
     ]
+    if model.remarks:
+        lines += ["", "warnings", *(f"  {line}" for line in model.remarks)]
     if found.problems:
         lines += ["", "checks: failed", *(f"  {line}" for line in found.problems)]
     else:
@@ -127,5 +129,6 @@ def _as_dict(model: Model, found: Description) -> dict[str, Any]:
         "equations": found.equations,
         "latex": found.latex,
         "found": found.found,
+        "warnings": list(model.remarks),
         "problems": found.problems,
     }

@@ -106,7 +106,7 @@ def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
     value = data["exponent_value"].isel(exponent=0)
     others = [d for d in value.dims if d != diagram.parameter]
     without = np.zeros_like(found.cells)
-    without[0] = (~np.isfinite(value)).sum(others).values
+    without[0] = value.isnull().sum(others).values
     without[0] -= sum(counts.sum(0) for counts in found.absent.values())
     return replace(found, absent={**found.absent, "without exponent": np.maximum(without, 0)})
 
@@ -122,7 +122,7 @@ def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Sur
 def left_out(part: xr.Dataset) -> str:
     """Say how many cells have no exponent, by what became of them; empty if all have one."""
     status = part["status"]
-    missing = ~np.isfinite(part["lyapunov"].isel(exponent=0, drop=True)).transpose(*status.dims)
+    missing = part["lyapunov"].isel(exponent=0, drop=True).isnull().transpose(*status.dims)
     counts = {name: int((missing & status.isin(codes)).sum()) for name, codes in ABSENT.items()}
     counts["without exponent"] = int((missing & status.isin(DRAWN)).sum())
     listed = style.join(f"{n} {name}" for name, n in counts.items() if n)

@@ -111,6 +111,7 @@ def describe_plan(
     check_space(plan, files.local, plan.n_cells - sum(plan.cells_in(i) for i in done))
     if parsed.title:
         yield parsed.title
+    yield from (f"warning: {remark}" for remark in parsed.model.flow.remarks)
     dims = ", ".join(f"{d} {n}" for d, n in zip(plan.dims, plan.shape, strict=True))
     yield f"{parsed.kind}: {plan.n_cells} cells ({dims or 'one cell'})"
     yield f"tasks: {plan.n_tasks} of {' x '.join(map(str, plan.block)) or '1'} cells, {len(done)} done"

@@ -99,6 +99,8 @@ def run(
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)
+    for remark in parsed.model.flow.remarks:
+        echo(f"warning: {remark}")
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
     return state(files)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from pipeline.spec.toml import toml_key, toml_value
 
 
 def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -> Model:
-    """Return a model, wherever it is written down.
+    """Return a model, wherever it is written down; warn of what nothing in its text uses.
 
     Parameters
     ----------
@@ -29,6 +30,15 @@ def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -
     ModelError, SpecError
         If there is none, with the nearest names; if it is wrong, with all its problems.
     """
+    model = _found(reference)
+    if model is not reference:
+        for remark in model.remarks:
+            warnings.warn(remark, stacklevel=2)
+    return model
+
+
+def _found(reference: str | Path | Mapping[str, Any] | Model) -> Model:
+    """Return the model without a remark."""
     if isinstance(reference, str) and not reference.lstrip().startswith("{") and is_toml_text(reference):
         return _model_in(toml_tables(reference.encode(), "the text"), Path())
     if isinstance(reference, Path) or (isinstance(reference, str) and is_model_file(reference)):

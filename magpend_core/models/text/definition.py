@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -9,7 +10,8 @@ from typing import Any
 
 from magpend_core.models.model import Mirror, Preset, Quantity, State
 from magpend_core.models.parameters import Parameter
-from magpend_core.models.text.grammar import Tree, names, written
+from magpend_core.models.text.grammar import Tree, names
+from magpend_core.models.text.writing import written
 
 
 @dataclass(frozen=True)
@@ -103,11 +105,32 @@ class Definition:
         return tuple(found)
 
     @property
+    def dynamics(self) -> list[Tree]:
+        """Expressions of the equations and the impacts."""
+        of_impacts = [tree for i in self.impacts for tree in (i.of, *i.set.values())]
+        return [*self.equations.values(), *of_impacts]
+
+    @property
     def autonomous(self) -> bool:
         """Whether neither the equations nor the impacts need time or frequency."""
-        trees = [*self.equations.values(), *(i.of for i in self.impacts)]
-        trees += [tree for impact in self.impacts for tree in impact.set.values()]
-        return not {"t", "f", "phase"} & set(self.used(trees))
+        return not {"t", "f", "phase"} & set(self.used(self.dynamics))
+
+    def remarks(self) -> list[str]:
+        """Return a sentence for each parameter and definition that no expression uses."""
+        trees = [*self.dynamics, *self.quantities.values()]
+        if self.drawing is not None:
+            trees += [
+                t for pair in (*self.drawing.points.values(), *self.drawing.fixed.values()) for t in pair
+            ]
+        if self.classifier is not None:
+            trees += self.classifier.words.values()
+        used = set(self.used(trees))
+        own = {**{p.name: "parameters" for p in self.parameters}, **dict.fromkeys(self.define, "define")}
+        return [
+            f"model.{table}.{name}: nothing uses it; {_suggestion(name, table, used)}"
+            for name, table in own.items()
+            if name not in used
+        ]
 
     def meaning(self) -> str:
         """What decides numbers, in one way of writing: the same for texts that differ in layout or words."""
@@ -129,6 +152,14 @@ class Definition:
             ],
         }
         return json.dumps(plain, sort_keys=True)
+
+
+def _suggestion(name: str, table: str, used: Iterable[str]) -> str:
+    """What to do about a name that nothing uses."""
+    near = difflib.get_close_matches(name, sorted(used), n=1, cutoff=0.6)
+    meant = f"did you mean it where an expression has {near[0]}? Else" if near else ""
+    effect = " (to sweep it would change nothing)" if table == "parameters" else ""
+    return f"{meant} use it in an expression, or take it out{effect}.".strip()
 
 
 def needed(tree: Tree, define: Mapping[str, Tree]) -> Iterator[str]:

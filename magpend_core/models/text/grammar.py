@@ -7,10 +7,11 @@ that whatever is given ends in a tree or in one `GrammarError`, in time proporti
 
 from __future__ import annotations
 
+import itertools
 import keyword
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from magpend_core.models.parameters import near_names
@@ -54,12 +55,25 @@ _COMPARISONS = ("<", "<=", ">", ">=")
 _OR, _AND, _NOT, _COMPARE, _SUM, _PRODUCT, _SIGN, _POWER = range(1, 9)
 _BINDING = {
     "or": _OR, "and": _AND, **dict.fromkeys(_COMPARISONS, _COMPARE), "+": _SUM, "-": _SUM, "*": _PRODUCT,
-    "/": _PRODUCT, "**": _POWER,
+    "/": _PRODUCT, "**": _POWER, "^": _POWER,
 }  # fmt: skip
 
 
 class GrammarError(ValueError):
-    """A text is no expression: what is wrong, with its place."""
+    """A text is no expression.
+
+    Attributes
+    ----------
+    problems : tuple of str
+        All that is wrong, each with its place; what follows a wrong sign or bracket is not judged.
+    names : tuple of (str, int)
+        Names in the text, each with its place.
+    """
+
+    def __init__(self, problems: str | Iterable[str], names: Iterable[tuple[str, int]] = ()) -> None:
+        self.problems = (problems,) if isinstance(problems, str) else tuple(problems)
+        self.names = tuple(names)
+        super().__init__("; ".join(self.problems))
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +148,25 @@ def _parse(text: object) -> Tree:
         raise GrammarError(f"has {len(text)} characters; {MAX_LENGTH} are the most, use define for parts")
     if not text.strip():
         raise GrammarError("is empty; write an expression")
-    return _Parser(text).whole()
+    tokens, problems = _tokens(text)
+    tree = None
+    if not problems:
+        parser = _Parser(tokens)
+        problems = parser.problems
+        try:
+            tree = parser.whole()
+        except GrammarError as error:
+            problems += error.problems
+    if tree is None or problems:
+        raise GrammarError(problems, _names_among(tokens))
+    return tree
+
+
+def _names_among(tokens: list[_Token]) -> Iterator[tuple[str, int]]:
+    """Each name with its place, where there is no tree; functions are not among them."""
+    for token, after in itertools.pairwise(tokens):
+        if token.kind == "name" and after.text != "(" and token.text not in ("and", "or", "not"):
+            yield token.text, token.at
 
 
 def names(tree: Tree) -> Iterator[tuple[str, int]]:
@@ -158,41 +190,6 @@ def name_problem(name: object) -> str | None:
     return None
 
 
-def written(tree: Tree) -> str:
-    """Write a tree as text in one way, which reads back to the same tree: spaces and brackets are gone."""
-    return _WRITE[tree.kind](tree, [written(arg) for arg in tree.args])
-
-
-def _write_call(tree: Tree, args: list[str]) -> str:
-    return f"{tree.value}({','.join(args)})"
-
-
-def _joined(sign: str) -> Callable[[Tree, list[str]], str]:
-    return lambda tree, args: f"({sign.join(args)})"
-
-
-def _write_product(tree: Tree, args: list[str]) -> str:
-    # an inverse writes its sign itself; one that stands first needs something to divide
-    text = "".join(a if i == 0 or a.startswith("/") else f"*{a}" for i, a in enumerate(args))
-    return f"({text})"
-
-
-_WRITE: dict[str, Callable[[Tree, list[str]], str]] = {
-    "number": lambda tree, args: repr(tree.value),
-    "name": lambda tree, args: str(tree.value),
-    "call": _write_call,
-    "sum": _joined("+"),
-    "product": _write_product,
-    "negative": lambda tree, args: f"(-{args[0]})",
-    "inverse": lambda tree, args: f"/{args[0]}",
-    "power": lambda tree, args: f"({args[0]}**{args[1]})",
-    "compare": lambda tree, args: f"({args[0]}{tree.value}{args[1]})",
-    "and": _joined(" and "),
-    "or": _joined(" or "),
-    "not": lambda tree, args: f"(not {args[0]})",
-}
-
-
 def _number(value: float, at: int) -> Tree:
     if value < 0.0:
         return Tree("negative", at, "", (Tree("number", at, -value),))
@@ -206,17 +203,22 @@ class _Token:
     at: int
 
 
-def _tokens(text: str) -> list[_Token]:
+def _tokens(text: str) -> tuple[list[_Token], list[str]]:
+    """Tokens of a text, and what is wrong with its characters, the first time that each stands there."""
     found: list[_Token] = []
+    odd: dict[str, int] = {}
     place = 0
     while True:
         space = _SPACE.match(text, place)
         place = space.end() if space else place
         if place == len(text):
-            return [*found, _Token("end", "", place + 1)]
+            problems = [f"{char!r} at character {at} has no meaning here" for char, at in odd.items()]
+            return [*found, _Token("end", "", place + 1)], problems
         match = _TOKEN.match(text, place)
         if match is None:
-            raise GrammarError(f"{text[place]!r} at character {place + 1} has no meaning here")
+            odd.setdefault(text[place], place + 1)
+            place += 1
+            continue
         found.append(_Token(str(match.lastgroup), match.group(), place + 1))
         place = match.end()
 
@@ -224,10 +226,11 @@ def _tokens(text: str) -> list[_Token]:
 class _Parser:
     """Precedence climbing; two calls for each level of nesting."""
 
-    def __init__(self, text: str) -> None:
-        self.tokens = _tokens(text)
+    def __init__(self, tokens: list[_Token]) -> None:
+        self.tokens = tokens
         self.next = 0
         self.depth = 0
+        self.problems: list[str] = []  # those after which the rest can still be read
 
     @property
     def token(self) -> _Token:
@@ -249,7 +252,7 @@ class _Parser:
     def unexpected(self, token: _Token) -> GrammarError:
         """What is wrong with a token that cannot follow, with a remedy where one is known."""
         hints = {
-            "^": "; powers are written **", "==": "; compare with < or >", "!=": "; compare with < or >",
+            "==": "; compare with < or >", "!=": "; compare with < or >",
             "=": "; an expression assigns nothing", ")": ": there is no ( for it",
         }  # fmt: skip
         if token.kind == "end":
@@ -283,25 +286,39 @@ class _Parser:
     def joined(self, left: Tree, token: _Token, binding: int) -> Tree:
         """Read what follows a sign."""
         if binding == _POWER:
+            begin = self.next
             right = self.expression(_SIGN)
-            return Tree("power", token.at, "", _numbers((left, right), token))
+            self.check_tower(token, begin)
+            return Tree("power", token.at, "", self.numbers((left, right), token))
         right = self.expression(binding + 1)
         if binding == _COMPARE:
-            _numbers((left, right), token)
+            self.numbers((left, right), token)
             if self.token.text in _COMPARISONS:
                 raise GrammarError(
                     f"{self.token.text!r} at character {self.token.at}: compare two at a time, joined by and"
                 )
             return Tree("compare", token.at, token.text, (left, right))
         if binding in (_AND, _OR):
-            _conditions((left, right), token)
+            self.conditions((left, right), token)
             return _flat(token.text, left, right)
-        _numbers((left, right), token)
+        self.numbers((left, right), token)
         if token.text == "-":
             right = Tree("negative", token.at, "", (right,))
         if token.text == "/":
             right = Tree("inverse", token.at, "", (right,))
         return _flat("sum" if binding == _SUM else "product", left, right)
+
+    def check_tower(self, token: _Token, begin: int) -> None:
+        """Note a power of a power with ^ and without brackets: languages read it from different sides."""
+        depth, powers = 0, [token]
+        for inner in self.tokens[begin : self.next]:
+            depth += (inner.text == "(") - (inner.text == ")")
+            powers += [inner] if depth == 0 and inner.text in ("**", "^") else []
+        if len(powers) == 2 and "^" in {power.text for power in powers}:
+            self.problems.append(
+                f"{powers[1].text!r} at character {powers[1].at}: a power of a power is read from the "
+                "left by some languages and from the right by others; write brackets, as in x**(y**z)"
+            )
 
     def prefix(self) -> Tree:
         """Read what an expression can begin with."""
@@ -309,15 +326,15 @@ class _Parser:
         if token.kind == "number":
             value = float(token.text)
             if not math.isfinite(value):
-                raise GrammarError(f"the number at character {token.at} is too large")
+                self.problems.append(f"the number at character {token.at} is too large")
             return Tree("number", token.at, value)
         if token.text in ("+", "-"):
             right = self.expression(_SIGN)
-            _numbers((right,), token)
+            self.numbers((right,), token)
             return Tree("negative", token.at, "", (right,)) if token.text == "-" else right
         if token.text == "not":
             right = self.expression(_NOT)
-            _conditions((right,), token)
+            self.conditions((right,), token)
             return Tree("not", token.at, "", (right,))
         if token.text == "(":
             inner = self.expression(_OR)
@@ -345,7 +362,7 @@ class _Parser:
         """Read the arguments of a function."""
         opened = self.take()
         if name.text not in FUNCTIONS:
-            raise GrammarError(unknown(name.text, name.at, FUNCTIONS, "function"))
+            self.problems.append(unknown(name.text, name.at, FUNCTIONS, "function"))
         args: list[Tree] = []
         while self.token.text != ")":
             args.append(self.expression(_OR))
@@ -353,21 +370,43 @@ class _Parser:
                 break
             self.take()
         self.close(opened)
-        least, most = FUNCTIONS[name.text]
+        self.check_arguments(name, args)
+        return Tree("call", name.at, name.text, tuple(args))
+
+    def check_arguments(self, name: _Token, args: list[Tree]) -> None:
+        """Note a wrong number of arguments, and conditions in the place of numbers."""
+        least, most = FUNCTIONS.get(name.text, (0, len(args)))
         if not least <= len(args) <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
-            raise GrammarError(
+            self.problems.append(
                 f"{name.text} at character {name.at} has {len(args)} arguments; it takes {wanted}"
             )
-        if name.text == "where":
+        elif name.text == "where":
             if not args[0].is_condition:
-                raise GrammarError(
+                self.problems.append(
                     f"where at character {name.at} needs a condition first, such as where(x < 0, a, b)"
                 )
-            _numbers(tuple(args[1:]), name)
+            self.numbers(tuple(args[1:]), name)
         else:
-            _numbers(tuple(args), name)
-        return Tree("call", name.at, name.text, tuple(args))
+            self.numbers(tuple(args), name)
+
+    def numbers(self, parts: tuple[Tree, ...], token: _Token) -> tuple[Tree, ...]:
+        """Return parts, after noting those that are conditions."""
+        self.problems += [
+            f"a condition stands at character {part.at} where {token.text!r} needs a number; "
+            "use where(condition, a, b)"
+            for part in parts
+            if part.is_condition
+        ]
+        return parts
+
+    def conditions(self, parts: tuple[Tree, ...], token: _Token) -> None:
+        """Note parts that are numbers."""
+        self.problems += [
+            f"a number stands at character {part.at} where {token.text!r} needs a condition (x < 0, say)"
+            for part in parts
+            if not part.is_condition
+        ]
 
 
 def unknown(name: str, at: int, known: Iterable[str], what: str) -> str:
@@ -388,21 +427,3 @@ def _flat(kind: str, left: Tree, right: Tree) -> Tree:
     """Join to what is joined already, so that long sums are not deep."""
     args = left.args if left.kind == kind else (left,)
     return Tree(kind, left.at, "", (*args, right))
-
-
-def _numbers(parts: tuple[Tree, ...], token: _Token) -> tuple[Tree, ...]:
-    for part in parts:
-        if part.is_condition:
-            raise GrammarError(
-                f"a condition stands at character {part.at} where {token.text!r} needs a number; "
-                "use where(condition, a, b)"
-            )
-    return parts
-
-
-def _conditions(parts: tuple[Tree, ...], token: _Token) -> None:
-    for part in parts:
-        if not part.is_condition:
-            raise GrammarError(
-                f"a number stands at character {part.at} where {token.text!r} needs a condition (x < 0, say)"
-            )

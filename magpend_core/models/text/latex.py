@@ -40,7 +40,7 @@ def equations_of(definition: Definition) -> list[str]:
     """Lines of LaTeX: definitions in the order of their need, then the rate of each state."""
     symbols = {s.name: s.symbol for s in definition.states if s.symbol}
     symbols |= {p.name: p.symbol for p in definition.parameters if p.symbol}
-    used = definition.used(definition.equations.values())
+    used = definition.used(definition.dynamics)
     lines = [
         f"{symbol_of(name, symbols)} &= {latex_of(definition.define[name], symbols)}"
         for name in used

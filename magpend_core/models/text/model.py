@@ -58,6 +58,11 @@ class TextModel(Model):
         return self.name if self.shipped else self.definition.table
 
     @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on parameters and definitions that nothing uses."""
+        return tuple(self.definition.remarks())
+
+    @cached_property
     def derived(self) -> Derived:
         """What follows from the text: rates, Jacobian, layers, edges, switches. Needs no compiler.
 

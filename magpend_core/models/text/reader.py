@@ -33,6 +33,10 @@ def shown(value: object, around: int = 1) -> str:
     return f'"{text}"' if isinstance(value, str) else text
 
 
+MOST_PROBLEMS = 8
+"""Problems of one expression that are named."""
+
+
 class Reader:
     """Reads entries of tables; what is wrong goes to `problems`, and something harmless is returned."""
 
@@ -126,18 +130,22 @@ class Reader:
     def _tree(
         self, value: Any, place: str, known: Mapping[str, str], read: Callable[[Any], Tree]
     ) -> Tree | None:
+        tree: Tree | None = None
+        found: tuple[tuple[str, int], ...] = ()
+        wrong: list[tuple[str, str]] = []
         try:
             tree = read(value)
+            found = tuple(names(tree))
         except GrammarError as error:
-            self.report(place, f"{shown(value)}: {_closed(str(error))}")
-            return None
-        bad: dict[str, int] = {}
-        for name, at in names(tree):
-            if name not in known:
-                bad.setdefault(name, at)
-        for name, at in list(bad.items())[:3]:
-            self.report(place, f"{shown(value, at)}: {_closed(unknown(name, at, known, 'name'))}")
-        return None if bad else tree
+            wrong = [(shown(value), problem) for problem in error.problems]
+            found = error.names
+        bad = {name: at for name, at in reversed(found) if name not in known}
+        wrong += [(shown(value, at), unknown(name, at, known, "name")) for name, at in reversed(bad.items())]
+        for text, problem in wrong[:MOST_PROBLEMS]:
+            self.report(place, f"{text}: {_closed(problem)}")
+        if len(wrong) > MOST_PROBLEMS:
+            self.report(place, f"{shown(value)}: {len(wrong) - MOST_PROBLEMS} more problems.")
+        return None if wrong else tree
 
 
 def _closed(sentence: str) -> str:

@@ -72,6 +72,52 @@ def test_show__text_of_a_specification(main, tmp_path, own):
     assert r"\frac{\mathrm{d}v}{\mathrm{d}t} &= \mathrm{drive} - d \, v - x^{3}" in out
 
 
+BALL = """
+name = "ball"
+section = "each millisecond"
+[states]
+h = "m"
+v = "m/s"
+[parameters]
+r = 0.8
+mass = 1.0
+[define]
+table = "0.01*sin(2*pi*f*t)"
+speed = "-r*v"
+[equations]
+h = "v"
+v = "-9.81"
+[[impacts]]
+of = "h - table"
+direction = "down"
+set = { v = "speed" }
+"""
+
+
+def test_show__definitions_of_impacts_and_names_without_use(main, tmp_path):
+    (tmp_path / "ball.toml").write_text(BALL)
+    code, out, said = main("model", "show", "ball.toml")
+    assert code == 0, said
+    assert {"  table = 0.01*sin(2*pi*f*t)", "  speed = -r*v"} <= set(out.splitlines())
+    assert "  model.parameters.mass: nothing uses it; use it in an expression" in out
+    found = json.loads(main("model", "show", "ball.toml", "--json")[1])
+    assert found["definitions"].keys() == {"table", "speed"}
+    assert len(found["warnings"]) == 1
+    assert "mathrm{speed} &= " in main("model", "show", "ball.toml", "--latex")[1]
+
+
+def test_run__warns_of_names_without_use(main, tmp_path, own):
+    (tmp_path / "spec.toml").write_text(
+        own.spec(own.text.replace("parameters = {", "parameters = { k = 1.0,"))
+    )
+    code, out, said = main("run", "spec.toml", "--dry-run")
+    assert code == 0, said
+    assert "warning: model.parameters.k: nothing uses it; " in out
+    code, _, said = main("run", "spec.toml", "--workers", 0)
+    assert code == 0, said
+    assert "warning: model.parameters.k: nothing uses it; " in said
+
+
 def test_show__file_of_a_model_and_one_that_ships(main, tmp_path, own):
     (tmp_path / "shared.toml").write_text(own.text.replace("[model]", "").replace('name = "duffing5"', ""))
     code, out, _ = main("model", "show", "shared.toml")

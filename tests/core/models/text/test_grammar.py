@@ -20,9 +20,9 @@ from magpend_core.models.text.grammar import (
     names,
     parse,
     parse_condition,
-    written,
 )
 from magpend_core.models.text.numeric import value_of
+from magpend_core.models.text.writing import written
 
 VALUES = {"x": 0.7, "y": -1.3, "w": 2.25, "k": 3.0}
 
@@ -68,7 +68,10 @@ def test_parse__means_what_python_means(text, wanted):
         ("x(1)", "unknown function 'x' at character 1"),
         ("sine(x)", "unknown function 'sine' at character 1; did you mean sin"),
         ("ln(x)", "here it is log"),
-        ("x^2", "powers are written **"),
+        ("x^y^2", "'^' at character 4: a power of a power"),
+        ("x**y^2", "write brackets, as in x**(y**z)"),
+        ("x^-y**2", "a power of a power"),
+        ("(x < 1)^2", "a condition stands at character 4 where '^' needs a number"),
         ("x == 1", "compare with < or >"),
         ("sin(x, y)", "sin at character 1 has 2 arguments; it takes 1"),
         ("where(x, 1, 2)", "needs a condition first"),
@@ -98,6 +101,28 @@ def test_parse__says_what_is_wrong_and_where(text, words):
     with pytest.raises(GrammarError) as error:
         parse(text)
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "same"),
+    [("x^2", "x**2"), ("-x^2", "-(x**2)"), ("x^-y", "x**(-y)"), ("(x^y)^2", "(x**y)**2"),
+     ("x^(y^2)", "x**(y**2)"), ("2*x^2*y^3", "2*(x**2)*(y**3)"), ("sin(x^2)^2", "sin(x**2)**2")],
+)  # fmt: skip
+def test_parse__reads_a_caret_as_a_power(text, same):
+    assert written(parse(text)) == written(parse(same))
+    assert value(text) == value(same)
+
+
+def test_parse__says_all_that_is_wrong():
+    with pytest.raises(GrammarError) as error:
+        parse("sine(x) + ln(y, 2) + (x < 1) + sin(x, y) + w + q*1e999)")
+    assert [problem.split(" at ")[0] for problem in error.value.problems] == [
+        "unknown function 'sine'", "unknown function 'ln'", "a condition stands", "sin", "the number", "')'",
+    ]  # fmt: skip
+    assert dict(error.value.names).keys() == {"x", "y", "w", "q"}
+    with pytest.raises(GrammarError) as error:
+        parse("x@y + $z + y@x")
+    assert [problem[:3] for problem in error.value.problems] == ["'@'", "'$'"]
 
 
 def test_parse_condition__wants_a_condition():

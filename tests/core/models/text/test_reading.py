@@ -382,3 +382,33 @@ def test_opening__needs_neither_compiler_nor_algebra(run_python):
         "print([m for m in ('numba', 'llvmlite', 'sympy', 'scipy') if m in sys.modules])\n"
     )
     assert run_python(script).strip() == "[]"
+
+
+def test_read_model__reports_all_that_is_wrong_in_an_expression():
+    problems = problems_of(changed(DUFFING, "equations", "v", value="driv - e*v - sine(x) + q1 + q2*q3 +"))
+    said = [problem.removeprefix("model.equations.v: ").partition(": ")[2] for problem in problems]
+    assert [s.split(" at ")[0] for s in said] == [
+        "unknown function 'sine'", "ends where something must follow.",
+        *(f"unknown name {name!r}" for name in ("driv", "e", "q1", "q2", "q3")),
+    ]  # fmt: skip
+    problems = problems_of(changed(DUFFING, "equations", "v", value="+".join(f"q{i}" for i in range(20))))
+    assert len(problems) == 9
+    assert problems[-1].endswith("12 more problems.")
+
+
+def test_remarks__name_parameters_and_definitions_that_nothing_uses():
+    assert read_model(DUFFING).remarks == ()
+    assert read_model(PENDULUM).remarks == ()  # l stands in the drawing and in a definition
+    table = changed(DUFFING, "parameters", "dd", value=0.1)
+    table = changed(table, "define", "friction", value="0.1*v")
+    assert read_model(table).remarks == (
+        "model.parameters.dd: nothing uses it; did you mean it where an expression has d? Else use it in an "
+        "expression, or take it out (to sweep it would change nothing).",
+        "model.define.friction: nothing uses it; use it in an expression, or take it out.",
+    )
+    used = changed(table, "impacts", value=[{"of": "x - dd", "direction": "up", "set": {"v": "-friction"}}])
+    assert read_model(used).remarks == ()
+
+
+def test_remarks__models_that_ship_have_none():
+    assert {name: load_model(name).remarks for name in model_names() if load_model(name).remarks} == {}
