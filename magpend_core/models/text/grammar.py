@@ -65,7 +65,7 @@ class GrammarError(ValueError):
     Attributes
     ----------
     problems : tuple of str
-        All that is wrong, each with its place; what follows a wrong sign or bracket is not judged.
+        All that is wrong, each with its place; after a wrong sign or bracket only names are judged.
     names : tuple of (str, int)
         Names in the text, each with its place.
     """
@@ -157,9 +157,19 @@ def _parse(text: object) -> Tree:
             tree = parser.whole()
         except GrammarError as error:
             problems += error.problems
+    if tree is None:
+        problems += [p for p in _unknown_functions(tokens) if p not in problems]
     if tree is None or problems:
         raise GrammarError(problems, _names_among(tokens))
     return tree
+
+
+def _unknown_functions(tokens: list[_Token]) -> Iterator[str]:
+    """Yield a sentence for each call of an unknown function, where there is no tree."""
+    for token, after in itertools.pairwise(tokens):
+        is_call = token.kind == "name" and after.text == "(" and token.text not in ("and", "or", "not")
+        if is_call and token.text not in FUNCTIONS:
+            yield unknown(token.text, token.at, FUNCTIONS, "function")
 
 
 def _names_among(tokens: list[_Token]) -> Iterator[tuple[str, int]]:
@@ -276,12 +286,20 @@ class _Parser:
         left = self.prefix()
         while True:
             token = self.token
-            binding = _BINDING.get(token.text, 0) if token.kind != "number" else 0
+            lacks_sign = self.lacks_sign(token)
+            binding = _PRODUCT if lacks_sign else _BINDING.get(token.text, 0)
             if binding == 0 or binding < least:
                 break
-            left = self.joined(left, self.take(), binding)
+            if lacks_sign:  # read on as if a product were written
+                self.problems += self.unexpected(token).problems
+            left = self.joined(left, token if lacks_sign else self.take(), binding)
         self.depth -= 1
         return left
+
+    def lacks_sign(self, token: _Token) -> bool:
+        """Return whether an operand begins where a sign must stand."""
+        is_operand = token.kind in ("number", "name") or token.text == "("
+        return is_operand and token.text not in ("and", "or", "not")
 
     def joined(self, left: Tree, token: _Token, binding: int) -> Tree:
         """Read what follows a sign."""

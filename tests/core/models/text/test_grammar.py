@@ -125,6 +125,23 @@ def test_parse__says_all_that_is_wrong():
     assert [problem[:3] for problem in error.value.problems] == ["'@'", "'$'"]
 
 
+def test_parse__reads_on_after_a_missing_sign():
+    with pytest.raises(GrammarError) as error:
+        parse("2x + sine(y) - (x)3 + sin(x, y)")
+    assert [problem.split(" at ")[0] for problem in error.value.problems] == [
+        "'x'", "unknown function 'sine'", "'3'", "sin",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ["x + * y - sine(x)", "x) - sine(x)", "x @ y - sine(x)", "x == sine(x)"])
+def test_parse__names_unknown_functions_after_a_wrong_sign(text):
+    with pytest.raises(GrammarError) as error:
+        parse(text)
+    first, second = error.value.problems
+    assert "character 5" in first or "character 2" in first or "character 3" in first
+    assert second.startswith("unknown function 'sine'")
+
+
 def test_parse_condition__wants_a_condition():
     assert bool(value_of(parse_condition("x < 1 and not y > 0"), VALUES))
     with pytest.raises(GrammarError, match="must be a condition"):
