@@ -49,8 +49,8 @@ def reproduce(
     interval, and one of four verdicts; a coarse grid or a small sample decides nothing.
     """
     from pipeline.cli import console
+    from pipeline.report.reproduce import calibrated_on, decided_first, headline, spelled
     from pipeline.report.reproduce import reproduce as carry_out
-    from pipeline.report.reproduce import spelled
     from pipeline.report.study import load_study
 
     found = load_study(study)
@@ -58,10 +58,14 @@ def reproduce(
     _check_folder(folder)
     n_workers = 0 if smoke and workers is None else workers
     done = carry_out(found, folder, figures=figure or [], smoke=smoke, workers=n_workers, echo=console.note)
-    for j in done.judgements:
+    if done.judgements:
+        console.result(headline(done.judgements, smoke))
+    for j in decided_first(done.judgements):
         console.result(
             f"{j.figure:>8}  {j.verdict.words}: {j.claim.statement} {spelled(j)} {j.reason}".rstrip()
         )
+    if calibrated := calibrated_on(done.judgements):
+        console.result(calibrated)
     console.result(f"report: {done.page} ({done.page.stat().st_size / 1e6:.1f} MB)")
     if done.failed:
         console.LOG.error(

@@ -227,11 +227,12 @@ def _range(claim: ClaimTable) -> str:
 
 
 def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
-    """Return what stands above the figures: what this is, all claims, where the numbers come from."""
+    """Return what stands above the figures: what it shows, what this is, all claims, versions."""
     table = results.study.table
     counts = {verdict: sum(j.verdict is verdict for j in judgements) for verdict in Verdict}
     failed = sum(j.fails for j in judgements)
-    blocks: list[Block] = [Note(table.source), *(Text(text) for text in table.about)]
+    lead = [Text(headline(judgements, results.smoke))] if judgements else []
+    blocks: list[Block] = [*lead, Note(table.source), *(Text(text) for text in table.about)]
     size = "smoke size: it shows that everything works, and decides little" if results.smoke else "full size"
     blocks.append(Facts({
         "size": size,
@@ -240,20 +241,48 @@ def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
     }))  # fmt: skip
     rows = [
-        (j.figure, j.claim.statement, spelled(j).partition(";")[0].rstrip("."), _short(j)) for j in judgements
+        (j.figure, j.claim.statement, spelled(j).partition(";")[0].rstrip("."), j.verdict.words)
+        for j in decided_first(judgements)
     ]
     if rows:
         heads = ("figure", "claim", "came out (95 % interval)", "verdict")
-        blocks.append(Grid(heads, rows, "All claims", stacked=True))
+        blocks.append(Grid(heads, rows, "Claims that are tests", stacked=True))
+    if calibrated := calibrated_on(judgements):
+        blocks.append(Text(calibrated))
     return blocks
 
 
-def _short(judgement: Judgement) -> str:
-    """Return a verdict, and of what was calibrated on, whether it came out."""
-    if judgement.verdict is not Verdict.CALIBRATED:
-        return judgement.verdict.words
-    came = {Verdict.MET: "it came out", Verdict.NOT_MET: "it did not come out"}
-    return f"{judgement.verdict.words}; {came.get(judgement.plain, 'undecided whether it came out')}"
+def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
+    """Say how many claims a study decides, and what is left open."""
+    tests = decided_first(judgements)
+    met, failed, left = (
+        sum(j.verdict is v for j in tests) for v in (Verdict.MET, Verdict.NOT_MET, Verdict.UNDECIDED)
+    )
+    text = f"Of {len(tests)} claims that are tests, {met} are met, {failed} not met, {left} undecided."
+    remedy = " The smoke size shows that every step works; the full size (without --smoke) decides more."
+    return text + (remedy if smoke else "")
+
+
+def decided_first(judgements: Sequence[Judgement]) -> list[Judgement]:
+    """Return the claims that nothing was calibrated on, the decided ones before the others."""
+    tests = [j for j in judgements if j.verdict is not Verdict.CALIBRATED]
+    return sorted(tests, key=lambda j: j.verdict is Verdict.UNDECIDED)
+
+
+def calibrated_on(judgements: Sequence[Judgement]) -> str:
+    """List the claims that parameters were calibrated on in one paragraph; empty if there are none."""
+    own = [j for j in judgements if j.verdict is Verdict.CALIBRATED]
+    if not own:
+        return ""
+    text = f"{len(own)} of {len(judgements)} claims are no test: parameters were calibrated on them."
+    heads = {
+        Verdict.MET: "Came out", Verdict.NOT_MET: "Did not come out",
+        Verdict.UNDECIDED: "Undecided whether they came out",
+    }  # fmt: skip
+    for verdict, head in heads.items():
+        named = [f"figure {j.figure}: {j.claim.statement.rstrip('.')}" for j in own if j.plain is verdict]
+        text += f" {head}: {'; '.join(named)}." if named else ""
+    return text
 
 
 def _provenance(results: Results) -> list[Part]:

@@ -13,7 +13,10 @@ import time
 import pytest
 
 from pipeline.cli.exits import Exit
-from pipeline.report.study import load_study, shipped_studies
+from pipeline.report.measures import Estimate
+from pipeline.report.reproduce import Judgement, calibrated_on, decided_first, headline
+from pipeline.report.study import ClaimTable, load_study, shipped_studies
+from pipeline.report.verdicts import Verdict
 from pipeline.spec.problems import SpecError
 
 SPEC = """
@@ -107,15 +110,52 @@ def test_reproduce__a_study_of_ones_own(study, main, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("calibrated", "verdict"), [(False, "not met"), (True, "calibrated on this, so no test")]
+    ("calibrated", "words"),
+    [
+        (False, "       2  not met: Nothing closes"),
+        (
+            True,
+            "1 of 2 claims are no test: parameters were calibrated on them. "
+            "Did not come out: figure 2: Nothing closes.",
+        ),
+    ],
 )
-def test_reproduce__a_required_claim_is_contradicted(study, main, tmp_path, calibrated, verdict):
+def test_reproduce__a_required_claim_is_contradicted(study, main, tmp_path, calibrated, words):
     study(STUDY + FALSE + f"calibrated = {str(calibrated).lower()}\n")
     code, out, err = main("reproduce", "mine.toml", "--out", "done", "--workers", "0")
     assert code == Exit.CONTRADICTED
     assert "1 required claims are contradicted: figure 2: Nothing closes" in err
-    assert f"2  {verdict}: Nothing closes" in out
-    assert (tmp_path / "done" / "report.html").is_file()
+    assert any(line.startswith(words) for line in out.splitlines())
+    html = (tmp_path / "done" / "report.html").read_text("utf-8")
+    assert (words in html) == calibrated
+    tests = f"Of {1 if calibrated else 2} claims that are tests, 1 are met, {int(not calibrated)} not met"
+    assert out.startswith(tests)
+    assert html.index(tests) < html.index("calibrated on") if calibrated else tests in html
+
+
+@pytest.mark.parametrize("smoke", [False, True])
+def test_headline__decided_claims_come_first_and_calibrated_ones_are_a_paragraph(smoke):
+    judgements = [
+        _judgement("1", "A.", Verdict.UNDECIDED), _judgement("2", "B", Verdict.MET),
+        _judgement("3", "C.", Verdict.CALIBRATED, Verdict.MET), _judgement("4", "D", Verdict.NOT_MET),
+        _judgement("5", "E", Verdict.CALIBRATED, Verdict.UNDECIDED),
+        _judgement("6", "F", Verdict.CALIBRATED, Verdict.MET),
+    ]  # fmt: skip
+    assert [j.figure for j in decided_first(judgements)] == ["2", "4", "1"]
+    assert calibrated_on(judgements) == (
+        "3 of 6 claims are no test: parameters were calibrated on them. Came out: figure 3: C; figure 6: F. "
+        "Undecided whether they came out: figure 5: E."
+    )
+    assert calibrated_on(judgements[:2]) == ""
+    assert headline(judgements, smoke).startswith(
+        "Of 3 claims that are tests, 1 are met, 1 not met, 1 undecided."
+    )
+    assert ("without --smoke" in headline(judgements, smoke)) == smoke
+
+
+def _judgement(figure, statement, verdict, plain=None):
+    claim = ClaimTable(statement=statement, source="us", measure="share_above", of=["sweep"])
+    return Judgement(figure, claim, Estimate(1.0, 1.0, 1.0), verdict, plain or verdict, "")
 
 
 def test_reproduce__one_that_is_not_required(study, main):
