@@ -57,6 +57,7 @@ KINDS = {
     "wrap": "the angle jumps by a turn",
     "leap": "the angle leaps from one sample to the next as nothing moves",
     "unit": "the file states another unit than the mapping",
+    "name": "the name in the file has a unit that the name in the mapping lacks",
 }
 """All kinds of findings."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping as AnyMapping
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,11 +18,22 @@ from pipeline.layout.vocabulary import model_attribute
 from pipeline.rig.recordings import checks, formats, units
 from pipeline.rig.recordings.clock import Clock, clock_of
 from pipeline.rig.recordings.findings import Finding, findings_of, to_json
-from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, Scaled, load_mapping
+from pipeline.rig.recordings.mapping import (
+    DRIVE,
+    ChannelMap,
+    DriveMap,
+    Mapping,
+    PieceMap,
+    Scaled,
+    TimeMap,
+    load_mapping,
+)
 from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.spec.problems import SpecError, unknown_name
 
 DIM = "sample"
+_WITH_UNIT = re.compile(r"\s*(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*")
+"""A channel's name, and its unit in brackets."""
 
 
 def read_recording(
@@ -79,7 +91,7 @@ def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | 
     parts = [_timed(s, mapping, columns, findings) for s in raw.stretches]
     stretches, numbers = [part[0] for part in parts], np.concatenate([part[1] for part in parts])
     clock = clock_of(stretches, mapping.sampling_rate_hz, str(raw.path), numbers=numbers, apart=raw.apart)
-    findings += [*clock.findings, *_unit_findings(raw, mapping, columns)]
+    findings += [*clock.findings, *_name_findings(mapping, columns), *_unit_findings(raw, mapping, columns)]
     variables: dict[str, np.ndarray] = {}
     for name in _entries(mapping):
         signal = checks.Signal(name, _joined(stretches, name, clock), clock.time, clock.piece)
@@ -128,19 +140,18 @@ def _entries(mapping: Mapping) -> dict[str, Scaled]:
 
 def _resolved(raw: Raw, mapping: Mapping) -> dict[str, str]:
     """Name in the file of each mapped channel, and of ``time`` and ``piece`` if there are any."""
-    wanted: dict[str, tuple[str, str | int]] = {
-        name: (f"channels.{name}" if name != DRIVE else DRIVE, entry.channel)
-        for name, entry in _entries(mapping).items()
-    }
+    wanted: dict[str, Scaled | TimeMap | PieceMap] = dict(_entries(mapping))
     for name, axis in (("time", mapping.time), ("piece", mapping.piece)):
         if axis is not None:
-            wanted[name] = (name, axis.channel)
+            wanted[name] = axis
     found, problems = {}, []
-    for name, (key, channel) in wanted.items():
-        own = _name_of(channel, raw.names)
+    for name, entry in wanted.items():
+        key, channel = f"channels.{name}" if name in mapping.channels else name, entry.channel
+        own = _name_of(channel, raw.names) or _name_but_for_unit(entry, raw.names)
         if own is None:
             told = unknown_name("channel", str(channel), raw.names or ("none",))
-            problems.append(f"{key}.channel = {channel!r}: {raw.path.name} has no such channel: {told}")
+            hint = _unit_hint(entry, raw.names)
+            problems.append(f"{key}.channel = {channel!r}: {raw.path.name} has no such channel: {told}{hint}")
         elif any(own not in stretch for stretch in raw.stretches):
             problems.append(f"{key}.channel = {channel!r}: is not in all stretches of {raw.path.name}.")
         else:
@@ -157,6 +168,51 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
         return channel
     near = [name for name in names if name.strip() == channel.strip()]
     return near[0] if len(near) == 1 else None
+
+
+def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
+    """Return the one name that has a unit in brackets besides, if the mapping gives the unit."""
+    near = _names_with_unit(entry.channel, names)
+    if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
+        return None
+    name, stated = near[0]
+    # the unit of time stamps has a default: only where the file agrees is it given
+    if isinstance(entry, TimeMap) and units.factor(units.spelled(stated), "s") != units.factor(
+        entry.unit, "s"
+    ):
+        return None
+    return name
+
+
+def _names_with_unit(channel: str | int, names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return names that are a channel's and a unit in brackets, each with the unit."""
+    parts = [(name, match) for name in names if (match := _WITH_UNIT.fullmatch(name))]
+    return [
+        (name, match[2]) for name, match in parts if isinstance(channel, str) and match[1] == channel.strip()
+    ]
+
+
+def _unit_hint(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str:
+    """Say that a unit in the mapping would do, where the name lacks one."""
+    near = _names_with_unit(entry.channel, names)
+    if len(near) != 1 or isinstance(entry, PieceMap):
+        return ""
+    return f" Write the whole name, or add unit = {near[0][1]!r}."
+
+
+def _name_findings(mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
+    """Say which channels have a unit in their names that the mapping's names lack."""
+    given: dict[str, str | int] = {name: entry.channel for name, entry in _entries(mapping).items()}
+    if mapping.time is not None:
+        given["time"] = mapping.time.channel
+    return [
+        Finding(
+            "name", name, math.nan, math.nan, "warning",
+            f"the file's channel is {columns[name]!r}, the mapping's {channel!r}; it is taken for the same.",
+        )
+        for name, channel in given.items()
+        if isinstance(channel, str) and channel.strip() != columns[name].strip()
+    ]  # fmt: skip
 
 
 def _timed(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from pipeline.rig.recordings import findings_of, recording_of, window
 from pipeline.rig.recordings.clock import clock_of
+from pipeline.rig.recordings.formats import read_raw
 from pipeline.rig.recordings.mapping import parse_mapping
 from pipeline.rig.recordings.raw import Channel
 from pipeline.spec.problems import SpecError
@@ -236,6 +239,44 @@ def test_resolved__missing_channels_are_named_with_the_nearest(make):
     assert len(caught.value.problems) == 2
     assert "did you mean rig/angle 1?" in caught.value.problems[0]
     assert "channels.psi2.channel = 7" in caught.value.problems[1]
+
+
+def test_resolved__a_unit_in_the_name_may_be_missing_where_the_mapping_gives_it(tmp_path):
+    """The angles are those that were written, in radians by hand."""
+    path = tmp_path / "x.csv"
+    rows = [(0.01 * i, 20.0 * math.sin(0.1 * i)) for i in range(200)]
+    path.write_text("Zeit [s],Winkel oben [deg]\n" + "".join(f"{t:.2f},{a!r}\n" for t, a in rows), "utf-8")
+    channel = {"channel": "Winkel oben", "unit": "deg"}
+    tables = {"model": "pendulum", "time": {"channel": "Zeit"}, "channels": {"psi1": channel}}
+    ds = recording_of(read_raw(path), parse_mapping(tables))
+    np.testing.assert_allclose(ds["psi1"], [a * math.pi / 180 for _, a in rows], rtol=1e-12)
+    assert [(f.kind, f.channel, f.severity) for f in findings_of(ds)] == [
+        ("name", "psi1", "warning"), ("name", "time", "warning"),
+    ]  # fmt: skip
+    assert "'Winkel oben [deg]', the mapping's 'Winkel oben'" in findings_of(ds)[0].text
+    whole = {**tables, "time": {"channel": "Zeit [s]"}, "channels": {"psi1": {**channel, "channel": 2}}}
+    assert findings_of(recording_of(read_raw(path), parse_mapping(whole))) == []
+
+
+@pytest.mark.parametrize(
+    ("head", "unit", "words"),
+    [
+        ("Zeit [s],Winkel oben [deg]", "", "Write the whole name, or add unit = 'deg'."),
+        ("Zeit [s],Winkel oben [deg],Winkel oben (mrad)", "deg", "did you mean"),
+        ("Zeit [ms],Winkel oben [deg]", "deg", "time.channel = 'Zeit'"),
+    ],
+)
+def test_resolved__a_name_without_its_unit_is_refused_where_it_says_too_little(tmp_path, head, unit, words):
+    path = tmp_path / "x.csv"
+    n_columns = head.count(",") + 1
+    rows = [",".join(f"{x}" for x in (0.01 * i, i % 7, i % 5)[:n_columns]) for i in range(50)]
+    path.write_text("\n".join([head, *rows]) + "\n")
+    channel = {"channel": "Winkel oben", **({"unit": unit} if unit else {})}
+    tables = {"model": "pendulum", "time": {"channel": "Zeit"}, "channels": {"psi1": channel}}
+    with pytest.raises(SpecError) as caught:
+        recording_of(read_raw(path), parse_mapping(tables))
+    (problem,) = caught.value.problems
+    assert words in problem
 
 
 def test_window__keeps_time(make):
