@@ -67,7 +67,8 @@ def simulate(
     """Integrate one trajectory: states and the model's quantities as CSV or NetCDF, and a figure.
 
     The initial state is given by the model's names: --NAME VALUE, or --NAME-deg VALUE of an angle or its
-    rate; what is not given is 0. Time 0 is the instant of a section. With --drive it is the state where the
+    rate; what is not given is 0. Time 0 is the instant of a section. The command says whether the motion has
+    closed on a periodic orbit, or how long a transient it would take. With --drive it is the state where the
     recording begins, and time is the recording's own.
     """
     from pipeline.cli import console
@@ -93,6 +94,8 @@ def simulate(
     )  # fmt: skip
     ds = ds.assign_attrs(versions=json.dumps(versions()), **provenance())
     console.result(f"series: {simulation.write_series(ds, out)}")
+    if "closing" in ds.attrs:
+        console.note(ds.attrs["closing"])
     if not no_figure:
         _draw(ds, target, out)
 

@@ -15,6 +15,7 @@ import numpy as np
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model, Quantity, State
 from magpend_core.models.presets import Preset
+from pipeline.compute.closing import LOOKED_AT, closing_of
 from pipeline.layout.domains import check_states
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import write_atomically, write_netcdf
@@ -162,12 +163,31 @@ def _at_frequency(
 
     n, samples = series.n_periods or DEFAULT_PERIODS, series.samples_per_period
     time = (series.n_transient + np.arange(n * samples + 1) / samples) / frequency_hz
-    states = trajectory(parameters, frequency_hz, state, time, rtol=series.rtol, atol=series.atol)
+    # sections before the series, to compare with; asking for them changes no step
+    first = min(series.n_transient, max(0, series.n_transient + n + 1 - LOOKED_AT))
+    before = np.arange(first, series.n_transient) / frequency_hz
+    asked = np.append(before, time)
+    states = trajectory(parameters, frequency_hz, state, asked, rtol=series.rtol, atol=series.atol)
+    sections = np.vstack([states[: len(before)], states[len(before) :: samples]])
+    states = states[len(before) :]
     names = [q.name for q in parameters.model.quantities]
     values = evaluate(names, time, states, parameters, frequency_hz)
     ds = _labelled(parameters, time, f"time since {parameters.model.section}", states, values)
     # a flow has no drive, and no section at even times
-    return ds if parameters.model.autonomous else ds.assign_attrs(frequency_hz=float(frequency_hz))
+    if parameters.model.autonomous:
+        return ds
+    return ds.assign_attrs(frequency_hz=float(frequency_hz), **_closing(sections, parameters, series))
+
+
+def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> dict[str, Any]:
+    """Attributes that say whether the motion has closed; none if there are too few sections."""
+    found = closing_of(sections[-LOOKED_AT:], parameters.model.system)
+    if found is None:
+        return {}
+    return {
+        "orbit_period": found.period if found.is_closed else 0,
+        "closing": found.sentence(series.n_transient),
+    }
 
 
 def _under_recording(

@@ -1,0 +1,127 @@
+"""Whether one trajectory has closed on a periodic orbit, and how long that would take."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from magpend_core.engine.system import System
+from pipeline.spec.tables import Integration
+
+LOOKED_AT = 129
+"""Sections at the end of a trajectory that are compared."""
+
+FEWEST = 8
+"""Sections without which nothing can be said."""
+
+NEAR = 0.1
+"""Largest distance from an orbit at which a rate is believed: chaotic sections come closer by chance, too."""
+
+LONGEST: int = Integration.model_fields["max_orbit_period"].default
+TOLERANCE: float = Integration.model_fields["closure_tolerance"].default
+"""Longest period looked for and largest distance of a closed motion: the defaults of runs."""
+
+
+class Closing(NamedTuple):
+    """How far a motion is from a periodic orbit.
+
+    Attributes
+    ----------
+    period : int
+        Drive periods after which the motion comes back closest.
+    distance : float
+        Bound on the distance from the orbit if the motion is closed or closes, else the largest distance
+        of late sections that are `period` apart; in the scales of the states, angles on the circle.
+    to_go : float
+        Drive periods until the motion closes if it goes on as it does: 0 if it has closed, infinite if
+        the distance does not shrink.
+    """
+
+    period: int
+    distance: float
+    to_go: float
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the distance is within `TOLERANCE`."""
+        return self.to_go == 0.0
+
+    def sentence(self, n_transient: int) -> str:
+        """Say it, with the ``--transient`` that would do after one of `n_transient` periods."""
+        periods = f"{self.period} drive period{'s' if self.period > 1 else ''}"
+        if self.is_closed:
+            return f"closed: the motion repeats after {periods} (distance {self.distance:.1e})"
+        text = f"not closed: after {periods} the motion comes back to a distance of {self.distance:.1e}"
+        if math.isinf(self.to_go):
+            return f"{text}, which does not shrink steadily (closed: {TOLERANCE:g})"
+        enough = n_transient + math.ceil(self.to_go)
+        return f"{text}; at this rate it is closed ({TOLERANCE:g}) with --transient {enough}"
+
+
+def closing_of(sections: np.ndarray, system: System) -> Closing | None:
+    """Compare sections that are whole periods apart.
+
+    The distances of a period fall into four quarters. If the largest of each quarter shrinks from quarter
+    to quarter, the sum of all that follow bounds the distance from the orbit, as in
+    `magpend_core.engine.observers.closed_period`.
+
+    Parameters
+    ----------
+    sections
+        Consecutive last sections of a trajectory, shape (n, n_states) [the states' units].
+    system
+        What was integrated: it has the scales of the states, and says which are angles.
+
+    Returns
+    -------
+    Closing or None
+        None for fewer than `FEWEST` sections.
+    """
+    n = len(sections)
+    if n < FEWEST:
+        return None
+    lags = [_lag_distances(sections, p, system) for p in range(1, min(LONGEST, n // 4) + 1)]
+    found = [_judged(p, distances) for p, distances in enumerate(lags, 1)]
+    closed = [one for one in found if one.is_closed]
+    if closed:
+        return next(
+            one._replace(distance=closed[0].distance, to_go=0.0)
+            for one, distances in zip(found, lags, strict=True)
+            # see `observers._smallest_divisor`
+            if closed[0].period % one.period == 0 and _late(distances) <= 10.0 * TOLERANCE
+        )
+    # a period that shrinks beats one that is small by chance; its multiples have about the same bound
+    least = min(found, key=lambda one: (math.isinf(one.to_go), one.distance))
+    return next(
+        one for one in found
+        if one.distance <= 3.0 * least.distance and math.isinf(one.to_go) == math.isinf(least.to_go)
+    )  # fmt: skip
+
+
+def _lag_distances(sections: np.ndarray, p: int, system: System) -> np.ndarray:
+    """Largest scaled differences of sections `p` apart, angles on the circle."""
+    apart = np.abs(sections[p:] - sections[:-p])
+    angles = np.array(system.is_angle, dtype=bool)
+    turned = apart[:, angles] % (2.0 * np.pi)
+    apart[:, angles] = np.minimum(turned, 2.0 * np.pi - turned)
+    return np.asarray((apart / np.array(system.scales)).max(axis=1))
+
+
+def _late(distances: np.ndarray) -> float:
+    """Largest distance of the last quarter."""
+    return float(distances[-(len(distances) // 4) :].max())
+
+
+def _judged(p: int, distances: np.ndarray) -> Closing:
+    """Judge one period by the distances of sections that are so far apart."""
+    quarter = len(distances) // 4
+    last = distances[len(distances) - 4 * quarter :].reshape(4, quarter).max(axis=1)
+    if last[2:].max() <= 0.01 * TOLERANCE:  # errors of integration hide what shrinks
+        return Closing(p, float(last[-1]), 0.0)
+    rate = math.log(last[1] / last[3]) / (2 * quarter) if last[3] > 0.0 else 0.0
+    bound = float(last[-1] / -math.expm1(-rate * p)) if rate > 0.0 else math.inf
+    if bound > NEAR or not (np.diff(last) < 0.0).all():
+        return Closing(p, float(last[-1]), math.inf)
+    return Closing(p, bound, max(0.0, math.log(bound / TOLERANCE) / rate))
