@@ -1,4 +1,4 @@
-"""Do what the tutorials say: ``python docs/run_tutorials.py [--pictures] [PAGE...]``.
+"""Do what the tutorials say: ``python docs/run_tutorials.py [--pictures | --check] [PAGE...]``.
 
 Each page is executed in a folder of its own, in this process but for what runs in the background. Marks in
 comments, which no reader sees, stand before blocks:
@@ -10,7 +10,8 @@ comments, which no reader sees, stand before blocks:
     <!-- printed -->          each line is among what the blocks before printed, numbers to a thousandth
     <!-- picture: FILE -->    the picture in the next line is this file
 
-With ``--pictures`` they are written into the docs. Runs compute in this process (``--workers 0``), which is
+With ``--pictures`` they are written into the docs; with ``--check`` those in the docs that differ are named,
+and the exit code is 1 if there are any. Runs compute in this process (``--workers 0``), which is
 all that is different from typing.
 """
 
@@ -196,10 +197,27 @@ def follow(page: Path, folder: Path) -> dict[str, Path]:
     return pictures
 
 
+def is_stale(kept: Path, made: Path) -> bool:
+    """Whether a picture in the docs differs from one just made, in the first frame of films.
+
+    A shade and half a percent of the pixels are let pass.
+    """
+    import numpy as np
+    from PIL import Image
+
+    if not kept.is_file():
+        return True
+    with Image.open(kept) as one, Image.open(made) as other:
+        if one.size != other.size:
+            return True
+        shades = np.abs(np.asarray(one.convert("RGB"), int) - np.asarray(other.convert("RGB"), int))
+    return bool((shades.max(axis=-1) > 32).mean() > 0.005)
+
+
 def main() -> None:
     """Follow the pages that are named, or all."""
-    words = sys.argv[1:]
-    for name in [word for word in words if word != "--pictures"] or PAGES:
+    words, n_stale = sys.argv[1:], 0
+    for name in [word for word in words if word not in ("--pictures", "--check")] or PAGES:
         with tempfile.TemporaryDirectory(prefix="magpend-tutorial-") as folder:
             begun = time.process_time()
             pictures = follow(PAGES[name], Path(folder))
@@ -207,6 +225,11 @@ def main() -> None:
             for shown, made in pictures.items() if "--pictures" in words else ():
                 (PAGES[name].parent / shown).write_bytes(made.read_bytes())
                 print(f"  {shown}: {made.stat().st_size / 1000:.0f} kB")
+            for shown, made in pictures.items() if "--check" in words else ():
+                if is_stale(PAGES[name].parent / shown, made):
+                    n_stale += 1
+                    print(f"  {shown}: stale; make it with: python docs/run_tutorials.py --pictures {name}")
+    sys.exit(1 if n_stale else 0)
 
 
 if __name__ == "__main__":

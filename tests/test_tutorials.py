@@ -30,6 +30,29 @@ def test_tutorial__does_what_it_says(name, tmp_path, monkeypatch):
             assert getattr(one, "n_frames", 1) == getattr(other, "n_frames", 1)
 
 
+def test_is_stale__tells_a_changed_picture(tmp_path):
+    """A line of 1 % of the pixels is seen, a shade is not."""
+    for name, shade, line in (("kept", 255, 0), ("shaded", 250, 0), ("drawn", 255, 1)):
+        image = Image.new("RGB", (100, 100), (shade,) * 3)
+        image.paste((0, 0, 0), (0, 0, 100, line))
+        image.save(tmp_path / f"{name}.png")
+    kept = tmp_path / "kept.png"
+    assert not tutorials.is_stale(kept, kept)
+    assert not tutorials.is_stale(kept, tmp_path / "shaded.png")
+    assert tutorials.is_stale(kept, tmp_path / "drawn.png")
+    assert tutorials.is_stale(tmp_path / "gone.png", kept)
+
+
+def test_first_motion__is_what_its_command_draws(tmp_path, command):
+    """The motion has closed, and the tutorial's picture shows it."""
+    page = (ROOT / "docs" / "tutorials" / "first-diagram.md").read_text("utf-8")
+    words = re.search(r"^magpend (simulate .*)$", page, re.MULTILINE).group(1).split()
+    _, notes = command(tmp_path, *words)
+    assert "closed: the motion repeats after 2 drive periods" in notes
+    kept = ROOT / "docs" / "tutorials" / "first-motion.png"
+    assert not tutorials.is_stale(kept, tmp_path / "trajectory.png")
+
+
 @pytest.mark.parametrize("page", sorted((ROOT / "docs").rglob("*.md")), ids=lambda path: path.stem)
 def test_pictures__are_there(page):
     for target in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", page.read_text("utf-8")):
