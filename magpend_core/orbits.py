@@ -225,7 +225,6 @@ def polish_orbits(
     *,
     tolerance: float = 1e-10,
     max_iterations: int = 12,
-    rtol: float = RTOL,
     system: System = PENDULUM_FITTED,
 ) -> PeriodicOrbits:
     """Find the periodic orbits near given section points.
@@ -244,8 +243,6 @@ def polish_orbits(
         Scaled residual at which an orbit counts as found.
     max_iterations
         Limit on the Newton steps.
-    rtol
-        Relative and absolute tolerance of the integration, which bounds the residual that can be reached.
     system
         What is integrated.
 
@@ -283,7 +280,7 @@ def polish_orbits(
     )
     for period in np.unique(found.orbit_period):
         rows = np.flatnonzero(found.orbit_period == period)
-        _newton(found, rows, int(period), packed, frequency, tolerance, max_iterations, rtol, system)
+        _newton(found, rows, int(period), packed, frequency, tolerance, max_iterations, system)
     return found
 
 
@@ -295,14 +292,11 @@ def _newton(
     frequency: np.ndarray,
     tolerance: float,
     max_iterations: int,
-    rtol: float,
     system: System,
 ) -> None:
     """Iterate the orbits of one period in place."""
     for iteration in range(max_iterations + 1):
-        ends = section_map(
-            packed[rows], frequency[rows], found.section[rows], period, rtol=rtol, system=system
-        )
+        ends = section_map(packed[rows], frequency[rows], found.section[rows], period, system=system)
         images, derivatives = ends.images, ends.derivatives
         found.residual[rows] = scaled_distance(images[:, -1], found.section[rows], system)
         found.n_iterations[rows] = iteration
@@ -313,7 +307,7 @@ def _newton(
             least = _least_period(orbit, tolerance, system)
             if least < period:
                 again = np.array([row])
-                _newton(found, again, least, packed, frequency, tolerance, max_iterations, rtol, system)
+                _newton(found, again, least, packed, frequency, tolerance, max_iterations, system)
                 continue
             multipliers = np.linalg.eigvals(derivative)
             found.orbit_period[row] = period

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.numbers import binomial_interval
+from pipeline.analysis.intervals import binomial_interval
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED, TRANSIENT, UNSTABLE, split_dims
 from pipeline.layout.vocabulary import DIVERGES as DIVERGED_LATER

@@ -45,7 +45,7 @@ def drawn(outcome: Outcome, name: str) -> DataFigure:
 
 def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
     """Share of the curves that a bump of their own describes with at least ``r2``."""
-    from pipeline.analysis.basins.numbers import binomial_interval
+    from pipeline.analysis.intervals import binomial_interval
 
     r2 = np.array([fit.quality.r2 for fit in outcome.curves])
     count = int((r2 >= options["r2"]).sum())
@@ -104,7 +104,7 @@ def _width(values: Mapping[str, float]) -> float:
 def signs_apart(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
     """Share of the readings whose torque has the sign of their side of the fitted transition line."""
     from magpend_core.models.pendulum import magnet_torque as laws
-    from pipeline.analysis.basins.numbers import binomial_interval
+    from pipeline.analysis.intervals import binomial_interval
 
     m = outcome.measured
     line = laws.transition(outcome.joint.values)

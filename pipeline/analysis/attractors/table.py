@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.numbers import Interval, basin_fractions
+from pipeline.analysis.basins.numbers import basin_fractions
+from pipeline.analysis.intervals import Interval
 from pipeline.analysis.outcomes import outcomes, sentence
 from pipeline.analysis.tabular import (
     FEW_POINTS,

@@ -381,7 +381,7 @@ def test_match__unlike_things_have_different_ids_however_near(periods, width, sa
             "rotation": (("frequency", "attractor", "link"), np.zeros((2, 1, 2))),
             "kind": (
                 ("frequency", "attractor"),
-                [[PERIODIC_ORBIT], [PERIODIC_ORBIT if periods[1] else BOUNDED_SET]],
+                [[PERIODIC_ORBIT if p else BOUNDED_SET] for p in periods],
             ),
             "orbit_period": (("frequency", "attractor"), np.array(periods)[:, None]),
             "attractor_id": (("frequency", "initial_condition"), np.zeros((2, 1), np.int32)),

@@ -178,9 +178,8 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
 
 
 def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made_run):
-    assert describe_view(ExploredRun.of(sweep), False)["commands"] == {
-        "branches": "magpend analyse branches run"
-    }
+    # of what a run of two parameters is to be followed along, a person has to say
+    assert describe_view(ExploredRun.of(sweep), False)["commands"] == {}
     assert "basins" not in describe_view(ExploredRun.of(walk), False)["commands"]  # a walk has no basins
     assert {"attractors", "basins"} <= describe_view(ExploredRun.of(made_run.directory), False)[
         "commands"

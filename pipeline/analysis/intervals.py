@@ -1,0 +1,68 @@
+"""Confidence intervals of probabilities."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+Interval = Literal["wilson", "clopper-pearson"]
+
+REFERENCES = {
+    "wilson": "Wilson, J. Am. Stat. Assoc. 22, 209 (1927)",
+    "clopper-pearson": "Clopper and Pearson, Biometrika 26, 404 (1934)",
+}
+
+
+def binomial_interval(
+    count: npt.ArrayLike, n: npt.ArrayLike, *, confidence: float = 0.95, method: Interval = "wilson"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Confidence interval of a probability from `count` hits in `n` independent trials.
+
+    Wilson's score interval (J. Am. Stat. Assoc. 22, 209, 1927) covers the truth at the stated rate on
+    average over the probability; Clopper and Pearson's (Biometrika 26, 404, 1934) at least at the
+    stated rate for every probability, and is wider. Both are compared by Brown, Cai and DasGupta
+    (Stat. Sci. 16, 101, 2001). Neither collapses to a point at 0 or `n` hits.
+
+    Parameters
+    ----------
+    count, n
+        Hits and trials, arrays that broadcast; ``n = 0`` gives (0, 1).
+    confidence
+        Two-sided level, between 0 and 1.
+    method
+        ``"wilson"`` or ``"clopper-pearson"``.
+
+    Returns
+    -------
+    low, high
+        Ends of the intervals, within [0, 1]. That the trials are independent is not validated.
+
+    Raises
+    ------
+    ValueError
+        If the level or the method is unknown, or hits are not between 0 and the trials.
+    """
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence is {confidence}, not between 0 and 1: give 0.95 for 95 %")
+    k, trials = (np.asarray(x, dtype=np.float64) for x in np.broadcast_arrays(count, n))
+    if np.any(k < 0) or np.any(k > trials):
+        raise ValueError(f"count {k.tolist()} is not within 0 and n {trials.tolist()}: count hits among n")
+    tail = 0.5 * (1.0 - confidence)
+    safe = np.maximum(trials, 1.0)
+    if method == "wilson":
+        z2 = special.ndtri(1.0 - tail) ** 2
+        centre = k + 0.5 * z2
+        half = np.sqrt(z2 * (k * (safe - k) / safe + 0.25 * z2))
+        low, high = (centre - half) / (safe + z2), (centre + half) / (safe + z2)
+    elif method == "clopper-pearson":
+        # arguments of 0 belong to the ends that are set below
+        low = special.betaincinv(np.maximum(k, 1.0), safe - k + 1.0, tail)
+        high = special.betaincinv(k + 1.0, np.maximum(safe - k, 1.0), 1.0 - tail)
+    else:
+        raise ValueError(f"method is {method!r}: use one of {sorted(REFERENCES)}")
+    low = np.where(k == 0.0, 0.0, np.clip(low, 0.0, 1.0))
+    high = np.where(k == trials, 1.0, np.clip(high, 0.0, 1.0))
+    return low, high
