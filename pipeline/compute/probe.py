@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import re
 import time
@@ -123,7 +124,9 @@ def sees(place: str, key: str, token: str) -> str:
 
 
 def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or str(error)
+    # writing names a hidden file and another remedy: the system's own words are enough here
+    code = getattr(error, "errno", None)
+    return os.strerror(code) if code else str(error)
 
 
 def _listed(problems: Mapping[str, str]) -> str:
