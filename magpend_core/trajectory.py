@@ -154,8 +154,8 @@ def trajectory(
     Returns
     -------
     ndarray
-        States at the times, in their units, shape (n, n_states); angles are not wrapped. Between steps the values are those of the
-        Dormand-Prince pair's continuous extension of order 4.
+        States at the times, in their units, shape (n, n_states); angles are not wrapped. Between steps the
+        values are those of the Dormand-Prince pair's continuous extension of order 4.
 
     Raises
     ------
