@@ -1,18 +1,21 @@
-"""Do what the tutorials say: ``python docs/run_tutorials.py [--pictures | --check] [PAGE...]``.
+"""Do what pages say: ``python docs/run_tutorials.py [--pictures | --check] [PAGE...]``.
+
+Pages are the tutorials and all others with a mark of a picture; without a name all are followed.
 
 Each page is executed in a folder of its own, in this process but for what runs in the background. Marks in
 comments, which no reader sees, stand before blocks:
 
     <!-- file: NAME -->       the block is written to this file
     <!-- file: NAME; quick: LINE | LINE -->   and so are these lines, which make the work smaller
+    <!-- before: COMMAND -->  a command of magpend, executed first: a run that another page makes
     <!-- run -->              commands of magpend, or Python, are executed
     <!-- background -->       each line is a program that runs until the page ends
     <!-- printed -->          each line is among what the blocks before printed, numbers to a thousandth
     <!-- picture: FILE -->    the picture in the next line is this file
 
-With ``--pictures`` they are written into the docs; with ``--check`` those in the docs that differ are named,
-and the exit code is 1 if there are any. Runs compute in this process (``--workers 0``), which is
-all that is different from typing.
+With ``--pictures`` all pictures are made again in the docs. With ``--check`` those that differ from these are
+named, and the exit code is 1 if there are any. `NOT_MADE` lists those that no command makes. Runs compute in
+this process (``--workers 0``), which is all that is different from typing.
 """
 
 from __future__ import annotations
@@ -34,11 +37,31 @@ from typing import Any
 
 DOCS = Path(__file__).resolve().parent
 PAGES = {path.stem: path for path in (*sorted((DOCS / "tutorials").glob("*.md")), DOCS / "rig.md")}
+NOT_MADE = {
+    "identification-residuals.png": "residuals of the identification that ships, which takes an hour",
+    "measured.png": "a sweep of 101 frequencies on the virtual rig, beside a run of as many",
+    "report.png": "a browser's picture of a part of a report",
+    "rig-calibrated.png": "a diagram of the calibrated model of docs/rig.md beside the rig's",
+}
+"""Pictures in the docs that this program does not make, with what they show."""
+
 PATIENCE_S = 60.0
 
 _BLOCK = re.compile(r"<!-- (file|run|background|printed)(?:: ([^>]*?))? -->\n```(\w*)\n(.*?)```", re.DOTALL)
+_BEFORE = re.compile(r"<!-- before: ([^>]+?) -->")
 _PICTURE = re.compile(r"<!-- picture: (\S+) -->\n!\[[^\]]*\]\(([^)]+)\)")
 _NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+
+
+def pages() -> dict[str, Path]:
+    """Return the pages that are followed by name: tutorials, and those with a picture that is made."""
+    drawn = [p for p in (DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md"))) if pictures_of(p)]
+    return {**PAGES, **{path.stem: path for path in drawn}}
+
+
+def pictures_of(page: Path) -> list[Path]:
+    """Return the pictures that a page makes."""
+    return [(page.parent / shown).resolve() for _, shown in _PICTURE.findall(page.read_text("utf-8"))]
 
 
 class TutorialError(AssertionError):
@@ -187,7 +210,11 @@ def follow(page: Path, folder: Path) -> dict[str, Path]:
     """
     text, session = page.read_text("utf-8"), Session(folder)
     try:
+        for command in _BEFORE.findall(text):
+            session.do("run", "", "sh", command)
         for kind, about, language, block in _BLOCK.findall(text):
+            if kind == "run" and about:  # a block for others, such as an installation
+                continue
             session.do(kind, about, language, block)
     finally:
         session.end()
@@ -216,17 +243,17 @@ def is_stale(kept: Path, made: Path) -> bool:
 
 def main() -> None:
     """Follow the pages that are named, or all."""
-    words, n_stale = sys.argv[1:], 0
-    for name in [word for word in words if word not in ("--pictures", "--check")] or PAGES:
+    words, n_stale, known = sys.argv[1:], 0, pages()
+    for name in [word for word in words if word not in ("--pictures", "--check")] or known:
         with tempfile.TemporaryDirectory(prefix="magpend-tutorial-") as folder:
             begun = time.process_time()
-            pictures = follow(PAGES[name], Path(folder))
+            pictures = follow(known[name], Path(folder))
             print(f"{name}: {time.process_time() - begun:.1f} s of this process")
             for shown, made in pictures.items() if "--pictures" in words else ():
-                (PAGES[name].parent / shown).write_bytes(made.read_bytes())
+                (known[name].parent / shown).write_bytes(made.read_bytes())
                 print(f"  {shown}: {made.stat().st_size / 1000:.0f} kB")
             for shown, made in pictures.items() if "--check" in words else ():
-                if is_stale(PAGES[name].parent / shown, made):
+                if is_stale(known[name].parent / shown, made):
                     n_stale += 1
                     print(f"  {shown}: stale; make it with: python docs/run_tutorials.py --pictures {name}")
     sys.exit(1 if n_stale else 0)

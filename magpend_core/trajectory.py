@@ -143,7 +143,7 @@ def trajectory(
     frequency_hz
         Drive frequency [Hz].
     initial_state
-        ``(psi1, psi2, psi1_dot, psi2_dot)`` at time 0 [rad, rad/s].
+        The model's states in their order at time 0, in their units; shape (n_states,).
     times
         Rising times [s], the first at least 0; shape (n,).
     rtol, atol
@@ -154,8 +154,8 @@ def trajectory(
     Returns
     -------
     ndarray
-        Shape (n, 4); angles are not wrapped. Between steps the values are those of the
-        Dormand-Prince pair's continuous extension of order 4.
+        States at the times, in their units, shape (n, n_states); angles are not wrapped. Between steps the
+        values are those of the Dormand-Prince pair's continuous extension of order 4.
 
     Raises
     ------

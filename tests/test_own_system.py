@@ -18,8 +18,8 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "own-system.md").read_text("utf-8")
 
 
-def block(name: str, language: str) -> str:
-    (text,) = re.findall(rf"<!-- run: {name} -->\n```{language}\n(.*?)```", PAGE, re.DOTALL)
+def block(mark: str, language: str) -> str:
+    (text,) = re.findall(rf"<!-- {mark} -->\n```{language}\n(.*?)```", PAGE, re.DOTALL)
     return text
 
 
@@ -43,9 +43,9 @@ def main(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_own_system__every_command_of_the_page(main, tmp_path):
-    (tmp_path / "mine.toml").write_text(block("specification", "toml"), "utf-8")
+    (tmp_path / "mine.toml").write_text(block("file: mine.toml", "toml"), "utf-8")
     done = []
-    for line in block("commands", "sh").splitlines():
+    for line in block("run", "sh").splitlines():
         words = shlex.split(line, comments=True)[1:]
         small = [*words, "--smoke", "--out", "runs/mine", "--workers", "0"] if words[0] == "run" else words
         code, out, said = main(*small)
@@ -62,7 +62,7 @@ def test_own_system__every_command_of_the_page(main, tmp_path):
 
 
 def test_own_system__text_of_the_page_is_twenty_lines_and_errors_are_as_it_says(main, tmp_path):
-    text = block("specification", "toml")
+    text = block("file: mine.toml", "toml")
     lines = [line for line in text.splitlines() if line.strip()]
     assert len(lines) <= 25
     wrong = text.replace("drive - d*v", "driv - d*v").replace("rtol = 1e-7", "rtol = -1")
@@ -85,7 +85,7 @@ def test_own_system__page_names_every_key_and_function():
 
 def test_own_system__section_without_a_drive_fits():
     (section,) = re.findall(r"```toml\n(\[section\].*?)```", PAGE, re.DOTALL)
-    data = tomllib.loads(block("specification", "toml") + "\n" + section)
+    data = tomllib.loads(block("file: mine.toml", "toml") + "\n" + section)
     data["model"]["equations"]["v"] = "(1 - x**2)*v - x"
     del data["parameters"], data["model"]["define"], data["smoke"]
     assert parse_spec(data).section is not None

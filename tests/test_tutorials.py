@@ -53,6 +53,34 @@ def test_first_motion__is_what_its_command_draws(tmp_path, command):
     assert not tutorials.is_stale(kept, tmp_path / "trajectory.png")
 
 
+def test_pictures__each_is_made_by_one_page_or_listed():
+    """Every picture in the docs is redrawn by one command, `python docs/run_tutorials.py --pictures`."""
+    made = [path for page in tutorials.pages().values() for path in tutorials.pictures_of(page)]
+    docs = ROOT / "docs"
+    kept = {p for suffix in ("png", "webp", "gif") for p in docs.rglob(f"*.{suffix}")}
+    listed = {docs / name for name in tutorials.NOT_MADE}
+    assert len(made) == len(set(made))
+    assert set(made) | listed == kept
+    assert not set(made) & listed
+
+
+def test_pictures__example_is_what_its_page_draws(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = tutorials.pages()["van-der-pol"]
+    for shown, made in tutorials.follow(page, tmp_path).items():
+        assert not tutorials.is_stale(page.parent / shown, made)
+
+
+def test_follow__commands_before_come_first_and_blocks_for_others_are_left(tmp_path):
+    page = tmp_path / "page.md"
+    text = "<!-- run: tests -->\n```sh\npip install .\n```\n\n<!-- before: magpend models -->\n"
+    page.write_text(text, "utf-8")
+    assert tutorials.follow(page, tmp_path) == {}
+    page.write_text(text.replace("magpend models", "pip list"), "utf-8")
+    with pytest.raises(tutorials.TutorialError, match="only commands of magpend"):
+        tutorials.follow(page, tmp_path)
+
+
 @pytest.mark.parametrize("page", sorted((ROOT / "docs").rglob("*.md")), ids=lambda path: path.stem)
 def test_pictures__are_there(page):
     for target in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", page.read_text("utf-8")):

@@ -57,12 +57,15 @@ def animate(
     transient: Annotated[int, typer.Option(help="Of a start: periods before the film begins.")] = 0,
     seconds: Annotated[
         float | None,
-        typer.Option(help="Length of the film [s], a little changed where whole periods fit; else 8."),
+        typer.Option(help="Length of the film [s]; else 8."),
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second, of a GIF at most 50; else 25.")] = None,
     speed: Annotated[
         float | None,
-        typer.Option(help="Seconds of the model in one of film; else such that a period takes about two."),
+        typer.Option(
+            help="Seconds of the model in one of film, changed by 10 % at most so that whole periods are "
+            "shown; else such that a period takes about two."
+        ),
     ] = None,
     size: Annotated[
         int | None, typer.Option(help="Width of a frame [pixels], its height follows; else 800.")
@@ -122,7 +125,7 @@ def animate(
     if target.exists():
         console.note(f"note: {target} was there already, and is replaced")
     make_folder(target.parent)
-    console.note(f"{film.n_frames} frames, {film.n_frames / film.fps:.3g} s")
+    console.note(film.summary)
     console.result(f"animation: {save_animation(film, target)}")
     console.result(f"data: {save_data(film.figure, target)}")
 

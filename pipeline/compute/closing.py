@@ -57,7 +57,10 @@ class Closing(NamedTuple):
         if math.isinf(self.to_go):
             return f"{text}, which does not shrink steadily (closed: {TOLERANCE:g})"
         enough = n_transient + math.ceil(self.to_go)
-        return f"{text}; at this rate it is closed ({TOLERANCE:g}) with --transient {enough}"
+        return (
+            f"{text}; if this distance goes on shrinking as it does, the motion has closed ({TOLERANCE:g}) "
+            f"after --transient {enough}"
+        )
 
 
 def closing_of(sections: np.ndarray, system: System) -> Closing | None:

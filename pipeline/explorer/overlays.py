@@ -99,7 +99,7 @@ def _size(array: xr.DataArray, dims: list[Any]) -> int:
 
 
 def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """Largest exponent and share of each attractor that is there."""
+    """Largest exponent and share of each attractor, with gaps where it is absent or does not attract."""
     found = run.kept("attractors")
     if found is None:
         return
@@ -118,9 +118,10 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
                 "name": f"exponent {letter(number)}", "title": f"largest exponent of {name}", "unit": "1/s",
                 "group": "exponents", "colour": colour, "attractor": number, "y": exponent,
             }  # fmt: skip
-        share = np.atleast_1d(one["share"].values)
-        if not (np.atleast_1d(one["stability"].values) == ATTRACTS).any():
+        attracts = np.atleast_1d(one["stability"].values) == ATTRACTS
+        if not attracts.any():
             continue
+        share = np.where(attracts, np.atleast_1d(one["share"].values), np.nan)
         shares: dict[str, Any] = {"y": share}
         if not walked:  # walks are no sample of initial states: their shares have no interval
             low, high = share_interval(np.atleast_1d(one["n_cells"].values), share)

@@ -21,6 +21,18 @@ from pipeline.plots import labels, style
 from pipeline.plots.movers import Scene, Trail, moving_clock, moving_machine, moving_portrait
 
 SCREEN_DPI = 100
+LOOK = style.Look(10.0, 9.0, 9.0)
+"""Letters of films of every size: 12 pixels and more."""
+
+LEAST_LABELLED_IN = 1.0
+"""Portraits narrower than this have no tick labels: these would cover each other."""
+
+LEAST_NAMED_IN = 1.35
+"""Narrower drawings have no names and no scale bar."""
+
+LEAST_HIGH_IN = 0.6
+"""Least height of a portrait."""
+
 MOST_ABREAST = 4
 """Motions beside one another; more begin a second row."""
 
@@ -51,6 +63,17 @@ class Animation:
     def fps(self) -> float:
         """Frames per second."""
         return float(self.figure.data.attrs["fps"])
+
+    @property
+    def summary(self) -> str:
+        """Frames, length [s], what time of the model is shown [s, drive periods], and how slowly."""
+        data = self.figure.data
+        shown, frequencies = float(data["time"][-1]), np.unique(data["drive_frequency"].values)
+        told = f"{shown:.4g} s of the model"
+        if not model_of(data).autonomous and len(frequencies) == 1:
+            told += f" ({shown * frequencies[0]:.4g} drive periods)"
+        told += f", {float(data.attrs['speed']):.3g} \N{MULTIPLICATION SIGN} real time"
+        return f"{self.n_frames} frames, {self.n_frames / self.fps:.3g} s: {told}"
 
     def frames(self) -> Iterator[Pixels]:
         """Draw the frames one after the other, each (height, width, 3)."""
@@ -101,6 +124,7 @@ def plot_animation(
     frame = style.Frame(plan.width / style.MM)
     fig = style.new_figure(plan.height, ds, frame, arranged=False, exact=True)
     fig.set_dpi(SCREEN_DPI)
+    fig.look = LOOK
     movers: list[Any] = []
     scene = None if model.drawing is None else Scene.of(ds, model.drawing)
     for k in range(ds.sizes["motion"]):
@@ -108,13 +132,16 @@ def plot_animation(
         boxes = plan.boxes(k)
         _title(fig, plan, boxes[0], str(one["name"].values))
         trail = Trail.of(one)
+        named = k == 0 and boxes[0][2] * plan.width >= LEAST_NAMED_IN
         if scene is not None:
-            movers.append(moving_machine(fig.add_axes(boxes[0]), scene, one, trail, named=k == 0))
+            movers.append(moving_machine(fig.add_axes(boxes[0]), scene, one, trail, named=named))
         places = boxes[scene is not None :]
-        movers += [
-            moving_portrait(fig.add_axes(p), one, c, trail, degrees)
-            for c, p in zip(pairs, places, strict=True)
-        ]
+        for pair, place in zip(pairs, places, strict=True):
+            ax = fig.add_axes(place)
+            movers.append(moving_portrait(ax, one, pair, trail, degrees))
+            ax.tick_params(labelleft=plan.labelled, labelbottom=plan.labelled)
+            if place[2] * plan.width < 2.0 * LEAST_LABELLED_IN:
+                style.few_ticks(ax, 3, 3)
     movers.append(moving_clock(fig, ds))
     style.finish(fig)
     return Animation(fig, tuple(movers))
@@ -151,21 +178,27 @@ class _Plan:
     left: float
     below: float
     above: float
+    labelled: bool
 
     @classmethod
     def of(cls, n: int, n_pairs: int, drawn: bool, size: int) -> _Plan:
         width = 2 * round(size / 2) / SCREEN_DPI
-        small = width / style.MM < style.COMPACT_MM
-        left, below, above = (0.5, 0.36, 0.24) if small else (0.66, 0.46, 0.3)
         columns = n if n <= MOST_ABREAST else math.ceil(n / 2)
+        room = width / columns if n > 1 else 0.48 * width if drawn else width / n_pairs
+        labelled = room - 0.86 >= LEAST_LABELLED_IN
+        left, below, above = (0.74, 0.46, 0.3) if labelled else (0.3, 0.3, 0.3)
         if n == 1:
-            height = min(0.56 * width, 6.0) if drawn or n_pairs > 1 else 0.7 * width
             stacked = n_pairs if drawn else 1
-            portrait = (height - above - below * (stacked + 0.6)) / stacked
-            return cls(n, n_pairs, drawn, width, 1, height - above - below, portrait, left, below, above)
+            margins = above + below * (stacked + 0.6)
+            height = min(0.56 * width, 6.0) if drawn or n_pairs > 1 else 0.7 * width
+            height = max(height, margins + LEAST_HIGH_IN * stacked)
+            portrait = (height - margins) / stacked
+            return cls(
+                n, n_pairs, drawn, width, 1, height - above - below, portrait, left, below, above, labelled
+            )
         pitch = width / columns
         return cls(n, n_pairs, drawn, width, columns, 0.95 * pitch if drawn else 0.0,
-                   max(0.55 * (pitch - left), 0.6), left, below, above)  # fmt: skip
+                   max(0.55 * (pitch - left), LEAST_HIGH_IN), left, below, above, labelled)  # fmt: skip
 
     @property
     def row(self) -> float:

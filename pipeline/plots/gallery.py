@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from pipeline.analysis.outcomes import left_out
 from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, model_of, parameters_of, told_by
 from pipeline.layout.words import once
@@ -19,7 +20,12 @@ from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, 
 from pipeline.products.figures import AttractorFigureOptions
 
 MAX_ROWS = 8
-_PANEL_IN, _TITLE_IN, _LABEL_IN, _HEAD_IN = 0.9, 0.2, 0.44, 0.3
+LONE_MM = 110.0
+"""Width of a figure with a single panel: a wider one would be half empty."""
+
+_PANEL_IN, _LABEL_IN, _LINE_IN = 0.9, 0.44, 0.17
+_PATH_IN = 0.14
+"""Further room for the tick labels of a path, which are long."""
 
 
 def plot_gallery(
@@ -43,7 +49,8 @@ def plot_gallery(
     DataFigure
         Lines are the motion, dots its section. The portrait of an angle that turns over is
         drawn on the circle, from -pi to pi. The `MAX_ROWS` attractors with the largest share are
-        drawn, in the order of their ids; where there are fewer, also sets that do not attract, in grey. Its
+        drawn, in the order of their ids; where there are fewer, also sets that do not attract, in grey. The
+        head says which cells end elsewhere and why. A single panel makes a figure of `LONE_MM` at most. Its
         `data` are the portraits of these.
 
     Raises
@@ -58,31 +65,45 @@ def plot_gallery(
         raise ValueError("there is no attractor at this parameter point: nothing to draw")
     ranked = np.argsort(-portraits["share"].values, kind="stable")[:MAX_ROWS]
     data = portraits.isel(attractor=np.sort(ranked)).assign_attrs(told_by(attractors.attrs))
-    cast = palette.cast_of(attractors, _described(attractors, portraits))
+    here = _described(attractors, portraits)
+    cast = palette.cast_of(attractors, here)
     each = len(model.portraits) + (model.drawing is not None)
-    layout = _Layout.of(frame, data.sizes["attractor"], each)
+    if each * data.sizes["attractor"] == 1:
+        frame = replace(frame, width=min(frame.width, LONE_MM))
+    head = style.folded(_told(data, portraits, here), frame.width_in - 0.2, style.look_at(frame).legend)
+    layout = _Layout.of(frame, data.sizes["attractor"], each, model.drawing is not None, head.count("\n") + 1)
+    titles = [_title(data.isel(attractor=k), cast, layout) for k in range(data.sizes["attractor"])]
+    layout = replace(layout, title_lines=1 + max(title.count("\n") for title in titles))
     fig = style.new_figure(layout.height, data, frame, arranged=False, exact=True)
     shown: set[str] = set()
-    for k in range(data.sizes["attractor"]):
-        shown |= _draw_one(fig, layout, k, data.isel(attractor=k), cast, degrees)
-    _head(fig, data, portraits, n, shown)
+    for k, title in enumerate(titles):
+        shown |= _draw_one(fig, layout, k, data.isel(attractor=k), (title, cast), degrees)
+    _write_head(fig, head, data, shown)
     style.finish(fig)
     return fig
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Places of the panels [in]: so many attractors beside one another, each with so many panels."""
+    """Places of the panels [in]: so many attractors beside one another, each with so many panels.
+
+    The last panel of each is a path if the model has a `drawing`. Above all stand `lines` of text and a
+    legend.
+    """
 
     frame: style.Frame
     rows: int
     beside: int
     each: int
+    drawing: bool
+    lines: int
+    title_lines: int = 1
 
     @classmethod
-    def of(cls, frame: style.Frame, n: int, each: int) -> _Layout:
-        beside = min(n, max(1, (2 if frame.compact else 3) // each))
-        return cls(frame, -(-n // beside), beside, each)
+    def of(cls, frame: style.Frame, n: int, each: int, drawing: bool, lines: int) -> _Layout:
+        most = max(1, (2 if frame.compact else 3) // each)
+        rows = -(-n // most)
+        return cls(frame, rows, -(-n // rows), each, drawing, lines)
 
     @property
     def left(self) -> float:
@@ -94,22 +115,24 @@ class _Layout:
 
     @property
     def panel(self) -> tuple[float, float]:
-        height = _PANEL_IN if self.each * self.beside > 2 else 1.35
-        # a lone panel is no wider than legible
-        return min(self.pitch - self.left - 0.08, 2.6 * height), height
+        height = {1: 2.2, 2: 1.35}.get(self.each * self.beside, _PANEL_IN)
+        return self.pitch - self.left - 0.16, height
 
     @property
     def row(self) -> float:
-        return self.panel[1] + _TITLE_IN + _LABEL_IN
+        return self.panel[1] + self.title_lines * _LINE_IN + 0.06 + _LABEL_IN
 
     @property
     def height(self) -> float:
-        return _HEAD_IN * (2 if self.frame.compact else 1) + self.rows * self.row
+        return _LINE_IN * (self.lines + 1) + 0.08 + self.rows * self.row
 
     def axes(self, fig: style.DataFigure, k: int, column: int) -> Axes:
         """Axes of a panel of the k-th attractor."""
         width, height = self.panel
         x = self.left + ((k % self.beside) * self.each + column) * self.pitch
+        if self.drawing and column == self.each - 1:
+            room = 0.0 if self.frame.compact else _PATH_IN
+            x, width = x + room, width - room
         y = (self.rows - 1 - k // self.beside) * self.row + _LABEL_IN
         size = fig.get_size_inches()
         ax = fig.add_axes((x / size[0], y / size[1], width / size[0], height / size[1]))
@@ -125,31 +148,41 @@ def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
     return attractors.sel(at)
 
 
+def _title(one: xr.Dataset, cast: palette.Cast, layout: _Layout) -> str:
+    """Name and share of an attractor, in the lines that its panels have room for."""
+    attracts = int(one["stability"]) == ATTRACTS
+    share = f", share {palette.percent(float(one['share']))}" if attracts else ""
+    room, size = layout.each * layout.pitch - layout.left, style.look_at(layout.frame).legend
+    return style.folded(f"{cast.names[int(one['attractor'])]}{share}", room, size, "   ")
+
+
 def _draw_one(
-    fig: style.DataFigure, layout: _Layout, k: int, one: xr.Dataset, cast: palette.Cast, degrees: bool
+    fig: style.DataFigure,
+    layout: _Layout,
+    k: int,
+    one: xr.Dataset,
+    named: tuple[str, palette.Cast],
+    degrees: bool,
 ) -> set[str]:
     model, number = model_of(one), int(one["attractor"])
+    title, cast = named
     motion = Motion(
         {name: one["orbit"].sel(state=name).values for name in model.state_names},
         {name: one["attractor_points"].sel(state=name).values for name in model.state_names},
         palette.GREY_OF.get(int(one["stability"]), cast.colours[number]), letter(number),
     )  # fmt: skip
     axes = [layout.axes(fig, k, column) for column in range(layout.each)]
-    attracts = int(one["stability"]) == ATTRACTS
-    share = f", share {palette.percent(float(one['share']))}" if attracts else ""
-    axes[0].text(
-        0.0, 1.04, f"{cast.names[number]}{share}", transform=axes[0].transAxes,
-        fontsize=fig.look.legend, va="bottom",
-    )  # fmt: skip
+    axes[0].text(0.0, 1.04, title, transform=axes[0].transAxes, fontsize=fig.look.legend, va="bottom")
     for ax, pair in zip(axes, model.portraits, strict=False):
         draw_portrait(ax, one, pair, motion, degrees=degrees)
     shown: list[str] = []
     if model.drawing is not None:
         shown = draw_path(axes[-1], model.drawing, _parameters(one), motion)
+        style.few_ticks(axes[-1], 3)
         equalise(axes[-1])
     if layout.panel[0] < 0.8:
         for ax in axes:
-            ax.xaxis.set_major_locator(MaxNLocator(2))
+            ax.xaxis.set_major_locator(MaxNLocator(2 if layout.panel[0] > 0.6 else 1))
     return set(shown)
 
 
@@ -159,20 +192,23 @@ def _parameters(one: xr.Dataset) -> dict[str, float]:
     return {name: float(one[name]) if name in one.coords else value for name, value in values.items()}
 
 
-def _head(fig: style.DataFigure, data: xr.Dataset, portraits: xr.Dataset, n: int, shown: set[str]) -> None:
-    width, height = fig.get_size_inches()
+def _told(data: xr.Dataset, portraits: xr.Dataset, here: xr.Dataset) -> str:
+    """The parameter point, and what of it is not drawn and why."""
     text = labels.caption(portraits.assign_attrs(data.attrs), with_start=False)
-    if (rest := n - data.sizes["attractor"]) > 0:
+    if (rest := portraits.sizes["attractor"] - data.sizes["attractor"]) > 0:
         share = palette.percent(float(portraits["share"].sum() - data["share"].sum()))
         text += f"; {rest} more sets, with a share of {share}, are not shown"
+    return style.join([text, left_out(here)])
+
+
+def _write_head(fig: style.DataFigure, text: str, data: xr.Dataset, shown: set[str]) -> None:
+    width, height = fig.get_size_inches()
     size = fig.look.legend
-    room = width - 0.2 if fig.frame.compact else 0.62 * width
-    fig.text(0.08 / width, 1.0 - 0.06 / height, style.folded(text, room, size), fontsize=size, va="top")
+    fig.text(0.08 / width, 1.0 - 0.06 / height, text, fontsize=size, va="top", linespacing=1.1)
     handles: list[Any] = [style.dot(once(model_of(data)), "black", 3.0), *_fixed_handles(data, shown)]
     fig.legend(
-        handles=handles, loc="upper right" if not fig.frame.compact else "upper left", frameon=False,
-        bbox_to_anchor=(1.0 - 0.05 / width, 1.0 - 0.04 / height)
-        if not fig.frame.compact else (0.04 / width, 1.0 - (0.04 + _HEAD_IN * 0.6) / height),
+        handles=handles, loc="upper left", frameon=False,
+        bbox_to_anchor=(0.04 / width, 1.0 - (0.06 + _LINE_IN * (text.count("\n") + 1)) / height),
         ncols=len(handles), fontsize=size, borderpad=0.0, borderaxespad=0.0, handletextpad=0.2,
         columnspacing=1.0, handlelength=1.2,
     )  # fmt: skip

@@ -127,7 +127,7 @@ def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Tra
         if str(line.get_gid()).startswith("orbit:"):
             line.set_alpha(0.4 if trail.closed else 0.0)
     for lines in (ax.xaxis, ax.yaxis):
-        lines.labelpad = 1.5
+        lines.labelpad = 2.5
     states = {s.name: s for s in model.states}
     measures = [labels.state_measure(one, n, degrees and states[n].unit.startswith("rad")) for n in pair]
     path, jumps = _path(measures, [orbit[name] for name in pair])
@@ -289,6 +289,10 @@ def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> Clock:
     speed = float(ds.attrs["speed"])
     told = "real time" if abs(speed - 1.0) < 5e-3 else f"{speed:.2g} \N{MULTIPLICATION SIGN} real time"
     drive = f"drive {float(frequencies[0]):.6g} Hz, " if forced else ""
-    fig.text(1.0 - 0.1 / width, y, f"{drive}{told}", fontsize=size, color="0.35", va="bottom", ha="right")
+    # as much as there is room for beside the time
+    for words in (f"{drive}{told}", told):
+        if 0.48 * size / 72.0 * len(words) <= width - 1.5:
+            fig.text(1.0 - 0.1 / width, y, words, fontsize=size, color="0.35", va="bottom", ha="right")
+            break
     period = 1.0 / float(frequencies[0]) if forced else 0.0
     return Clock(text, ds["time"].values, period, "drive periods")

@@ -37,6 +37,7 @@ from pipeline.layout.vocabulary import (
     UNSTABLE,
     model_of,
 )
+from pipeline.layout.words import period_of
 from pipeline.plots import style
 
 COLOURS = (
@@ -135,7 +136,7 @@ def describe(one: xr.Dataset) -> str:
     words = _words(one, one["side"].values.ravel()[present]) if "side" in one else ""
     kinds, periods = (one[name].values.ravel()[present] for name in ("kind", "orbit_period"))
     told = _periods(periods, kinds, model_of(one).autonomous) + _seconds(one)
-    return style.join([told, (words + _turns(one, present)).lstrip("\u00a0"), _stability(one)])
+    return style.join([told, words, _turns(one, present), _stability(one)])
 
 
 def _stability(one: xr.Dataset) -> str:
@@ -183,15 +184,16 @@ def _words(one: xr.Dataset, codes: np.ndarray) -> str:
 
 
 def _turns(one: xr.Dataset, present: np.ndarray) -> str:
-    """Mean turns per drive period, where the motion rotates at every point and always alike."""
+    """Mean turns per drive period or return, where the motion rotates at every point and always alike."""
     dim = model_of(one).angle_dim
     if "rotation" not in one or dim not in one["rotation"].dims:
         return ""
     turns = one["rotation"].transpose(..., dim).values.reshape(-1, one.sizes[dim])[present]
     if np.abs(turns).max(axis=1).min() < 0.05 or not np.ptp(turns, axis=0).max() <= 0.05:
         return ""
-    # no-break spaces: a legend's line is not folded here
-    return "\u00a0({})".format(",\u00a0".join(_signed(x) for x in turns.mean(axis=0)))
+    told = [_signed(x) for x in turns.mean(axis=0)]
+    word = "turn" if told in (["+1"], ["\N{MINUS SIGN}1"]) else "turns"
+    return f"{' and '.join(told)} {word} per {period_of(model_of(one))}"
 
 
 def _signed(turns: float) -> str:

@@ -79,6 +79,8 @@ def plot_trajectory(
         handles += _draw_path(path, ds, drawing, Motion(series, section, "0.35"))
     if frame.xlim:
         axes[-1].set_xlim(*style.check_range("xlim", frame.xlim))
+    if path is not None:
+        equalise(path)  # its ticks must be known when places are found
     fig.align_ylabels(axes)
     style.complete(fig, axes[0], _place(ds), handles)
     if path is not None:

@@ -24,6 +24,9 @@ RTOL = 1e-9
 PERIOD_IN_FILM_S = 2.0
 """What a period takes in the film if no speed is given: slow enough to follow, fast enough to wait for."""
 
+MOST_CHANGE, MOST_CHANGE_OF_SPEED = 2.0, 1.1
+"""Largest factor by which the speed is changed so that whole periods are shown: chosen here, or given."""
+
 SAMPLES_PER_PERIOD = 240
 """Lines look smooth; frames fall on samples."""
 
@@ -89,7 +92,10 @@ class Schedule:
 
 
 def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
-    """Lay the instants of a film: whole periods where all motions repeat and enough of them fit.
+    """Lay out the instants of a film, which lasts what was asked, to the nearest frame.
+
+    The speed is changed so that whole periods are shown, where all motions repeat: by `MOST_CHANGE` at most,
+    of a speed that was given by `MOST_CHANGE_OF_SPEED`.
 
     Raises
     ------
@@ -97,15 +103,17 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
         If the film has too many frames, or shows too much time.
     """
     cycle = min((_cycle(m) for m in moving), default=1.0)
-    speed = options.speed or _nice(cycle / PERIOD_IN_FILM_S)
-    asked = options.seconds * speed
+    n_frames = max(2, round(options.seconds * options.fps))
+    length = n_frames / options.fps
+    duration = asked = length * (options.speed or _nice(cycle / PERIOD_IN_FILM_S))
     common = _common([m.period_s for m in moving if m.period_s != 0.0], cycle)
     # what rests repeats whatever is shown
-    duration = asked if not common else common * max(1, round(asked / common))
-    repeats = common is not None and duration <= 2.0 * asked
-    if not repeats:
-        duration = asked
-    n_frames = max(2, round(duration / speed * options.fps))
+    whole = asked if not common else common * max(1, round(asked / common))
+    most = MOST_CHANGE_OF_SPEED if options.speed else MOST_CHANGE
+    repeats = common is not None and max(whole / asked, asked / whole) <= most * (1.0 + 1e-9)
+    if repeats:
+        duration = whole
+    speed = duration / length
     substeps = max(1, math.ceil(duration / n_frames / cycle * SAMPLES_PER_PERIOD))
     problems = []
     if n_frames > MOST_FRAMES:
@@ -120,7 +128,7 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
         )
     if problems:
         raise SpecError(problems)
-    return Schedule(duration * options.fps / n_frames, duration, n_frames, substeps, repeats)
+    return Schedule(speed, duration, n_frames, substeps, repeats)
 
 
 def _cycle(one: Moving) -> float:

@@ -10,9 +10,9 @@ period that spring from it where a period doubling hands stability on. So
   band inside of a branch, say); at a fold a branch turns back, and what lies beyond is another attractor;
 * an orbit of twice the period keeps the id of the one that it springs from, unless both attract at one
   parameter point: attractors that coexist anywhere have different ids;
-* what no branch connects is held against each other by distance, like with like only: a bounded set never
-  takes the id of an orbit, nor an orbit that of another whose period no doubling relates, that moves on
-  another side, or that was followed to an end without meeting it.
+* sets that no branch connects are matched by their distance, and only sets of one kind: a bounded set never
+  takes the id of an orbit. An orbit never takes the id of an orbit whose period no doubling relates to its
+  own, which moves on another side, or which was followed to its end without a meeting.
 
 `match_basis` says for every appearance what its id rests on, nearest evidence first: a branch that was
 followed, a doubling, or distance alone.

@@ -23,6 +23,7 @@ from magpend_core.models import load_model
 from magpend_core.models.parameters import ParameterError, Parameters
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.presets import find_preset
+from pipeline.rig.recordings import units
 from pipeline.spec.files import read_toml
 from pipeline.spec.problems import SpecError, unknown_choice, unknown_name, validated
 from pipeline.spec.tables import Table
@@ -194,6 +195,8 @@ class Measurement:
         As read [N m].
     torque : ndarray
         Of the magnets alone [N m].
+    warnings : tuple of str
+        Names of columns that were taken though they are not the header's.
     """
 
     header: Header
@@ -205,6 +208,7 @@ class Measurement:
     side: np.ndarray
     reading: np.ndarray
     torque: np.ndarray
+    warnings: tuple[str, ...] = ()
 
     @cached_property
     def curves(self) -> tuple[Curve, ...]:
@@ -264,7 +268,7 @@ def read_measurement(path: str | Path) -> Measurement:
     path = Path(path)
     header = validated(Header, read_toml(path))
     parameters, problems = _known(header, path.parent)
-    table, content, more = _table(path.parent / header.file, header)
+    table, content, more, warnings = _table(path.parent / header.file, header)
     problems += more
     columns = _numbers(header, table, problems) if table else {}
     if columns:
@@ -275,7 +279,9 @@ def read_measurement(path: str | Path) -> Measurement:
     angle, locked, reading = columns[laws.ANGLE], columns[laws.LOCKED], columns["torque"]
     torque = reading - _besides(header.correction, parameters, angle, locked, columns)
     digest = hashlib.sha256(content).hexdigest()
-    return Measurement(header, path, digest, parameters, angle, locked, columns["side"], reading, torque)
+    return Measurement(
+        header, path, digest, parameters, angle, locked, columns["side"], reading, torque, tuple(warnings)
+    )
 
 
 def _besides(
@@ -322,24 +328,25 @@ def _known(header: Header, folder: Path) -> tuple[Parameters | None, list[str]]:
 # ---- the table -----------------------------------------------------------------------------------
 
 
-def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, list[str]]:
-    """Columns as they stand in the file, its bytes, and what is wrong with it as a table."""
+def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, list[str], list[str]]:
+    """Return the columns as they stand in the file, its bytes, and its problems and warnings."""
     try:
         content = path.read_bytes()
         lines = [line for line in content.decode("utf-8-sig").splitlines() if line.strip()]
     except OSError as error:
-        return {}, b"", [f"file = {header.file!r}: cannot be read ({error.strerror or error})."]
+        return {}, b"", [f"file = {header.file!r}: cannot be read ({error.strerror or error})."], []
     except UnicodeDecodeError:
-        return {}, b"", [f"file = {header.file!r}: is not text in UTF-8; write the table as CSV."]
+        return {}, b"", [f"file = {header.file!r}: is not text in UTF-8; write the table as CSV."], []
     rows = list(csv.reader((line for line in lines if not line.startswith("#")), delimiter=header.delimiter))
     if len(rows) < 2:
         return (
             {},
             content,
             [f"file = {header.file!r}: has no readings; names in the first row, then numbers."],
+            [],
         )
     names = [name.strip() for name in rows[0]]
-    wanted = _wanted(header)
+    wanted, warnings = _but_for_units(_wanted(header), names, header)
     problems = [
         f"columns.{key} = {name!r}: {header.file} has no such column; it has: {', '.join(names)}."
         for key, name in wanted.items()
@@ -349,9 +356,9 @@ def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, lis
     if ragged:
         problems.append(f"{header.file}: {_places(ragged)}: not {len(names)} fields as in the first row.")
     if problems:
-        return {}, content, problems
+        return {}, content, problems, []
     columns = {key: [row[names.index(name)].strip() for row in rows[1:]] for key, name in wanted.items()}
-    return columns, content, []
+    return columns, content, [], warnings
 
 
 def _wanted(header: Header) -> dict[str, str]:
@@ -360,6 +367,25 @@ def _wanted(header: Header) -> dict[str, str]:
     if header.correction.without is not None:
         found["without"] = header.correction.without
     return found
+
+
+def _but_for_units(
+    wanted: dict[str, str], names: list[str], header: Header
+) -> tuple[dict[str, str], list[str]]:
+    """Accept columns whose names have a unit in brackets besides, for the header gives it; warn of them."""
+    found, warnings = dict(wanted), []
+    for key, name in wanted.items():
+        near = units.names_with_unit(name, names)
+        if name in names or len(near) != 1 or key == "side":
+            continue
+        found[key], stated = near[0]
+        own = getattr(header.columns, "torque" if key == "without" else key).unit
+        path = "correction.without" if key == "without" else f"columns.{key}"
+        text = f"{path} = {name!r}: {header.file} has {found[key]!r}; it is taken for the same"
+        if not units.same(stated, own):
+            text += f", in {own} as the header says"
+        warnings.append(f"{text}.")
+    return found, warnings
 
 
 def _numbers(header: Header, table: Mapping[str, list[str]], problems: list[str]) -> dict[str, np.ndarray]:

@@ -172,7 +172,7 @@ def _table(joint: JointFit, m: Measurement) -> list[str]:
 
 def warnings_of(outcome: Outcome) -> list[str]:
     """Return what whoever uses the numbers must know."""
-    joint, found = outcome.joint, []
+    joint, found = outcome.joint, list(outcome.measured.warnings)
     for name, partner in joint.undetermined.items():
         found.append(
             f"{name} is hardly determined by these readings (standard error {joint.errors[name]:.2g} of "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping as AnyMapping
 from collections.abc import Sequence
 from dataclasses import replace
@@ -32,8 +31,6 @@ from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.spec.problems import SpecError, unknown_name
 
 DIM = "sample"
-_WITH_UNIT = re.compile(r"\s*(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*")
-"""A channel's name, and its unit in brackets."""
 
 
 def read_recording(
@@ -186,10 +183,7 @@ def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str])
 
 def _names_with_unit(channel: str | int, names: Sequence[str]) -> list[tuple[str, str]]:
     """Return names that are a channel's and a unit in brackets, each with the unit."""
-    parts = [(name, match) for name in names if (match := _WITH_UNIT.fullmatch(name))]
-    return [
-        (name, match[2]) for name, match in parts if isinstance(channel, str) and match[1] == channel.strip()
-    ]
+    return units.names_with_unit(channel, names) if isinstance(channel, str) else []
 
 
 def _unit_hint(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str:
@@ -282,11 +276,7 @@ def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[
     for name, entry in _entries(mapping).items():
         stated = units.spelled(raw.stretches[0][columns[name]].unit)
         own = units.spelled(entry.unit or mapping.unit_of(name))
-        known = [units.factor(u, units.kind_of(u) or "") for u in (stated, own)]
-        same = stated == own or (
-            known[0] == known[1] is not None and units.kind_of(stated) == units.kind_of(own)
-        )
-        if stated and not same:
+        if stated and not units.same(stated, own):
             findings.append(Finding(
                 "unit", name, math.nan, math.nan, "warning",
                 f"the file says {stated!r}, the mapping {own!r}; the mapping's is used.",

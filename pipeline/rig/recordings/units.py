@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
+
+_WITH_UNIT = re.compile(r"\s*(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*")
+"""A column's name, and its unit in brackets."""
 
 _DEGREE, _TURN = math.pi / 180.0, 2.0 * math.pi
 
@@ -47,3 +52,25 @@ def factor(unit: str, wanted: str) -> float | None:
 def kind_of(unit: str) -> str | None:
     """Return the SI unit of the quantities that are measured in this unit, None if that is not known."""
     return next((si for si, known in UNITS.items() if unit in known), None)
+
+
+def same(one: str, other: str) -> bool:
+    """Whether two units are one, however they are spelled."""
+    one, other = spelled(one), spelled(other)
+    kind = kind_of(one)
+    alike = kind is not None and kind == kind_of(other) and factor(one, kind) == factor(other, kind)
+    return one == other or alike
+
+
+def names_with_unit(wanted: str, names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the names that are the wanted one and a unit in brackets, each with the unit.
+
+    Parameters
+    ----------
+    wanted
+        Such as ``Winkel oben``.
+    names
+        Of a file's columns or channels, such as ``Winkel oben [deg]``.
+    """
+    parts = [(name, match) for name in names if (match := _WITH_UNIT.fullmatch(name))]
+    return [(name, match[2]) for name, match in parts if match[1] == wanted.strip()]

@@ -29,7 +29,7 @@ from pipeline.explorer.tables import table
 from pipeline.explorer.view import describe_view
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.layout.vocabulary import DIVERGED, EVIDENCE, PERIODIC, TRANSIENT
+from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, EVIDENCE, PERIODIC, TRANSIENT
 from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
@@ -560,9 +560,12 @@ def test_curves__are_shares_and_exponents_of_the_analysis(sweep):
     shares = {c["attractor"]: c for c in listed if c["group"] == "fractions"}
     assert shares
     for number, one in shares.items():
-        np.testing.assert_array_equal(one["y"], found["share"].isel(attractor=number).values)
+        # where it is absent there is a gap, not a share of 0
+        there = (found["stability"].isel(attractor=number) == ATTRACTS).values
+        share = found["share"].isel(attractor=number).values
+        assert [y is not None for y in one["y"]] == there.tolist()
+        np.testing.assert_array_equal(np.array(one["y"], float)[there], share[there])
         for low, y, high in zip(one["low"], one["y"], one["high"], strict=True):
-            # where the attractor has no cells there is no interval
             assert low <= y <= high if y else low is high is None
         assert one["x"] == found["amplitude"].values.tolist()
 

@@ -102,6 +102,15 @@ def test_plot_gallery__portraits_that_the_model_names_and_no_path(width):
         plot_gallery(found, make_portraits(2), degrees=True)
 
 
+def test_plot_gallery__a_lone_panel_fills_its_figure():
+    """Half of a figure of full width was empty."""
+    found = make_attractors([[0]], ("frequency", "initial_condition"), {"frequency": [0.2]})
+    (ax,) = plot_gallery(found, make_portraits(1)).axes
+    box = ax.get_position()
+    assert box.width > 0.8
+    assert box.height > 0.6
+
+
 def make_series(model, names, **attrs):
     time = np.linspace(0.0, 3.0, 301)
     values = {name: ("time", 0.1 * np.cos(2 * np.pi * time + i)) for i, name in enumerate(names)}

@@ -10,6 +10,7 @@ import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 
 from magpend_core.models import load_model
@@ -28,6 +29,7 @@ from pipeline.plots import (
     plot_regimes,
     save_data,
     save_figure,
+    style,
 )
 
 VALUES = load_model("pendulum").load().as_dict()
@@ -310,7 +312,7 @@ def test_describe__periods_sides_turns():
     ds["stability"][:] = ATTRACTS
     ds["side"][:] = Side.ROTATING
     ds["rotation"][:] = [0.0, -0.5]
-    assert palette.describe(ds).endswith("rotating\N{NO-BREAK SPACE}(0,\N{NO-BREAK SPACE}\N{MINUS SIGN}0.5)")
+    assert palette.describe(ds).endswith("rotating, 0 and \N{MINUS SIGN}0.5 turns per drive period")
     ds["rotation"][0] = [0.0, 1.0]
     assert palette.describe(ds).endswith("rotating")
 
@@ -631,6 +633,46 @@ def test_plot_gallery__largest_shares_are_drawn():
     assert any("3 more sets" in t.get_text() for t in fig.texts)
     with pytest.raises(ValueError, match="no attractor at this parameter point"):
         plot_gallery(attractors, portraits.isel(attractor=[]))
+
+
+def test_plot_gallery__says_what_it_leaves_out():
+    """Of six cells two end on the attractors, three diverged and one was not reached."""
+    attractors = make_attractors(np.array([0, 1, -1, -1, -1, -1]), ("initial_condition",), {})
+    attractors["status"][2:] = [vocabulary.DIVERGED] * 3 + [vocabulary.UNREACHED]
+    fig = plot_gallery(attractors, make_portraits(2))
+    head = " ".join(fig.texts[0].get_text().split())
+    assert head.endswith("2 of 6 cells end on attractors; 3 diverged, 1 unreached")
+
+
+def texts_of(fig):
+    """Texts with their bounding boxes [pixels], labels of the ticks in view included."""
+    canvas = FigureCanvasAgg(fig)
+    canvas.draw()
+    found = list(fig.texts)
+    for ax in fig.axes:
+        found += [*ax.texts, ax.xaxis.label, ax.yaxis.label]
+        for axis in (ax.xaxis, ax.yaxis):
+            low, high = axis.get_view_interval()
+            ticks = zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=True)
+            found += [label for place, label in ticks if low <= place <= high]
+    return [(t, t.get_window_extent(canvas.get_renderer())) for t in found if t.get_text()]
+
+
+@pytest.mark.parametrize("width", [85.0, 178.0])
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_plot_gallery__no_label_covers_a_panel_or_another_label(n, width):
+    """Labels of paths, which have many digits, covered each other and the panel on the left."""
+    portraits = make_portraits(n)
+    portraits["orbit"] = 0.05 * portraits["orbit"] + 0.2
+    attractors = make_attractors(np.arange(n), ("initial_condition",), {})
+    fig = plot_gallery(attractors, portraits, frame=style.Frame(width))
+    texts, places = texts_of(fig), [ax.get_window_extent() for ax in fig.axes]
+    for text, box in texts:
+        assert not any(box.padded(-2).overlaps(p.padded(-2)) for p in places), text.get_text()
+        assert 0.0 <= box.x0 < box.x1 <= fig.bbox.x1, text.get_text()
+    for k, (text, box) in enumerate(texts):
+        for other, place in texts[:k]:
+            assert not box.padded(-2).overlaps(place.padded(-2)), (text.get_text(), other.get_text())
 
 
 def test_plot_gallery__sets_that_do_not_attract_are_grey_and_have_no_share():

@@ -6,11 +6,14 @@ import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from magpend_core.models import load_model
 from pipeline.plots import labels, plot_trajectory, save_figure
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+PARAMETERS = "\n".join(f"{k} = {v!r}" for k, v in load_model("pendulum").load().as_dict().items())
 
 
 def make_trajectory(n=401, frequency=2.0):
@@ -47,6 +50,20 @@ def test_plot_trajectory__torque_panel():
     fig = plot_trajectory(ds.assign(torque=("time", np.sign(ds["psi1"].values), {"units": "N m"})))
     np.testing.assert_array_equal(lines(fig)["series:torque"][:, 1], np.sign(ds["psi1"]))
     assert "torque [N m]" in [ax.get_ylabel() for ax in fig.axes]
+
+
+def test_plot_trajectory__labels_stay_off_the_series():
+    """The path of a small motion has ticks of many digits, known only once its scale is."""
+    ds = make_trajectory()
+    for state in STATES:
+        ds[state] = 0.02 * ds[state] + (0.1 if state in ("psi1", "psi2") else 0.0)
+    fig = plot_trajectory(ds.assign_attrs(parameters=PARAMETERS))
+    canvas = FigureCanvasAgg(fig)
+    canvas.draw()
+    path = fig.axes[-1]
+    label = path.yaxis.label.get_window_extent(canvas.get_renderer())
+    (last,) = (ax for ax in fig.axes if ax.get_xlabel() == "time [s]")
+    assert label.x0 > last.get_window_extent().x1
 
 
 def test_plot_trajectory__given_section_times():

@@ -145,6 +145,25 @@ def test_animation__attractors_side_by_side_repeat(run):
     assert all(np.abs(starts - point).max(axis=1).min() < 1e-4 for point in kept)
 
 
+@pytest.mark.parametrize("seconds", [1.0, 3.0, 5.1, 8.0])
+@pytest.mark.parametrize(("period", "hz"), [(2.0 / 2.44, 2.44), (6.0, 1.0), (1.0 / 2.6, 2.6), (np.nan, 2.2)])
+def test_schedule__lasts_what_was_asked(seconds, period, hz):
+    """Whole periods are shown by another speed, not by another length."""
+    plan = instants.schedule([one_moving(period, hz)], AnimationOptions(seconds=seconds, fps=16))
+    assert plan.n_frames / 16 == pytest.approx(seconds, abs=1 / 16)
+    assert plan.duration == pytest.approx(plan.speed * plan.n_frames / 16)
+    if plan.repeats:
+        assert plan.duration / period == pytest.approx(round(plan.duration / period))
+
+
+@pytest.mark.parametrize(("period", "repeats"), [(0.95, True), (0.8, False)])
+def test_schedule__a_speed_that_was_given_is_changed_a_little(period, repeats):
+    """By 5 % so that two periods fill two seconds; not by 20 %."""
+    plan = instants.schedule([one_moving(period, 1.0)], AnimationOptions(seconds=2, fps=10, speed=1.0))
+    assert plan.repeats is repeats
+    assert plan.speed == pytest.approx(period if repeats else 1.0)
+
+
 def test_animation__cells_pass_through_their_sections(run):
     """Cell 4 is the second start at the second frequency: its film goes through what the cube holds."""
     film = animation(run, cells=[4], seconds=10, fps=5, speed=3.0)
@@ -254,16 +273,16 @@ def test_animate__refuses_in_one_sentence(main, run, tmp_path, words, said):
     assert {p for p in sorted(run.rglob("*")) if p not in before} <= set((run / "derived").rglob("*"))
 
 
-def one_moving(period):
+def one_moving(period, hz=0.5):
     parameters = magpend.load_model("duffing").load()
-    return instants.Moving("", "0", parameters, 0.5, np.zeros(2), np.empty((0, 2)), period)
+    return instants.Moving("", "0", parameters, hz, np.zeros(2), np.empty((0, 2)), period)
 
 
 def test_schedule__whole_periods_where_they_fit():
-    """Orbits of 2 and 3 drive periods of 2 s: 12 s together, at 1 s/s the nearest multiple of it."""
+    """Orbits of 2 and 3 drive periods of 2 s repeat together after 12 s, which fill the 13 s asked for."""
     both = [one_moving(4.0), one_moving(6.0)]
     plan = instants.schedule(both, AnimationOptions(seconds=13.0, fps=10.0, speed=1.0))
-    assert (plan.duration, plan.n_frames, plan.repeats) == (12.0, 120, True)
+    assert (plan.duration, plan.n_frames, plan.repeats) == (12.0, 130, True)
     assert plan.times.size == plan.n_frames * plan.substeps + 1
     short = instants.schedule(both, AnimationOptions(seconds=5.0, fps=10.0, speed=1.0))
     assert (short.duration, short.repeats) == (5.0, False)
@@ -271,7 +290,8 @@ def test_schedule__whole_periods_where_they_fit():
     assert (chaos.duration, chaos.repeats) == (13.0, False)
     rest = instants.schedule([one_moving(0.0)], AnimationOptions(seconds=3.0, speed=1.0))
     assert (rest.duration, rest.repeats) == (3.0, True)
-    assert instants.schedule(both, AnimationOptions()).speed == 1.0
+    chosen = instants.schedule(both, AnimationOptions())
+    assert (chosen.duration, chosen.speed, chosen.n_frames) == (12.0, 1.5, 200)
 
 
 def test_durations__add_up():

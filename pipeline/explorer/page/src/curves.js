@@ -114,7 +114,8 @@ class Strip {
       ctx.fillStyle = colours.muted;
       ctx.fillRect(box.left, Math.round(placeY(box, bounds, 0)), box.width, 1);
     }
-    for (const curve of this.curves) paintCurve(ctx, box, bounds, curve, visible(curve.colour, colours.card));
+    const paintOne = this.group === "fractions" ? paintSteps : paintCurve;
+    for (const curve of this.curves) paintOne(ctx, box, bounds, curve, visible(curve.colour, colours.card));
     const chosen = this.owner.diagram.selection;
     if (chosen) {
       ctx.globalAlpha = 0.45;
@@ -145,8 +146,44 @@ class Strip {
     return this.curves.map(({ title, x: xs, y }) => {
       let nearest = 0;
       for (let i = 1; i < xs.length; i++) if (Math.abs(xs[i] - x) < Math.abs(xs[nearest] - x)) nearest = i;
-      return `${title} ${told(y[nearest])}`;
+      return `${title} ${y[nearest] === null ? "absent" : told(y[nearest])}`;
     });
+  }
+}
+
+/** Limits of the column of each value of the axis: half way to its neighbours. */
+function columnEdges(x) {
+  const edges = x.slice(1).map((value, i) => (x[i] + value) / 2), last = x.length - 1;
+  if (!last) return [x[0] - 0.05 * Math.abs(x[0] || 1), x[0] + 0.05 * Math.abs(x[0] || 1)];
+  return [2 * x[0] - edges[0], ...edges, 2 * x[last] - edges[last - 1]];
+}
+
+/** Paint shares as steps: a column for each value of the axis, none where the attractor is absent. */
+function paintSteps(ctx, box, bounds, { x, y, low, high }, colour) {
+  const px = columnEdges(x).map((value) => placeX(box, bounds, value)), py = y.map((value) => placeY(box, bounds, value));
+  ctx.fillStyle = ctx.strokeStyle = colour;
+  if (low && high) {
+    ctx.globalAlpha = 0.18;
+    for (let i = 0; i < x.length; i++) {
+      if (y[i] === null || low[i] === null || high[i] === null) continue;
+      const top = placeY(box, bounds, high[i]);
+      ctx.fillRect(px[i], top, px[i + 1] - px[i], placeY(box, bounds, low[i]) - top);
+    }
+  }
+  // risers are faint: many jumps must not become a slab
+  ctx.globalAlpha = 0.35;
+  ctx.lineWidth = 1;
+  ctx.beginPath();
+  for (let i = 1; i < x.length; i++) {
+    if (y[i] === null || y[i - 1] === null || y[i] === y[i - 1]) continue;
+    ctx.moveTo(px[i], py[i - 1]);
+    ctx.lineTo(px[i], py[i]);
+  }
+  ctx.stroke();
+  ctx.globalAlpha = 1;
+  for (let from = 0, to; from < x.length; from = to) {
+    for (to = from + 1; to < x.length && y[to] === y[from]; to++);
+    if (y[from] !== null) ctx.fillRect(px[from], py[from] - 1, Math.max(px[to] - px[from], 1.5), 2);
   }
 }
 

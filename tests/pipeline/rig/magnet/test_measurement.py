@@ -72,6 +72,35 @@ def test_read_measurement__takes_off_readings_without_the_magnets(rig):
     assert "set weights = false and drop tie" in problems_of(rig.path)[0]
 
 
+def with_units(rig, *names):
+    """Give columns of the table a unit in brackets."""
+    head, rest = rig.table.read_text().split("\n", 1)
+    for name, unit in names:
+        assert name in head
+        head = head.replace(name, f"{name} [{unit}]")
+    rig.table.write_text(f"{head}\n{rest}")
+
+
+def test_read_measurement__a_unit_in_a_columns_name_may_be_left_out(rig):
+    """As in the mapping of a recording: the header gives the unit, and a warning says what was taken."""
+    assert read_measurement(rig.path).warnings == ()
+    names = rig.table.read_text().split("\n", 1)[0].split(",")
+    with_units(rig, (names[0], "deg"), (names[3], "kN m"))
+    found = read_measurement(rig.path)
+    np.testing.assert_allclose(found.torque, rig.magnets, rtol=0, atol=1e-14)
+    assert len(found.warnings) == 2
+    assert f"has '{names[0]} [deg]'; it is taken for the same." in found.warnings[0]
+    assert "as the header says" in found.warnings[1]
+
+
+def test_read_measurement__two_columns_of_one_name_are_none(rig):
+    names = rig.table.read_text().split("\n", 1)[0].split(",")
+    lines = rig.table.read_text().splitlines()
+    head = lines[0].replace(names[0], f"{names[0]} [deg]")
+    rig.table.write_text("\n".join([f"{head},{names[0]} [rad]", *(f"{line},0" for line in lines[1:])]))
+    assert f"has no such column; it has: {names[0]} [deg]" in problems_of(rig.path)[0]
+
+
 @pytest.mark.parametrize("delimiter", [";", "\t"])
 def test_read_measurement__decimal_commas_and_other_delimiters(rig, delimiter):
     text = rig.table.read_text().replace(",", delimiter).replace(".", ",")
