@@ -60,7 +60,7 @@ def fit_magnet(
 
 
 def _folder(path: Path) -> Path:
-    """Refuse an impossible folder for results before anything is computed."""
+    """Refuse a folder that cannot be written to, before anything is computed."""
     from pipeline.cli.outputs import check_place
     from pipeline.spec.problems import SpecError
 

@@ -21,7 +21,7 @@ def allow(force: bool) -> None:
 
 
 def check_place(path: Path, option: str = "--out", within: str = "") -> None:
-    """Refuse an impossible place for output before anything is computed.
+    """Refuse a place that cannot be written to, before anything is computed.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def check_place(path: Path, option: str = "--out", within: str = "") -> None:
 
 
 def check_file(path: Path, option: str = "--out", within: str = "") -> None:
-    """Refuse an impossible place, and a file there that magpend did not write.
+    """Refuse a place that cannot be written to, and an existing file that magpend did not write.
 
     Raises
     ------

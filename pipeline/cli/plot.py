@@ -82,7 +82,7 @@ def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
 
 
 def check_figure_path(path: Path, within: str = "") -> None:
-    """Refuse an impossible file for a figure before anything is computed; see `check_place`."""
+    """Refuse a figure file that cannot be written, before anything is computed; see `check_place`."""
     from pipeline.cli.outputs import check_file
     from pipeline.spec.problems import SpecError
 

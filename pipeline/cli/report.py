@@ -43,7 +43,7 @@ def report(
 
 
 def check_page(path: Path) -> None:
-    """Refuse an impossible file for the page before anything is computed."""
+    """Refuse a page that cannot be written, before anything is computed."""
     from pipeline.cli.outputs import check_file
     from pipeline.spec.problems import SpecError
     from pipeline.store.errors import RefusedError

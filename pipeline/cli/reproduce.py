@@ -80,7 +80,7 @@ def reproduce(
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse an impossible folder before anything is computed."""
+    """Refuse a folder that cannot be written to, before anything is computed."""
     from pipeline.cli.outputs import check_place
     from pipeline.spec.problems import SpecError
     from pipeline.store.errors import RefusedError

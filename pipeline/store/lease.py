@@ -50,7 +50,7 @@ def _holder_in(content: bytes) -> dict[str, Any] | None:
 
 
 def is_note(content: bytes) -> bool:
-    """Return whether a content is a note about a lock's holder."""
+    """Return whether a content names a lock's holder."""
     return _holder_in(content) is not None
 
 

@@ -117,7 +117,7 @@ class ObjectFiles:
 
     @property
     def store(self) -> Any:
-        """The store of obstore for the prefix."""
+        """Client of obstore for the bucket and the prefix."""
         if self._store is None:
             self._store = _client(self.bucket, self.prefix)
         return self._store

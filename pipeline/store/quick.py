@@ -73,6 +73,6 @@ register_pipeline(QuickPipeline)
 
 @contextlib.contextmanager
 def quick_reading() -> Iterator[None]:
-    """Let arrays that are opened inside this context read by `QuickPipeline`."""
+    """Use `QuickPipeline` for arrays that are opened inside this context."""
     with zarr.config.set({"codec_pipeline.path": f"{QuickPipeline.__module__}.{QuickPipeline.__qualname__}"}):
         yield

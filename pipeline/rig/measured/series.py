@@ -121,7 +121,7 @@ def _first_timing(edges: Edges) -> float:
 
 
 def _fitted(edges: Edges, first: int, last: int) -> np.ndarray:
-    """Return edges on the line through all edges of the part's stretch."""
+    """Return the part's edges, placed on the line through all edges of its stretch."""
     a, b = next((a, b) for a, b in constant_spans(edges) if a <= first < b)
     rising = edges.rising[a : b + 1]
     n = np.arange(rising.size, dtype=np.float64)

@@ -28,7 +28,7 @@ _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 
 @dataclass(frozen=True)
 class _Form:
-    """The form of a CSV text.
+    """The delimiter, decimal sign, header and columns of a CSV text.
 
     Attributes
     ----------
