@@ -1,1 +1,1 @@
-"""The command line: parses, calls, prints."""
+"""Run the command line: parse, call, print."""

@@ -1,4 +1,4 @@
-"""``magpend analyse X DIR``: a command for each analysis in the registry."""
+"""Define ``magpend analyse NAME DIR``, with a command for each analysis in the registry."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ analyse_app = typer.Typer(
 
 def prune(
     directory: Directory,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List them; remove nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the results; remove nothing.")] = False,
 ) -> None:
-    """Remove results of an earlier state of the cube or an earlier version of magpend."""
+    """Remove results that belong to an earlier state of the cube or an earlier version of magpend."""
     from pipeline.cli import console
     from pipeline.runs import derive
 

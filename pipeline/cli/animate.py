@@ -1,4 +1,4 @@
-"""``magpend animate``: a motion as GIF, WebP or MP4."""
+"""Define ``magpend animate``: a motion as GIF, WebP or MP4."""
 
 from __future__ import annotations
 
@@ -24,42 +24,42 @@ def animate(
     ] = None,
     at: Annotated[
         list[str] | None,
-        typer.Option(metavar="AXIS=VALUE", help="Value of an axis of the run: the point that is shown."),
+        typer.Option(metavar="AXIS=VALUE", help="Value of an axis: the parameter point to show."),
     ] = None,
     nearest: Annotated[
-        bool, typer.Option("--nearest", help="Take the nearest values of the axes for --at, and say which.")
+        bool, typer.Option("--nearest", help="Use the axes' values nearest to --at, and print them.")
     ] = False,
     attractor: Annotated[
         list[str] | None,
-        typer.Option(metavar="LETTER", help="Attractor at that point; by default all, side by side."),
+        typer.Option(metavar="LETTER", help="Attractor at the point; by default all, side by side."),
     ] = None,
     cell: Annotated[
         list[int] | None,
-        typer.Option(metavar="N", help="Cell of the run instead, counted through the dims of its cube."),
+        typer.Option(metavar="N", help="Flat index of a cell of the run, to show instead."),
     ] = None,
     model: Annotated[
         str | None,
         typer.Option(
-            help=f"Without a run: a name, a file, or package.module:NAME; else {DEFAULT}.",
+            help=f"Without a run: model by name, file or package.module:NAME. Default: {DEFAULT}.",
             autocompletion=completing(names),
         ),
     ] = None,
     frequency_hz: Annotated[
         float | None,
-        typer.Option("--frequency-hz", "--frequency", help="Without a run: drive frequency [Hz]; else 2.2."),
+        typer.Option("--frequency-hz", "--frequency", help="Without a run: frequency [Hz]. Default: 2.2."),
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(help="Without a run: parameter preset, or a file of one.")
+        str | None, typer.Option(help="Without a run: parameter preset, or a preset's file.")
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Without a run: a parameter.")
     ] = None,
-    transient: Annotated[int, typer.Option(help="Of a start: periods before the film begins.")] = 0,
+    transient: Annotated[int, typer.Option(help="For a start: periods before the film begins.")] = 0,
     seconds: Annotated[
         float | None,
         typer.Option(help="Length of the film [s]; else 8."),
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames a second, of a GIF at most 50; else 25.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames per second, GIF at most 50. Default: 25.")] = None,
     speed: Annotated[
         float | None,
         typer.Option(
@@ -68,23 +68,23 @@ def animate(
         ),
     ] = None,
     size: Annotated[
-        int | None, typer.Option(help="Width of a frame [pixels], its height follows; else 800.")
+        int | None, typer.Option(help="Width of a frame [pixels]; the height follows. Default: 800.")
     ] = None,
     portrait: Annotated[
-        str | None, typer.Option(metavar="STATE", help="Portrait that is shown; else what there is room for.")
+        str | None, typer.Option(metavar="STATE", help="State whose phase portrait is shown.")
     ] = None,
-    degrees: Annotated[bool, typer.Option("--degrees", help="Degrees instead of radians.")] = False,
+    degrees: Annotated[bool, typer.Option("--degrees", help="Use degrees instead of radians.")] = False,
     out: Annotated[
         Path | None,
         typer.Option(help="File, .gif, .webp or .mp4; by default in DIR/figures, or animation.gif."),
     ] = None,
 ) -> None:  # fmt: skip
-    """Draw motions as they move, as GIF, WebP or MP4: the model's drawing, and phase portraits.
+    """Draw moving motions as GIF, WebP or MP4: the model's drawing, and phase portraits.
 
-    Of a run: its attractors at a parameter point (--at) side by side, the cells that --cell names, or a start
-    of your own there. Without a run: a start of a model. A start is given by the model's names: --NAME VALUE,
-    or --NAME-deg VALUE of an angle or its rate; what is not given is 0. What repeats makes a film without a
-    jump. MP4 takes ffmpeg.
+    With a run, the film shows its attractors at a parameter point (--at) side by side, the cells that you
+    name with --cell, or your own start at that point. Without a run it shows a start of a model. Give a start
+    by the model's names: --NAME VALUE, or --NAME-deg VALUE for an angle or its rate; other states are 0. A
+    periodic motion gives a film without a jump. MP4 needs ffmpeg.
     """
     from pipeline.cli import console
     from pipeline.cli.outputs import check_file
@@ -97,7 +97,7 @@ def animate(
     from pipeline.store.run import Run
 
     words = list(context.args)
-    if directory is not None and directory.startswith("--"):  # no directory, but the first name of a state
+    if directory is not None and directory.startswith("--"):  # not a directory, but the first state's option
         words, directory = [directory, *words], None
     start = _start(words, model, frequency_hz, preset, settings, transient, directory is None)
     points = read_pairs("--at", at or [], "frequency=2.2")
@@ -134,7 +134,7 @@ def _start(
     words: list[str], model: str | None, frequency_hz: float | None, preset: str | None,
     settings: list[str] | None, transient: int, alone: bool,
 ) -> Start | None:  # fmt: skip
-    """Return what is given of a start; None of a run if nothing is."""
+    """Return the given start; None if a run is given and no start."""
     from pipeline.runs.filming import Start
     from pipeline.spec.problems import SpecError
 
@@ -155,7 +155,7 @@ def _contradictions(
     directory: str | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None,
     start: Start | None,
 ) -> list[str]:  # fmt: skip
-    """Sentences for options that do not go together."""
+    """Return problems with options that exclude each other."""
     of_run: dict[str, Any] = {"--at": at, "--attractor": attractor, "--cell": cell}
     problems = []
     if directory is None:
@@ -172,7 +172,7 @@ def _contradictions(
 def _place(
     run: Run | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None
 ) -> Path:
-    """File that a film goes to if none is named: in the run's figures, named by what it shows."""
+    """Return the default file of a film: in the run's figures, named by its content."""
     if run is None:
         return Path("animation.gif")
     files = run.info.files

@@ -1,4 +1,4 @@
-"""What the commands share: arguments, the list of exit codes, tables for programs."""
+"""Share arguments, the list of exit codes and the output of tables among commands."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from pipeline.products.product import Table
 
 UsageError: Any = typer.BadParameter.__base__
-"""What the command line raises for words that it does not know; typer brings its own copy of click."""
+"""The error class of the command line for unknown words, from typer's own copy of click."""
 
 CommandError: Any = UsageError.__base__
 
 EXIT_HELP = "Exit codes: " + "; ".join(f"{int(code)} {code.sentence}" for code in Exit) + "."
 
-# no Path: that would make one slash of the two in s3://BUCKET
+# str, since Path would turn the two slashes of s3://BUCKET into one
 Directory = Annotated[str, typer.Argument(metavar="DIR", help="Run directory, or s3://BUCKET/PREFIX.")]
 Csv = Annotated[
     str | None,
@@ -34,7 +34,7 @@ Json = Annotated[bool, typer.Option("--json", help="Write the table as JSON to t
 
 
 def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
-    """Read ``NAME=VALUE`` pairs with numbers; raises `SpecError` naming all that are none."""
+    """Read ``NAME=VALUE`` pairs with numbers; raise `SpecError` with all that are wrong."""
     from pipeline.spec.problems import SpecError
 
     found, problems = {}, []
@@ -61,7 +61,7 @@ def check_csv(path: str | None) -> None:
 
 
 def tell(table: Table, csv: str | None, as_json: bool) -> None:
-    """Print a table: its lines for people, or its rows for programs alone."""
+    """Print a table: its lines, or with `as_json` or ``-`` only its rows."""
     from pipeline.cli import console
 
     if as_json:
@@ -85,7 +85,7 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
 
 
 def json_rows(table: Table) -> list[dict[str, Any]]:
-    """Rows of a table as JSON has them."""
+    """Return the rows of a table in types that JSON can hold."""
     return [{name: _json(value) for name, value in row.items()} for row in table.rows]
 
 
@@ -98,6 +98,6 @@ def write_csv(rows: Sequence[Mapping[str, Any]], file: Any) -> None:
 
 
 def _json(value: Any) -> Any:
-    """NaN and infinity are no JSON; numbers of numpy are numbers."""
+    """Convert numpy numbers to Python's, and NaN and infinity, which JSON lacks, to None."""
     plain = value.item() if hasattr(value, "item") else value
     return None if isinstance(plain, float) and not math.isfinite(plain) else plain

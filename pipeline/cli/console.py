@@ -1,7 +1,7 @@
-"""What the commands say: results on the standard output, everything else beside it.
+"""Print results to the standard output, and everything else to the standard error.
 
-Notes, warnings and progress go to the standard error and, with ``--log``, with times to a file; so the
-standard output can be read by a program, or by ``head``.
+Notes, warnings and progress go to the standard error and, with ``--log``, with times to a file. A program, or
+``head``, can therefore read the standard output.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FIRST_LINE_S, LINE_EVERY_S, BAR_EVERY_S = 2.0, 10.0, 0.3
 
 
 class EnoughError(Exception):
-    """Whoever read the standard output has enough, as ``head`` does."""
+    """An error for a standard output that its reader has closed, as ``head`` does."""
 
 
 def visible(text: str) -> str:
@@ -41,7 +41,7 @@ class _Visible(logging.Formatter):
 
 
 def note(line: str) -> None:
-    """Say what happens; not with ``--quiet``."""
+    """Print a note, unless ``--quiet`` is given."""
     LOG.info(line)
 
 
@@ -51,7 +51,7 @@ def result(line: str) -> None:
     Raises
     ------
     EnoughError
-        If nobody reads it any more.
+        If the reader has closed the standard output.
     """
     try:
         sys.stdout.write(f"{visible(line)}\n")
@@ -61,12 +61,12 @@ def result(line: str) -> None:
 
 
 def is_shown() -> bool:
-    """Whether notes are shown, not with ``--quiet``."""
+    """Return whether notes are shown, that is without ``--quiet``."""
     return any(isinstance(h, _Stderr) and h.level <= logging.INFO for h in LOG.handlers)
 
 
 class _Stderr(logging.Handler):
-    """Writes to whatever the standard error is now, above a progress bar if one is drawn."""
+    """A log handler that writes to the standard error, above a progress bar if one is drawn."""
 
     def emit(self, record: logging.LogRecord) -> None:
         bar = Display.current
@@ -76,7 +76,7 @@ class _Stderr(logging.Handler):
 
 
 def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
-    """Set who hears what.
+    """Set up the log: what goes to the standard error, and what to a file.
 
     Raises
     ------
@@ -111,19 +111,19 @@ def close() -> None:
 
 
 class Display:
-    """Shows how far a command is: a bar on a terminal, else a line now and then.
+    """The display of a command's progress: a bar on a terminal, else a line at intervals.
 
-    It hears what `pipeline.products.reporting` reports, and from the first seconds on says at intervals
-    what is being done and for how long, reports or not.
+    It listens to `pipeline.products.reporting`. After the first seconds it shows at intervals the present
+    work and its duration, even without new reports.
 
     Parameters
     ----------
     name
-        What is shown while nothing is reported.
+        Text that is shown before the first report.
     terminal
-        Draw a bar; by default if the standard error is a terminal.
+        Whether to draw a bar; by default if the standard error is a terminal.
     clock
-        Seconds that only ever grow.
+        Function that returns a monotonic time [s].
     """
 
     current: Display | None = None
@@ -138,14 +138,14 @@ class Display:
         self._lock, self._over = threading.RLock(), threading.Event()
 
     def __call__(self, what: str, done: float, total: float, expected_s: float = 0.0) -> None:
-        """Take a report."""
+        """Take a report; see `pipeline.products.reporting.report`."""
         with self._lock:
             if what != self._work.what:
                 self._work = Work(what, self._clock(), done, expected_s=expected_s)
             self._work.done, self._work.total, self._work.heard = done, total, self._clock()
 
     def show(self) -> None:
-        """Say now how far the work is."""
+        """Show the present progress."""
         with self._lock:
             line = self._work.line(self._clock())
             if not self._terminal:
@@ -156,7 +156,7 @@ class Display:
                 self._drawn = True
 
     def clear(self) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         with self._lock:
             if self._drawn:
                 sys.stderr.write("\r\x1b[2K")
@@ -164,35 +164,36 @@ class Display:
                 self._drawn = False
 
     def watch(self) -> None:
-        """Show at intervals until `stop` is called."""
+        """Show the progress at intervals until `stop` is called."""
         pause = FIRST_LINE_S
         while not self._over.wait(pause):
             self.show()
             pause = BAR_EVERY_S if self._terminal else LINE_EVERY_S
 
     def stop(self) -> None:
-        """End `watch`, and take the bar away."""
+        """End `watch`, and remove the bar."""
         self._over.set()
         self.clear()
 
 
 @dataclass
 class Work:
-    """A piece of work and how far it is.
+    """A piece of work with its progress.
 
     Attributes
     ----------
     what : str
+        Name of the work.
     started : float
-        When the first report of it came [s].
+        Time of its first report [s].
     begun : float
-        How much was done then.
+        Amount that was done at its first report.
     done, total : float
-        As last reported; without a total, only the time is known.
+        Amounts of the last report; a total of 0 is unknown.
     heard : float
-        When the last report came [s].
+        Time of the last report [s].
     expected_s : float
-        Time that all of it will take as far as is known beforehand [s]; 0 if it is not.
+        Expected time of the whole work [s]; 0 if unknown.
     """
 
     what: str
@@ -204,7 +205,7 @@ class Work:
     expected_s: float = 0.0
 
     def line(self, now: float) -> str:
-        """Say how far it is, and how long it will take."""
+        """Return a line on the progress and the remaining time."""
         elapsed = max(now - self.started, 0.0)
         if not self.total:
             return f"{self.what}: {duration(elapsed)} so far"
@@ -221,14 +222,14 @@ class Work:
 
 
 def at_rest() -> None:
-    """Show no progress any more: what follows lasts until somebody ends it."""
+    """Stop showing progress, for a command that lasts until the user ends it."""
     if Display.current is not None:
         Display.current.stop()
 
 
 @contextlib.contextmanager
 def progress(name: str) -> Iterator[None]:
-    """Show the progress of what is done inside, which has a name."""
+    """Show the progress of the work inside this context, under a name."""
     display = Display(name)
     Display.current = display
     watcher = threading.Thread(target=display.watch, daemon=True)

@@ -1,4 +1,4 @@
-"""The way in: signals first, then everything else, which takes a moment to load."""
+"""Start the command line: install signal handlers first, since loading the rest takes a moment."""
 
 from __future__ import annotations
 

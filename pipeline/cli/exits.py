@@ -1,4 +1,4 @@
-"""Exit codes of the command line, in one place."""
+"""Define the exit codes of the command line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Exit(IntEnum):
-    """What a command's exit code says."""
+    """The exit codes of a command."""
 
     DONE = 0
     BUG = 1
@@ -21,7 +21,7 @@ class Exit(IntEnum):
 
     @property
     def sentence(self) -> str:
-        """What the code means."""
+        """Meaning of the code."""
         return _SENTENCES[self]
 
 

@@ -1,4 +1,4 @@
-"""``magpend explore DIR``: a page on which one sees a run."""
+"""Define ``magpend explore DIR``: a page to explore a run."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from pipeline.cli.common import Directory
 def explore(
     directory: Directory,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")
+        int, typer.Option(min=0, max=65535, help="Port on this machine; 0 selects a free one.")
     ] = 0,
     no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Say where the page is; open none.")
+        bool, typer.Option("--no-browser", help="Print the address of the page; open no browser.")
     ] = False,
 ) -> None:
-    """Look at a run in a browser: its diagram, the orbit behind each point, planes of initial states.
+    """Explore a run in a browser: its diagram, the orbit behind each point, planes of initial states.
 
-    The page is served to this machine alone, at an address with a token, until Ctrl-C. It reads what is in
-    the run and changes nothing; what analyses found is shown once they have been made. On another machine,
-    tunnel the port: ssh -L PORT:127.0.0.1:PORT
+    The page is served only to this machine, at an address with a token, until you press Ctrl-C. It reads the
+    run and changes nothing. It shows the results of analyses that you have run. From another machine, tunnel
+    the port: ssh -L PORT:127.0.0.1:PORT
     """
     from pipeline.cli import console
     from pipeline.explorer.browser import browser

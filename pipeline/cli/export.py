@@ -1,4 +1,4 @@
-"""``magpend export``: the explorer as files, without a server."""
+"""Define ``magpend export``: the explorer as files, without a server."""
 
 from __future__ import annotations
 
@@ -20,29 +20,27 @@ def export(
         Path | None,
         typer.Option(
             metavar="OUT",
-            help="Instead a folder for any static host: with all of the cube, read as one looks.",
+            help="Folder for a static web host instead, with the whole cube, loaded on demand.",
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace the file, or a folder that export has made.")
+        bool, typer.Option("--force", help="Replace the file, or a folder made by export.")
     ] = False,
     quantity: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME", help="A quantity of the model that can be on the vertical axis, besides states."
-        ),
+        typer.Option(metavar="NAME", help="Additional quantity of the model for the vertical axis."),
     ] = None,
     orbits: Annotated[
-        int, typer.Option(min=0, help="Most orbits that are integrated to go along. Default: 2000.")
+        int, typer.Option(min=0, help="Largest number of orbits to integrate and include. Default: 2000.")
     ] = 2000,
     megabytes: Annotated[
-        float, typer.Option(min=1, max=100, help="Size of the one file at most [MB]. Default: 20.")
+        float, typer.Option(min=1, max=100, help="Largest size of the single file [MB]. Default: 20.")
     ] = 20.0,
 ) -> None:
-    """Write the explorer of a run as files that need no server of magpend's: to send, to publish, to keep.
+    """Write the explorer of a run as files that need no magpend server: to send, to publish, to keep.
 
-    The diagram, its overlays and the orbits of attractors are in them; live integration is not. What does not
-    fit into one file is left out, and the page says what.
+    The files hold the diagram, its overlays and the orbits of attractors, but no live integration. Parts that
+    do not fit into one file are left out, and the page names them.
     """
     from pipeline.cli import console
     from pipeline.explorer.export import export_page

@@ -1,4 +1,4 @@
-"""``magpend extend``: a run grows, with every cell that is computed already."""
+"""Define ``magpend extend``: widen a run and reuse all computed cells."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def extend(
         str | None,
         typer.Argument(
             metavar="[SPEC]",
-            help="The wider specification; without it that of DIR, with the options' changes.",
+            help="Wider specification; by default that of DIR, changed by the options.",
             autocompletion=completing(workflow_names),
         ),
     ] = None,
@@ -31,18 +31,16 @@ def extend(
         list[str] | None,
         typer.Option(
             metavar="NAME[={...}]",
-            help="Compute this besides, with options as in a specification's [products].",
+            help="Additional product, with options as in a specification's [products].",
         ),
     ] = None,
     also: Annotated[
         list[str] | None,
-        typer.Option(metavar="DIR", help="A further run that holds cells, such as another half."),
+        typer.Option(metavar="DIR", help="Another run with cells to reuse, such as another half."),
     ] = None,
     out: Annotated[
         str | None,
-        typer.Option(
-            help="Directory of the wider run. Default: it takes the place of DIR when it is complete."
-        ),
+        typer.Option(help="Directory of the wider run. Default: it replaces DIR when it is complete."),
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -50,10 +48,10 @@ def extend(
     dashboard: Dashboard = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Widen a run; every cell that is computed already is taken over, not integrated again.
+    """Widen a run; computed cells are reused, not integrated again.
 
-    The files are the same as those of a fresh run of the wider specification. Stop it whenever you like:
-    the same command goes on where it was. Without --out the run as it was stays beside, as DIR.before.
+    The files are the same as those of a fresh run of the wider specification. You can stop the command at any
+    time: the same command continues. Without --out the old run is kept as DIR.before.
     """
     from pipeline.cli import console
     from pipeline.runs import extend as extending

@@ -1,4 +1,4 @@
-"""Groups of commands that are made from a registry, each when it is asked for."""
+"""Build groups of commands from a registry, each command when it is needed."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 
 def made(name: str, function: Command, help: str) -> Any:
-    """Make a command of a function."""
+    """Make a command from a function."""
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
     app.command(name, help=help, epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(function))
     return get_command(app)
 
 
 class RegistryGroup(TyperGroup):
-    """``magpend VERB NAME DIR``: commands by name from a registry, beside those of its own."""
+    """The group ``magpend VERB``: commands from a registry, and its own commands."""
 
     verb = ""
 
     def names(self) -> list[str]:
-        """Names of the commands that are made."""
+        """Return the names of the commands from the registry."""
         raise NotImplementedError
 
     def make(self, name: str) -> Any:
-        """Make one of them."""
+        """Make the command with a name."""
         raise NotImplementedError
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """All names."""
+        """Return the names of all commands."""
         return [*self.names(), *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Make a command when it is asked for."""
+        """Return a command; one from the registry is made now."""
         return self.make(cmd_name) if cmd_name in self.names() else super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command; say what the order is if the directory came first."""
+        """Find a command; explain the order if the directory came first."""
         if args and args[0] not in self.list_commands(ctx):
             later = [a for a in args[1:] if a in self.list_commands(ctx)]
             if later:
@@ -60,10 +60,10 @@ _MOVED = {"branches": "magpend analyse branches DIR", "analyze": "magpend analys
 
 
 class TopGroup(TyperGroup):
-    """``magpend``: its commands, and where those went that it had."""
+    """The group ``magpend``: its commands, and hints for moved ones."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command, or name the nearest."""
+        """Find a command; if there is none, name the nearest or the moved one."""
         if args and args[0] not in self.list_commands(ctx) and not args[0].startswith("-"):
             from pipeline.spec.problems import unknown_name
 

@@ -1,4 +1,4 @@
-"""``magpend identify``: parameters of a model from recordings, and a judgement on other recordings."""
+"""Define ``magpend identify``: identify parameters from recordings, and judge the result on others."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import completing, speaking
 
 RUN = "spec"
-"""Name of the command that ``magpend identify SPEC`` stands for."""
+"""Name of the command that ``magpend identify SPEC`` runs."""
 
 
 class IdentifyGroup(TyperGroup):
-    """``magpend identify SPEC`` beside ``magpend identify check`` and ``compare``."""
+    """The group ``magpend identify``: SPEC itself, ``check`` and ``compare``."""
 
     default = RUN
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the command that is meant before what is no command's name."""
+        """Insert the default command if the first word is not a command."""
         known = (*self.list_commands(ctx), "--help", "-h", "--install-completion", "--show-completion")
         meant = [self.default, *args] if args and args[0] not in known else args
         return list(super().parse_args(ctx, meant))
@@ -51,17 +51,17 @@ def identify(
         str,
         typer.Argument(
             metavar="SPEC",
-            help="A TOML file, or the name of one that ships.",
+            help="TOML file, or the name of an identification that ships.",
             autocompletion=completing(_identifications),
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="Directory; by default runs/NAME.")] = None,
-    no_figures: Annotated[bool, typer.Option("--no-figures", help="Write numbers alone.")] = False,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Identify what a specification asks for, or what is missing of it: magpend identify SPEC --out DIR.
+    """Identify the parameters that a specification names: magpend identify SPEC --out DIR.
 
-    Stop it whenever you like: the same command goes on where it was, and the finished files are the same.
+    You can stop the command at any time: the same command continues, and the finished files are the same.
     """
     from pipeline.cli import console
     from pipeline.rig.identify import identification
@@ -81,11 +81,11 @@ def check(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of an identification.")],
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="A file with the same channels.")],
     like: Annotated[
-        int, typer.Option(min=0, help="Number of the fitted recording whose mapping, drive and zeros it has.")
+        int, typer.Option(min=0, help="Index of the fitted recording with the same mapping, drive and zeros.")
     ] = 0,
     as_json: Json = False,
 ) -> None:
-    """Judge an identification on another recording: only the starts of its pieces are refitted."""
+    """Judge an identification on another recording; only the starts of its pieces are fitted."""
     from pipeline.cli import console
     from pipeline.rig.identify import check as checking
     from pipeline.rig.identify.reports import judgement_lines
@@ -109,7 +109,7 @@ def compare(
     as_json: Json = False,
     csv: Csv = None,
 ) -> None:
-    """Put identifications side by side, best first: laws are compared by held-out pieces, not by the fit."""
+    """Compare identifications by their held-out pieces, not by their fits; the best one comes first."""
     from pipeline.cli.common import check_csv, tell
     from pipeline.rig.identify.comparison import compare as comparing
 

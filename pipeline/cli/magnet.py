@@ -1,4 +1,4 @@
-"""``magpend fit-magnet``: from measured torque curves to a preset."""
+"""Define ``magpend fit-magnet``: fit torque curves and write a preset."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ def fit_magnet(
         str,
         typer.Argument(
             metavar="MEASUREMENT",
-            help="Header of a table of torque readings, a TOML file; or discs, which ships.",
+            help="Header of a table of torque readings (TOML), or discs, an example that ships.",
         ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where results go; by default a folder named as the header."),
+        typer.Option(metavar="DIR", help="Folder of the results; by default named after the header."),
     ] = None,
-    no_figures: Annotated[bool, typer.Option("--no-figures", help="Write report and presets alone.")] = False,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
     json: Json = False,
 ) -> None:
     """Fit the magnets' torque to measured curves: a report, figures, and a preset for specifications.
 
-    Each curve by itself, then all at once, with point dipoles beside them. A fit that does not converge is
-    no result: nothing is written then.
+    The command fits single curves, then all curves at once, and point dipoles for comparison. If a fit does
+    not converge, nothing is written.
     """
     import json as formats
 
@@ -60,7 +60,7 @@ def fit_magnet(
 
 
 def _folder(path: Path) -> Path:
-    """Refuse a place for results that cannot be, before anything is computed."""
+    """Refuse a folder that cannot be written to, before anything is computed."""
     from pipeline.cli.outputs import check_place
     from pipeline.spec.problems import SpecError
 

@@ -1,4 +1,4 @@
-"""The command line: parses, calls, prints. Everything heavy is imported by the command that needs it."""
+"""Define ``magpend`` with all its commands. Each command imports its heavy modules itself."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from pipeline.cli.submit import submit
 from pipeline.cli.zoom import zoom
 
 MOST_SAID, MOST_LINE = 2000, 600
-"""Bytes of a message, and characters of one of its lines."""
+"""Most bytes of a message, and most characters of one of its lines."""
 
 app = typer.Typer(
     name="magpend",
@@ -63,7 +63,7 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _main(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and leave.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
     pass
@@ -84,7 +84,7 @@ app.add_typer(identify_app, name="identify")
 
 
 def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
-    """Exceptions that people can act on, and their exit codes."""
+    """Return the exceptions that users can act on, with their exit codes."""
     from magpend_core.models.parameters import ParameterError
     from pipeline.compute.addresses import SchedulerError
     from pipeline.compute.execute import TaskFailedError
@@ -136,13 +136,13 @@ def _short(text: str) -> str:
 
 
 def main() -> None:
-    """Entry point: run the command line and turn errors into messages and exit codes."""
+    """Run the command line; turn errors into messages and exit codes."""
     code: Any = Exit.DONE
     try:
         with stopping.in_order():
             code = app(standalone_mode=False) or Exit.DONE
             sys.stdout.flush()
-        if code == Exit.INTERRUPTED:  # what typer makes of every signal
+        if code == Exit.INTERRUPTED:  # typer returns this code for every signal
             raise KeyboardInterrupt
     except (EnoughError, BrokenPipeError):
         _leave_quietly()
@@ -163,7 +163,7 @@ def main() -> None:
 
 
 def _usage(error: Any) -> None:
-    """Say which word of a command is wrong, and where help is."""
+    """Print which word of a command is wrong, and how to get help."""
     context = getattr(error, "ctx", None)
     message = error.format_message()
     near = getattr(error, "possibilities", None)
@@ -176,7 +176,7 @@ def _usage(error: Any) -> None:
 
 
 def _leave_quietly() -> None:
-    """Whoever read the output has enough, as ``head`` does; what is left goes nowhere."""
+    """Discard the rest of the output, since its reader has closed it, as ``head`` does."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -1,7 +1,7 @@
-"""``magpend measured``: diagrams of recordings, alone and held against a run.
+"""Define ``magpend measured``: diagrams of recordings, alone and compared with a run.
 
-These commands are about recordings, several of them, and their mapping; a run is what they are held against.
-So they are no analyses or figures of a run, which know nothing but its cells.
+These commands take recordings and their mapping; a run is only used for comparison. They are therefore not
+among the analyses and figures of a run, which read its cells alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ measured_app = typer.Typer(
 )
 
 Recordings = Annotated[
-    list[Path], typer.Argument(metavar="RECORDING...", help="Recordings of sweeps of the drive's frequency.")
+    list[Path], typer.Argument(metavar="RECORDING...", help="Recordings of sweeps of the drive frequency.")
 ]
 Mappings = Annotated[
     list[Path],
@@ -42,25 +42,25 @@ Mappings = Annotated[
 Transient = Annotated[int, typer.Option(help="Drive periods dropped after each step of the frequency.")]
 Window = Annotated[
     int | None,
-    typer.Option(help="Drive periods of a window of a slow sweep; by default found out, 0 for steps only."),
+    typer.Option(help="Drive periods of a window of a slow sweep; by default detected; 0: steps only."),
 ]
 WindowS = Annotated[float, typer.Option(help="Width of the polynomials' window about an edge [s].")]
 Hysteresis = Annotated[
     float | None, typer.Option(help="Band about the drive's middle that an edge must cross, in its unit.")
 ]
-MaxPeriod = Annotated[int, typer.Option(help="Longest period looked for [drive periods].")]
-State = Annotated[str, typer.Option(help="State that is drawn; by default the first that is measured.")]
-Degrees = Annotated[bool, typer.Option("--degrees", help="Degrees instead of radians.")]
+MaxPeriod = Annotated[int, typer.Option(help="Longest orbit period that is detected [drive periods].")]
+State = Annotated[str, typer.Option(help="State to draw; by default the first measured one.")]
+Degrees = Annotated[bool, typer.Option("--degrees", help="Use degrees instead of radians.")]
 Width = Annotated[float, typer.Option(help="Width of the figure [mm]; 85 is a journal's column.")]
 At = Annotated[
     list[str] | None, typer.Option("--at", metavar="NAME=VALUE", help="Value of another axis of the run.")
 ]
-Preset = Annotated[str | None, typer.Option(help="Parameters; by default the model's first preset.")]
+Preset = Annotated[str | None, typer.Option(help="Preset of the parameters; by default the model's first.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")]
 
 
 def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
-    """Return a mapping for each recording; all of one model, which is known before any is read."""
+    """Return a mapping for each recording; all must have the same model."""
     from pipeline.rig.recordings import load_mapping
     from pipeline.spec.problems import SpecError
 
@@ -78,7 +78,7 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
 
 
 def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
-    """Read recordings, and say what was found in them."""
+    """Read recordings, and print their findings."""
     from pipeline.cli import console
     from pipeline.rig.recordings import findings_of, read_recording, summary
 
@@ -135,9 +135,9 @@ def steps(
     csv: Csv = None,
     as_json: Json = False,
 ) -> None:
-    """List the steps of a sweep: frequency, jitter, duty cycle, period of the motion and how sure it is.
+    """List the steps of a sweep: frequency, jitter, duty cycle, orbit period and its confidence.
 
-    Words of the model's classifier, such as the side of a motion, are told for the preset's parameters.
+    Motions are classified, for example by side, with the preset's parameters.
     """
     from pipeline.rig.measured.measuring import measure
     from pipeline.rig.measured.tables import steps_table
@@ -156,7 +156,7 @@ def diagram(
     mapping: Mappings,
     out: Annotated[Path, typer.Option(help="Figure, .png, .pdf or .svg.")],
     run: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Run whose diagram is drawn beside or below it.")
+        Path | None, typer.Option(metavar="DIR", help="Run whose diagram is drawn for comparison.")
     ] = None,
     layout: Annotated[str, typer.Option(help="side: beside the computed diagram; over: over it.")] = "side",
     state: State = "",
@@ -169,7 +169,7 @@ def diagram(
     hysteresis: Hysteresis = None,
     max_period: MaxPeriod = 16,
 ) -> None:
-    """Draw the measured bifurcation diagram, alone or with that of a run on the same axes."""
+    """Draw the measured bifurcation diagram, alone or with a run's diagram on the same axes."""
     from pipeline.plots import Frame
     from pipeline.rig.measured.figures import plot_measured
     from pipeline.rig.measured.measuring import measure
@@ -200,7 +200,7 @@ def compare(
     recordings: Recordings,
     mapping: Mappings,
     out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="For figures, tables and data; made if absent.")
+        Path, typer.Option(metavar="FOLDER", help="Folder for figures, tables and data; made if necessary.")
     ],
     state: State = "",
     degrees: Degrees = False,
@@ -214,11 +214,11 @@ def compare(
     csv: Csv = None,
     as_json: Json = False,
 ) -> None:
-    """Hold a measured sweep against the attractors of a run.
+    """Compare a measured sweep with the attractors of a run.
 
-    Per step: which attractor is nearest, how far in units of noise, whether period and side agree. Per end of
-    a window: its shift from the model's [Hz]. FOLDER gets comparison.png, beside.png, over.png, steps.csv,
-    edges.csv and comparison.nc.
+    For each step the command lists the nearest attractor, its distance in units of noise, and whether period
+    and side agree. For each window edge it lists the shift from the model's edge [Hz]. It writes
+    comparison.png, beside.png, over.png, steps.csv, edges.csv and comparison.nc to FOLDER.
     """
     from pipeline.cli import console
     from pipeline.plots import Frame
@@ -263,15 +263,15 @@ def series(
     preset: Preset = None,
     settings: Set = None,
     start_s: Annotated[
-        float | None, typer.Option(help="The first rising edge from this time on [s] is the start.")
+        float | None, typer.Option(help="Start at the first rising edge from this time on [s].")
     ] = None,
-    periods: Annotated[int, typer.Option(help="Drive periods.")] = 10,
+    periods: Annotated[int, typer.Option(help="Number of drive periods.")] = 10,
     degrees: Degrees = False,
     width: Width = 178.0,
     window_s: WindowS = 0.08,
     hysteresis: Hysteresis = None,
 ) -> None:
-    """Draw a recording and the model from the same state: series over series, portrait over portrait."""
+    """Draw a recording and the model from the same state: time series and phase portraits."""
     from pipeline.cli import console
     from pipeline.plots import Frame
     from pipeline.rig.measured.overlays import plot_series

@@ -1,4 +1,4 @@
-"""``magpend model``: a system of one's own, shown as it was understood, or begun from a template."""
+"""Define ``magpend model``: show a system as magpend reads it, or begin one from a template."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from magpend_core.models.showing import Description
 
 model_app = typer.Typer(
-    help="A system of your own as text: begin one, and look at what magpend makes of it.",
+    help="Your own system as text: begin one, and check how magpend reads it.",
     no_args_is_help=True, rich_markup_mode=None, context_settings=SETTINGS,
 )  # fmt: skip
 
@@ -33,17 +33,17 @@ def show(
         str,
         typer.Argument(
             metavar="NAME|FILE",
-            help="A model's name, a file of one, a specification, or package.module:NAME.",
+            help="Model's name, its file, a specification, or package.module:NAME.",
             autocompletion=completing(_names),
         ),
     ],
-    latex: Annotated[bool, typer.Option("--latex", help="The equations in LaTeX alone.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="All of it as JSON.")] = False,
+    latex: Annotated[bool, typer.Option("--latex", help="Print only the equations, in LaTeX.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
-    """Show a model's equations as they are understood, what was found in them, and checks.
+    """Show a model's equations as magpend reads them, the detected discontinuities, and checks.
 
-    What was found are the places that steps are chosen by: edges of the drive, steep layers, switches,
-    impacts. The checks run the equations at the starts of a specification, or near 0, and compile nothing.
+    Integration steps are adapted to the detected edges of the drive, steep layers, switches and impacts. The
+    checks evaluate the equations at the starts of a specification, or near 0, and compile nothing.
     """  # fmt: skip
     from pipeline.cli import console
     from pipeline.cli.exits import Exit
@@ -67,7 +67,7 @@ def new(
         typer.Argument(metavar="[FILE]", help="TOML file to write; by default the standard output."),
     ] = None,
 ) -> None:
-    """Write a specification with a model of your own, commented, which runs as it is."""
+    """Write a commented specification with an own model as a template; it runs as it is."""
     from pipeline.cli import console
     from pipeline.runs.modelling import write_template
 

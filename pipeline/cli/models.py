@@ -1,4 +1,4 @@
-"""``magpend models`` and ``magpend presets``: what can be integrated, and with which values."""
+"""Define ``magpend models`` and ``magpend presets``: list models and their parameter values."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 DEFAULT = "pendulum"
-"""As `magpend_core.models.DEFAULT`, which is not imported for the help."""
+"""Name of the default model, equal to `magpend_core.models.DEFAULT`, which the help does not import."""
 
 
 def names() -> Iterable[str]:
-    """Names of the models that ship."""
+    """Return the names of the models that ship."""
     from magpend_core.models import model_names
 
     return model_names()
@@ -30,7 +30,7 @@ def models(
     name: Annotated[
         str | None,
         typer.Argument(
-            help="Show this model alone, with all it has; or a file of one, FILE.toml.",
+            help="Show only this model, in full: a name, or a model's file, FILE.toml.",
             autocompletion=completing(names),
         ),
     ] = None,
@@ -54,7 +54,7 @@ def models(
 
 
 def described(model: Model) -> dict[str, Any]:
-    """What a model has, for programs."""
+    """Return a model's properties as plain data."""
     about = [
         {"name": s.name, "unit": s.unit, "meaning": s.meaning, "on_circle": s.on_circle, "scale": s.scale}
         for s in model.states
@@ -71,7 +71,7 @@ def described(model: Model) -> dict[str, Any]:
 
 
 def all_of(model: Model) -> list[str]:
-    """Lines on all that a model has."""
+    """Return lines on all properties of a model."""
     seen = "no drive: time enters through the states alone" if model.autonomous else ""
     seen = seen or f"period 1/f, f the drive's frequency [Hz]; sections are taken at {model.section}"
     lines = [f"{model.name}: {model.title}", seen, "", "states"]
@@ -96,7 +96,7 @@ def _table(rows: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def _preset(model: Model, name: str | Preset) -> list[str]:
-    """Values of a preset, and where each comes from."""
+    """Return lines on the values of a preset and their origins."""
     found = model.preset(name)
     known, origin = model.load(found), found.provenance
     rows = [
@@ -108,17 +108,17 @@ def _preset(model: Model, name: str | Preset) -> list[str]:
 
 def presets(
     name: Annotated[
-        str | None, typer.Argument(help="Show this preset alone; or a file of one, FILE.toml.")
+        str | None, typer.Argument(help="Show only this preset: a name, or a preset's file, FILE.toml.")
     ] = None,
     model: Annotated[
         str,
         typer.Option(
-            help="Whose presets: a name or a file; a preset's file names its own.",
+            help="Model, by name or file; a preset's file names its own model.",
             autocompletion=completing(names),
         ),
     ] = DEFAULT,
 ) -> None:
-    """List the presets of a model: values, units, and where each comes from."""
+    """List the presets of a model: values, units, and the origin of each value."""
     from magpend_core.models.presets import find_preset
     from pipeline.cli import console
     from pipeline.spec.models import find_model

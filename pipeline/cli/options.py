@@ -1,4 +1,4 @@
-"""From a model of options to a command: names, types, defaults, bounds and help, none of them twice."""
+"""Turn a model of options into a command's options, with their types, defaults, bounds and help."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 Command = Callable[..., None]
 
-QUIET = Annotated[bool, typer.Option("--quiet", "-q", help="Results and warnings alone.")]
-VERBOSE = Annotated[bool, typer.Option("--verbose", "-v", help="Say more, and show the trace of an error.")]
-FORCE = Annotated[bool, typer.Option("--force", help="Replace files that magpend has not written.")]
+QUIET = Annotated[bool, typer.Option("--quiet", "-q", help="Print only results and warnings.")]
+VERBOSE = Annotated[bool, typer.Option("--verbose", "-v", help="Print more, and the traceback of an error.")]
+FORCE = Annotated[bool, typer.Option("--force", help="Replace files that magpend did not write.")]
 LOGFILE = Annotated[
-    Path | None, typer.Option("--log", metavar="FILE", help="Write a log, with times, to this file, too.")
+    Path | None, typer.Option("--log", metavar="FILE", help="Also write a log with times to this file.")
 ]
 IMPORT = Annotated[
     str | None,
     typer.Option(
         metavar="MODULE:NAME",
-        help="Import this Python object, the model of a run; opening one imports nothing by itself.",
+        help="Import this Python object, the model of a run; otherwise nothing is imported.",
     ),
 ]
 _METAVARS = {int: "N", float: "X", str: "TEXT"}
@@ -36,7 +36,7 @@ _IMPORTED = "import_model"
 
 
 def speaking(command: Command) -> Command:
-    """Give a command the options that all have (see `_VOICES`), and show its progress."""
+    """Add the options that all commands have (see `_VOICES`) to a command, and show its progress."""
     has_force = any(p.name == "force" for p in _own(command))
 
     def run(*args: Any, **given: Any) -> None:
@@ -59,9 +59,9 @@ def speaking(command: Command) -> Command:
 
 
 def taking(model: type[Options], command: Command) -> Command:
-    """Give a command that takes ``options`` one option for each field of a model.
+    """Replace a command's parameter ``options`` by one option for each field of a model.
 
-    What is given is validated as a whole, and the command is called with the model.
+    The given values are validated together, and the command is called with the model.
     """
 
     def run(*args: Any, **given: Any) -> None:
@@ -85,7 +85,7 @@ def taking(model: type[Options], command: Command) -> Command:
 
 
 def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Return what a shell asks for the words that an incomplete one may become."""
+    """Return a function that completes an incomplete word for a shell."""
 
     def complete(incomplete: str) -> list[str]:
         return [word for word in words() if word.startswith(incomplete)]
@@ -94,13 +94,13 @@ def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]
 
 
 def flag_of(model: type[Options], name: str) -> str:
-    """What a field is called on the command line."""
+    """Return the name of a field on the command line."""
     extra: Any = model.model_fields[name].json_schema_extra or {}
     return str(extra.get("flag") or f"--{name.replace('_', '-')}")
 
 
 def help_of(info: FieldInfo) -> str:
-    """Sentence of a field with its unit and bounds."""
+    """Return the help of a field with its unit and bounds."""
     extra: Any = info.json_schema_extra or {}
     text = (info.description or "").rstrip(".")
     unit = f" [{extra['unit']}]" if extra.get("unit") else ""
@@ -109,7 +109,7 @@ def help_of(info: FieldInfo) -> str:
 
 
 def bounds_of(info: FieldInfo) -> str:
-    """Bounds of a field in words, such as ``above 0, at most 1``; empty if there are none."""
+    """Return the bounds of a field in words, such as ``above 0, at most 1``; empty if there are none."""
     words = {"gt": "above {}", "ge": "{} or more", "lt": "below {}", "le": "at most {}"}
     found = []
     for bound in info.metadata:
@@ -120,7 +120,7 @@ def bounds_of(info: FieldInfo) -> str:
 
 
 def kind_of(info: FieldInfo) -> Any:
-    """Type of a field without ``None``."""
+    """Return the type of a field without ``None``."""
     kind = info.annotation
     if get_origin(kind) in (Union, types.UnionType):
         (kind,) = [part for part in get_args(kind) if part is not type(None)]

@@ -1,4 +1,4 @@
-"""Where commands may write: not inside of a run directory, and not over what somebody else has written."""
+"""Check where a command may write: not into a run directory, not over files of others."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 _LOOKED_AT = 100_000
-"""Bytes at both ends of a file in which it says who wrote it."""
+"""Bytes at both ends of a file that are searched for magpend's mark."""
 
 _HEADER = re.compile(rb"[A-Za-z_][\w.]*(,[A-Za-z_][\w.]*)*")
 _LOG_LINE = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ ")
@@ -15,27 +15,27 @@ _forced = False
 
 
 def allow(force: bool) -> None:
-    """Take whether files of somebody else may be replaced, for the command at hand."""
+    """Set whether files that magpend did not write may be replaced by the present command."""
     global _forced
     _forced = force
 
 
 def check_place(path: Path, option: str = "--out", within: str = "") -> None:
-    """Refuse a place that nothing may be written to, before anything is computed.
+    """Refuse a place that cannot be written to, before anything is computed.
 
     Parameters
     ----------
     path
-        A file or a folder, there or not.
+        A file or a folder, which need not exist.
     option
-        What names it.
+        Option that gave it, for the message.
     within
-        Folder of a run directory in which the command writes by itself.
+        Folder of a run directory in which the command may write.
 
     Raises
     ------
     RefusedError
-        If it lies inside of a run directory, or is a link that leads nowhere.
+        If the path lies inside of a run directory, or is a link that leads nowhere.
     """
     from pipeline.store.local import refuse_place
 
@@ -43,12 +43,12 @@ def check_place(path: Path, option: str = "--out", within: str = "") -> None:
 
 
 def check_file(path: Path, option: str = "--out", within: str = "") -> None:
-    """Refuse a place as `check_place`, and a file there that magpend has not written.
+    """Refuse a place that cannot be written to, and an existing file that magpend did not write.
 
     Raises
     ------
     RefusedError, SpecError
-        Saying what is wrong, and the remedy; of a file not if ``--force`` is given.
+        If the place is impossible, or, without ``--force``, if such a file exists.
     """
     check_place(path, option, within)
     if path.is_file() and not _is_own(path):
@@ -56,12 +56,12 @@ def check_file(path: Path, option: str = "--out", within: str = "") -> None:
 
 
 def check_table(path: Path, header: str, option: str = "--csv") -> None:
-    """Refuse to replace a table with other columns, which nobody can tell from a stranger's.
+    """Refuse to replace a table with other columns, since it may be somebody else's.
 
     Raises
     ------
     SpecError
-        Unless ``--force`` is given.
+        If such a table exists, unless ``--force`` is given.
     """
     if not path.is_file():
         return
@@ -72,12 +72,12 @@ def check_table(path: Path, header: str, option: str = "--csv") -> None:
 
 
 def check_log(path: Path) -> None:
-    """Refuse to add to a file that is no log.
+    """Refuse to append to a file that is not a log.
 
     Raises
     ------
     SpecError
-        Unless ``--force`` is given.
+        If the file is not a log, unless ``--force`` is given.
     """
     check_place(path, "--log")
     if path.is_file():
@@ -98,7 +98,7 @@ def _refuse(path: Path, option: str) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a file says that magpend wrote it, is empty, or may be a table: see `check_table`."""
+    """Return whether a file has magpend's mark, is empty, or may be a table: see `check_table`."""
     with path.open("rb") as file:
         begin = file.read(_LOOKED_AT)
         file.seek(max(0, path.stat().st_size - _LOOKED_AT))

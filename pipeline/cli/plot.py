@@ -1,4 +1,4 @@
-"""``magpend plot X DIR``: a command for each figure in the registry."""
+"""Define ``magpend plot NAME DIR``, with a command for each figure in the registry."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ plot_app = typer.Typer(
 
 
 def draw(directory: str, name: str, options: FigureOptions) -> None:
-    """Draw a figure of a run, write it and the data drawn, and say where."""
+    """Draw a figure of a run, write it with its data, and print their places."""
     from pipeline.cli import console
     from pipeline.runs.drawing import drawn, ready
     from pipeline.store.errors import RefusedError
@@ -70,19 +70,19 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
 
 
 def _target_of(options: FigureOptions) -> Path:
-    """File that is asked for; ``--format`` is added to a name without it."""
+    """Return the requested file; ``--format`` is added to a name without it."""
     out, suffix = Path(options.out), f".{options.format}"
     return out.with_name(out.name + suffix) if options.format and out.suffix.lower() != suffix else out
 
 
 def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
-    """File in the run directory; of a run in an object store, in a folder of its name in ``figures``."""
+    """Return the default file: in the run directory, or for an object store in ``figures/NAME``."""
     folder = files.local / "figures" if files.local else Path("figures") / files.name.rpartition("/")[2]
     return folder / f"{name}{options.label()}.{options.format or 'png'}"
 
 
 def check_figure_path(path: Path, within: str = "") -> None:
-    """Refuse a path that cannot be written to, before anything is computed; `within` as for `check_place`."""
+    """Refuse a figure file that cannot be written, before anything is computed; see `check_place`."""
     from pipeline.cli.outputs import check_file
     from pipeline.spec.problems import SpecError
 

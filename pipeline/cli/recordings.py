@@ -1,4 +1,4 @@
-"""``magpend recordings``: show, convert and simulate recordings of a rig."""
+"""Define ``magpend recordings``: show, convert and simulate recordings of a rig."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Window = Annotated[
 ]
 
 recordings_app = typer.Typer(
-    help="Recordings of a rig: what a file holds, and what is wrong with it.",
+    help="Recordings of a rig: show a file's content and findings, convert it, simulate one.",
     no_args_is_help=True,
     rich_markup_mode=None,
     context_settings=SETTINGS,
@@ -34,9 +34,7 @@ recordings_app = typer.Typer(
 
 def show(
     file: File,
-    mapping: Annotated[
-        Path | None, typer.Option(help="Mapping (TOML): which channel is which state.")
-    ] = None,
+    mapping: Annotated[Path | None, typer.Option(help="Mapping (TOML) from channels to states.")] = None,
     window: Window = None,
     smooth: Annotated[
         bool, typer.Option("--smooth", help="Draw smoothed states and the rates from them.")
@@ -47,10 +45,11 @@ def show(
     out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Say what a recording holds; with a mapping, what was found in it, and draw it.
+    """Describe a recording; with a mapping, list its findings and draw it.
 
-    Without --mapping the channels of the file are listed as they are: what a mapping can name. With it they
-    are read as states of the model, checked, and drawn with --out; the exit code is 0 whatever was found.
+    Without --mapping the command lists the channels of the file, which a mapping can name. With a mapping it
+    reads them as states of the model, checks them, and with --out draws them. The exit code is 0 whatever the
+    findings are.
     """
     from pipeline.rig.recordings.formats import read_raw
     from pipeline.rig.recordings.overview import describe_file
@@ -74,7 +73,7 @@ def show(
 def convert(
     file: File,
     out: Annotated[Path, typer.Option(help="File to write: .tdms, .csv or .nc.")],
-    mapping: Annotated[Path, typer.Option(help="Mapping (TOML): which channel is which state.")],
+    mapping: Annotated[Path, typer.Option(help="Mapping (TOML) from channels to states.")],
     window: Window = None,
     smooth: Annotated[
         bool, typer.Option("--smooth", help="Write smoothed states, and the rates from them.")
@@ -83,7 +82,7 @@ def convert(
         float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")
     ] = None,
 ) -> None:
-    """Write a recording in SI units, in another format; beside TDMS and CSV, the mapping that reads it."""
+    """Write a recording in SI units in another format; with TDMS and CSV also the mapping that reads it."""
     from pipeline.cli import console
     from pipeline.rig.recordings import mapping_for, write_recording
     from pipeline.rig.recordings.writing import check_target
@@ -105,7 +104,7 @@ def simulate(
     spec: Annotated[Path, typer.Argument(metavar="SPEC", help="Virtual rig (TOML).")],
     out: Annotated[Path, typer.Option(help="File to write: .tdms or .csv; the mapping goes beside it.")],
 ) -> None:
-    """Write the recording of a virtual rig, labelled as simulated, and the mapping that reads it."""
+    """Write the recording of a virtual rig, marked as simulated, and the mapping that reads it."""
     from pipeline.cli import console
     from pipeline.rig.recordings.writing import SUFFIXES, check_target, write_raw
     from pipeline.rig.simulation import load_rig, simulated
@@ -125,21 +124,21 @@ def simulate(
 
 def drive(
     file: File,
-    mapping: Annotated[Path, typer.Option(help="Mapping (TOML): which channel is the drive.")],
+    mapping: Annotated[Path, typer.Option(help="Mapping (TOML) that names the drive's channel.")],
     kind: Annotated[
         Literal["edges", "torque"],
-        typer.Option(help="What is kept: the instants at which the drive switches, or its values."),
+        typer.Option(help="Content: the times at which the drive switches, or its values."),
     ] = "edges",
     out: Annotated[Path, typer.Option(help="Drive file, .csv.")] = Path("drive.csv"),
     window: Window = None,
     tolerance: Annotated[
         float,
-        typer.Option(help="Leave out samples of a torque that lie this close to the lines left [N m]."),
+        typer.Option(help="Drop samples of a torque that interpolation meets this closely [N m]."),
     ] = 0.0,
 ) -> None:
-    """Write what the drive did as a file that ``magpend run`` and ``simulate`` take for their drive.
+    """Write a recorded drive as a file that ``magpend run`` and ``simulate`` accept.
 
-    Says its frequency, jitter and duty cycle. With edges, shape and amplitude stay the model's own.
+    The command prints frequency, jitter and duty cycle. With edges, the model gives shape and amplitude.
     """
     from pipeline.cli import console
     from pipeline.rig.driving import drive_file
@@ -166,7 +165,7 @@ def drive(
 
 
 def _keep(file: Path, out: Path) -> None:
-    """Refuse to write a recording over the one that is read."""
+    """Refuse to overwrite the recording that is read."""
     from pipeline.spec.problems import SpecError
 
     if out.exists() and file.exists() and out.samefile(file):
@@ -174,14 +173,14 @@ def _keep(file: Path, out: Path) -> None:
 
 
 def _check_recording(out: Path) -> None:
-    """Refuse a file that magpend has not written; with a mapping beside it is told by that, see `_beside`."""
+    """Refuse to replace a file that magpend did not write; `_beside` decides if a mapping exists."""
     check_place(out)
     if not out.with_suffix(".toml").exists():
         check_file(out)
 
 
 def _beside(out: Path, text: str) -> Path:
-    """Return where the mapping of a recording goes; refuse to replace what is something else."""
+    """Return the place of a recording's mapping; refuse to replace another file."""
     from pipeline.spec.problems import SpecError
 
     path = out.with_suffix(".toml")

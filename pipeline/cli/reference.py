@@ -1,7 +1,7 @@
-"""The tables of README and docs, made from the code: ``python -m pipeline.cli.reference``.
+"""Make the tables of README and docs from the code: ``python -m pipeline.cli.reference``.
 
-A table stands between the marks ``<!-- reference: NAME -->`` and ``<!-- /reference -->``; what is between
-them is replaced. With ``--check`` nothing is written, and the exit code is 1 if a page is not true any more.
+A table stands between the marks ``<!-- reference: NAME -->`` and ``<!-- /reference -->``. The text between
+the marks is replaced. With ``--check`` nothing is written, and the exit code is 1 if a page is out of date.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _BLOCK = re.compile(r"(<!-- reference: ([\w ]+) -->\n).*?(<!-- /reference -->)",
 
 
 def pages() -> list[Path]:
-    """Files that have tables."""
+    """Return the files that have tables."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def rendered(text: str) -> str:
-    """Return a page with all its tables made again.
+    """Return a page with all its tables made anew.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def rendered(text: str) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table of Markdown."""
+    """Return a table in Markdown."""
     lines = [list(head), ["---"] * len(head), *(list(row) for row in rows)]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines)
 
@@ -44,17 +44,17 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def commands() -> str:
-    """Every command in a line."""
+    """Return the table of all commands, one line each."""
     rows = ((f"`magpend {name}{_arguments(command)}`", _first(command)) for name, command in _commands())
     return table(("command", "does"), rows)
 
 
 SHARED = ("plot fractions", "analyse attractors", "analyse branches")
-"""Commands whose options others have too: listed with these alone."""
+"""Commands whose options other commands have, too. The options are listed only with these commands."""
 
 
 def options() -> str:
-    """Every command with its options."""
+    """Return every command with its options."""
     found, parts = dict(_commands()), []
     listed = {name: dict(_options(found[name])) for name in SHARED}
     for name, command in found.items():
@@ -83,7 +83,7 @@ def _options(command: Any) -> list[tuple[str, str]]:
 
 
 def exit_codes() -> str:
-    """What a command's exit code says."""
+    """Return the table of exit codes."""
     from pipeline.cli.exits import Exit
 
     return table(("code", "meaning"), ((str(int(code)), code.sentence) for code in Exit))
@@ -115,7 +115,7 @@ def _metavar(parameter: Any) -> str:
 
 
 def _help(parameter: Any) -> str:
-    """Sentence of an option, with the default of those that the help shows one for."""
+    """Return the help of an option, with its default if the help should show one."""
     has_default = isinstance(parameter.default, (int, float, str, Path)) and parameter.default is not False
     return _text(parameter.help or "") + (f" Default: {parameter.default}." if has_default else "")
 
@@ -129,7 +129,7 @@ def _text(text: str) -> str:
 
 
 def workflows() -> str:
-    """Specifications that ship."""
+    """Return the table of specifications that ship."""
     from pipeline.runs.workflows import shipped_identifications, shipped_workflows
 
     def title(path: Path) -> str:
@@ -143,7 +143,7 @@ def workflows() -> str:
 
 
 def specification() -> str:
-    """Keys of a specification, table by table."""
+    """Return the keys of a specification, table by table."""
     from pipeline.spec import recorded, section, starts, tables
 
     parts = [
@@ -178,7 +178,7 @@ def specification() -> str:
 
 
 def identification() -> str:
-    """Keys of the specification of an identification, table by table."""
+    """Return the keys of an identification's specification, table by table."""
     from pipeline.rig.identify import specification as tables
     from pipeline.rig.identify.unknowns import Identified
 
@@ -198,7 +198,7 @@ _STATES = (
 
 
 def products() -> str:
-    """Products of a specification with their keys."""
+    """Return the products of a specification with their keys."""
     from pipeline.products.registry import CELL_PRODUCTS
 
     return "\n\n".join(
@@ -208,7 +208,7 @@ def products() -> str:
 
 
 def mapping() -> str:
-    """Keys of a recording's mapping."""
+    """Return the keys of a recording's mapping."""
     from pipeline.rig.recordings import mapping as found
 
     top = ("csv", "channels", "drive")
@@ -224,14 +224,14 @@ def mapping() -> str:
 
 
 def findings() -> str:
-    """What can be found in a recording."""
+    """Return the table of findings in recordings."""
     from pipeline.rig.recordings.findings import KINDS
 
     return table(("finding", "meaning"), ((f"`{kind}`", meaning) for kind, meaning in KINDS.items()))
 
 
 def virtual_rig() -> str:
-    """Keys of a virtual rig."""
+    """Return the keys of a virtual rig's specification."""
     from pipeline.rig import simulation
 
     parts = [
@@ -244,7 +244,7 @@ def virtual_rig() -> str:
 
 
 def study() -> str:
-    """Keys of a study."""
+    """Return the keys of a study."""
     from pipeline.report import study as tables
 
     parts = [
@@ -260,7 +260,7 @@ def study() -> str:
 
 
 def measures() -> str:
-    """What a claim can be about, and with which options."""
+    """Return the table of measures for claims, with their options."""
     from pipeline.report import torque_curves
     from pipeline.report.measures import MEASURES
 
@@ -268,7 +268,8 @@ def measures() -> str:
     for name, measure in MEASURES.items():
         text = inspect.getdoc(getattr(torque_curves, measure.__name__, measure)) or ""
         first, _, more = text.partition("\n\n")
-        rows.append((f"`{name}`", _flat(first), _flat(more.replace("``", "`"))))
+        first = _flat(first).removeprefix("Return the ")
+        rows.append((f"`{name}`", f"{first[:1].upper()}{first[1:]}", _flat(more)))
     return table(("measure", "what it is", "options and interval"), rows)
 
 
@@ -315,7 +316,7 @@ def _bounds(info: Any) -> str:
 
 
 def variables() -> str:
-    """Variables of a cube, those of products last."""
+    """Return the table of a cube's variables; those of products come last."""
     from magpend_core.models import load_model
     from pipeline.layout.schema import REST_STATE, RETURN_TIME, base_variables
     from pipeline.products.registry import CELL_PRODUCTS
@@ -334,7 +335,7 @@ def variables() -> str:
 
 
 def statuses() -> str:
-    """What can become of a cell."""
+    """Return the table of a cell's status codes."""
     from magpend_core.status import Status
 
     return table(
@@ -343,7 +344,7 @@ def statuses() -> str:
 
 
 def models() -> str:
-    """Models that ship."""
+    """Return the table of models that ship."""
     from magpend_core.models import load_model, model_names
 
     rows = []
@@ -356,7 +357,7 @@ def models() -> str:
 
 
 def public() -> str:
-    """Names of the Python package."""
+    """Return the public names of the Python package."""
     import magpend
 
     return ", ".join(f"`{name}`" for name in dir(magpend) if not name.startswith("_"))
@@ -383,7 +384,7 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def main() -> None:
-    """Write the pages that are not true any more, or with ``--check`` name them."""
+    """Write the pages that are out of date, or with ``--check`` list them."""
     check = "--check" in sys.argv[1:]
     stale = [page for page in pages() if rendered(page.read_text("utf-8")) != page.read_text("utf-8")]
     for page in stale:

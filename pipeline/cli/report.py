@@ -1,4 +1,4 @@
-"""``magpend report``: one page on runs of one's own."""
+"""Define ``magpend report``: one page on your own runs."""
 
 from __future__ import annotations
 
@@ -12,22 +12,25 @@ def report(
     directories: Annotated[
         list[str], typer.Argument(metavar="DIR...", help="Run directories, or s3://BUCKET/PREFIX.")
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The page.")] = Path("report.html"),
-    title: Annotated[str, typer.Option(help="Its title; by default that of the run.")] = "",
+    out: Annotated[Path, typer.Option(metavar="FILE", help="File of the page.")] = Path("report.html"),
+    title: Annotated[str, typer.Option(help="Title of the page; by default that of the run.")] = "",
     also: Annotated[
         list[str] | None,
         typer.Option(
-            "--with", metavar="ANALYSIS", help="Compute this, too: branches, chaos, ...; may be repeated."
+            "--with",
+            metavar="ANALYSIS",
+            help="Additional analysis to compute: branches, chaos, ...; may be repeated.",
         ),
     ] = None,
     only_stored: Annotated[
-        bool, typer.Option("--only-stored", help="Compute nothing; show what was found before.")
+        bool, typer.Option("--only-stored", help="Compute nothing; show only stored results.")
     ] = False,
 ) -> None:
     """Write one HTML page on runs: parameters, diagram, attractors, bifurcations, exponents, provenance.
 
-    The page holds all that it shows, needs no script and no network, and prints. Attractors are found, and of
-    a continuation its hysteresis, if they were not; what else is missing is named with its command.
+    The page is self-contained: it needs no script and no network. You can print it. Attractors, basins and
+    the hysteresis of a continuation are computed if they are missing. For other missing results the page
+    names the command.
     """
     from pipeline.cli import console
     from pipeline.report.page import write

@@ -1,4 +1,4 @@
-"""``magpend reproduce``: a study computed, drawn and judged."""
+"""Define ``magpend reproduce``: compute, draw and judge a study."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.cli.options import completing
 
 
 def studies() -> Iterable[str]:
-    """Names of the studies that ship."""
+    """Return the names of the studies that ship."""
     from pipeline.report.study import shipped_studies
 
     return shipped_studies()
@@ -24,19 +24,23 @@ def reproduce(
         str,
         typer.Argument(
             metavar="STUDY",
-            help="Name of a study that ships, or a TOML file.",
+            help="Name of a study that ships, or its TOML file.",
             autocompletion=completing(studies),
         ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where everything goes; by default reproduce/STUDY."),
+        typer.Option(metavar="DIR", help="Folder of all results; by default reproduce/STUDY."),
     ] = None,
     figure: Annotated[
-        list[str] | None, typer.Option(metavar="N", help="This figure alone; may be repeated.")
+        list[str] | None,
+        typer.Option(metavar="N", help="Number of a figure to reproduce; may be repeated. Default: all."),
     ] = None,
     smoke: Annotated[
-        bool, typer.Option("--smoke", help="The small size: minutes, and most is undecided.")
+        bool,
+        typer.Option(
+            "--smoke", help="Use the small size: it takes minutes and leaves most claims undecided."
+        ),
     ] = False,
     workers: Annotated[
         int | None,
@@ -45,8 +49,8 @@ def reproduce(
 ) -> None:
     """Compute, draw and judge the figures of a study, and write one HTML page on them.
 
-    Runs that are complete are taken, others go on where they were. Every claim has what came out with its
-    interval, and one of four verdicts; a coarse grid or a small sample decides nothing.
+    Complete runs are used, other runs are continued. Every claim gets a measured value with its interval, and
+    one of four verdicts. A coarse grid or a small sample leaves a claim undecided.
     """
     from pipeline.cli import console
     from pipeline.report.reproduce import calibrated_on, decided_first, headline, spelled
@@ -76,7 +80,7 @@ def reproduce(
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse a place that cannot be written to, before anything is computed."""
+    """Refuse a folder that cannot be written to, before anything is computed."""
     from pipeline.cli.outputs import check_place
     from pipeline.spec.problems import SpecError
     from pipeline.store.errors import RefusedError

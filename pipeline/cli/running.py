@@ -1,4 +1,4 @@
-"""``magpend run``, ``status`` and ``verify``."""
+"""Define ``magpend run``, ``status`` and ``verify``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def workflow_names() -> Iterable[str]:
-    """Names of the workflows that ship."""
+    """Return the names of the workflows that ship."""
     from pipeline.runs.workflows import shipped_workflows
 
     return shipped_workflows()
@@ -47,13 +47,13 @@ Scheduler = Annotated[
 ClusterFile = Annotated[
     Path | None,
     typer.Option(
-        metavar="FILE", help="TOML file whose [cluster] says what a job is. Default: $MAGPEND_CLUSTER."
+        metavar="FILE", help="TOML file whose table [cluster] describes a job. Default: $MAGPEND_CLUSTER."
     ),
 ]
 Dashboard = Annotated[
-    bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and say where.")
+    bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and print its address.")
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be done; create nothing.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Describe the work; create nothing.")]
 
 
 def run(
@@ -67,18 +67,18 @@ def run(
     dashboard: Dashboard = False,
     dry_run: DryRun = False,
     smoke: Annotated[
-        bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")
+        bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
     ] = False,
     plot: Annotated[
         bool,
-        typer.Option("--plot", help="Draw what the run has at the end: a diagram, its exponents, or a map."),
+        typer.Option("--plot", help="Draw the finished run: a diagram, its exponents, or a map."),
     ] = False,
 ) -> None:
-    """Compute what a specification asks for, or what is missing of it.
+    """Run a specification, or complete its run.
 
-    Stop it whenever you like: the same command goes on where it was, and the finished files are the same.
-    At the end it counts the cells by status. Cells that diverged or failed are results, with exit code 0; a
-    warning tells of them if they are more than 1 %.
+    You can stop the command at any time: the same command continues, and the finished files are the same. At
+    the end it counts the cells by status. Cells that diverged or failed are results, and the exit code is 0;
+    above 1 % a warning reports them.
     """
     from pipeline.cli import console
     from pipeline.runs import outcome, preview
@@ -104,7 +104,7 @@ def run(
 
 
 def _plot(run: Run) -> None:
-    """Draw what shows a finished run best; a figure that cannot be drawn is a note, no error."""
+    """Draw the figure that shows a finished run best; if that fails, print a note, no error."""
     from pipeline.cli import console
     from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES
@@ -124,7 +124,7 @@ def _plot(run: Run) -> None:
 
 
 def status(directory: Directory, json: Json = False) -> None:
-    """Say how much of a run is committed and what became of its cells."""
+    """Print how much of a run is committed, and the status of its cells."""
     from pipeline.cli.common import tell
     from pipeline.products.product import Table
     from pipeline.runs.status import describe_state, state
@@ -149,7 +149,7 @@ def verify(
         ),
     ] = False,
 ) -> None:
-    """Check every committed byte against the commit records, and the set-up's against run.json."""
+    """Check every committed byte against the commit records, and the set-up's files against run.json."""
     from pipeline.cli import console
     from pipeline.runs import verify as verification
 

@@ -1,4 +1,4 @@
-"""``magpend simulate``: one trajectory of any model."""
+"""Define ``magpend simulate``: integrate one trajectory of any model."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 DEFAULT_HZ = 2.2
 
 EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
-"""States are options by their own names, which the model decides."""
+"""Settings for commands whose options include a model's states by name."""
 
 
 def simulate(
@@ -27,7 +27,7 @@ def simulate(
     model: Annotated[
         str,
         typer.Option(
-            help="Which one: a name (see magpend models), a file with its text, or package.module:NAME.",
+            help="Model: a name (see magpend models), a file with its text, or package.module:NAME.",
             autocompletion=completing(names),
         ),
     ] = DEFAULT,
@@ -36,16 +36,16 @@ def simulate(
         typer.Option(
             "--frequency-hz",
             "--frequency",
-            help=f"Drive frequency [Hz]; by default {DEFAULT_HZ:g}. Without a drive periods are of 1 s.",
+            help=f"Drive frequency [Hz]; by default {DEFAULT_HZ:g}. Without a drive a period is 1 s.",
         ),
     ] = None,
     drive: Annotated[
         Path | None,
-        typer.Option(help="Drive file (see magpend recordings drive): the drive is a recording."),
+        typer.Option(help="Drive file with a recorded drive (see magpend recordings drive)."),
     ] = None,
     preset: Annotated[
         str | None,
-        typer.Option(help="Parameter preset, or a file of one: FILE.toml; by default the model's first."),
+        typer.Option(help="Parameter preset, or a preset's file, FILE.toml; by default the model's first."),
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")
@@ -62,14 +62,14 @@ def simulate(
     figure: Annotated[
         Path | None, typer.Option(help="Figure, .png, .pdf or .svg; by default beside the series.")
     ] = None,
-    no_figure: Annotated[bool, typer.Option("--no-figure", help="Write the series alone.")] = False,
+    no_figure: Annotated[bool, typer.Option("--no-figure", help="Draw no figure.")] = False,
 ) -> None:
     """Integrate one trajectory: states and the model's quantities as CSV or NetCDF, and a figure.
 
-    The initial state is given by the model's names: --NAME VALUE, or --NAME-deg VALUE of an angle or its
-    rate; what is not given is 0. Time 0 is the instant of a section. The command says whether the motion has
-    closed on a periodic orbit, or how long a transient it would take. With --drive it is the state where the
-    recording begins, and time is the recording's own.
+    Give the initial state by the model's names: --NAME VALUE, or --NAME-deg VALUE for an angle or its rate;
+    other states are 0. Time 0 is the time of a section. The command prints whether the motion has closed on a
+    periodic orbit, or how long a transient it would need. With --drive the initial state is that at the start
+    of the recording, and time is the recording's.
     """
     from pipeline.cli import console
     from pipeline.cli.outputs import check_file
@@ -101,7 +101,7 @@ def simulate(
 
 
 def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
-    """Write the figure of a series and, unless the series is that already, the data beside it."""
+    """Write the figure of a series, and its data beside it unless the series is the same file."""
     from pipeline.cli import console
     from pipeline.plots import plot_trajectory, save_data, save_figure
 
@@ -112,12 +112,12 @@ def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
 
 
 def _states(words: list[str]) -> dict[str, float]:
-    """Read ``--NAME VALUE`` pairs of options that the command does not have."""
+    """Read ``--NAME VALUE`` pairs with the names of states."""
     return {name: values[0] for name, values in read_named(words, 1).items()}
 
 
 def read_named(words: list[str], n: int) -> dict[str, Any]:
-    """Read ``--NAME VALUE ...`` with `n` numbers each, as ``NAME`` with underscores; all mistakes at once."""
+    """Read ``--NAME VALUE ...`` with `n` numbers each, by name; raise `SpecError` with all mistakes."""
     from pipeline.spec.problems import SpecError
 
     found: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""``magpend submit``."""
+"""Define ``magpend submit``: run a specification as a batch job."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def submit(
         bool, typer.Option("--dry-run", help="Print the batch script; create and send nothing.")
     ] = False,
     smoke: Annotated[
-        bool, typer.Option("--smoke", help="Run the specification's small size of seconds.")
+        bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
     ] = False,
 ) -> None:
-    """Run a specification as a job of SLURM, PBS, Grid Engine or LSF, and say how to follow it.
+    """Run a specification as a job of SLURM, PBS, Grid Engine or LSF, and print how to follow it.
 
-    The job goes on where an earlier one was stopped.
+    The job continues where an earlier one was stopped.
     """
     from pipeline.cli import console
     from pipeline.runs.submit import prepare, send

@@ -1,4 +1,4 @@
-"""``magpend zoom``: a narrower specification from an old one."""
+"""Define ``magpend zoom``: write a narrower specification from an old one."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ def zoom(
     ] = None,
     num: Annotated[
         int | None,
-        typer.Option(min=2, help="Points of every new range; by default as many as before."),
+        typer.Option(min=2, help="Number of points of every new range; by default as before."),
     ] = None,
     samples: Annotated[int | None, typer.Option(min=1, help="Number of random initial states.")] = None,
 ) -> None:
-    """Write a new specification with narrower ranges; everything else stays as it was.
+    """Write a new specification with narrower ranges; everything else stays unchanged.
 
-    New ranges are given by name, with two numbers: --frequency 2.1 2.3 [Hz], --NAME LOW HIGH of a state or
-    a parameter, --NAME-deg LOW HIGH of an angle; --num-NAME N gives a range its own number of points. The
-    new specification is validated before it is written. Run it with: magpend run OUT
+    Give new ranges by name with two numbers: --frequency 2.1 2.3 [Hz], --NAME LOW HIGH for a state or a
+    parameter, --NAME-deg LOW HIGH for an angle. --num-NAME N gives a range its own number of points. The new
+    specification is validated before it is written. Run it with: magpend run OUT
     """
     from pipeline.cli import console
     from pipeline.layout.vocabulary import parameter_name

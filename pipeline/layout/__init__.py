@@ -1,1 +1,1 @@
-"""From a specification to cells, tasks, chunks, names and identity. Pure: nothing is created."""
+"""Turn a specification into cells, tasks, chunks, names and an identity. Pure: nothing is created."""

@@ -1,4 +1,4 @@
-"""Attributes that every format takes: numbers, lists of numbers, and texts."""
+"""Convert attributes to the types that every file format accepts: numbers, lists of numbers, texts."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def netcdf_safe(ds: xr.Dataset) -> xr.Dataset:
 
 
 def safe_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return attributes as NetCDF has them.
+    """Return attributes in the types that NetCDF accepts.
 
-    Truth values become 0 and 1, lists of words one text with spaces between, other lists and tables JSON;
-    what is None is left out.
+    Truth values become 0 and 1. A list of texts becomes one text, joined by spaces. Other lists and tables
+    become JSON. None is left out.
     """
     return {str(name): _safe(value) for name, value in attrs.items() if value is not None}
 

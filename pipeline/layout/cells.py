@@ -1,4 +1,4 @@
-"""From a specification to numbers: dims and coordinates of the cube, and a task's input arrays."""
+"""Turn a specification into numbers: dims and coordinates of the cube, and a task's input arrays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DIRECTION_CODES = {"up": 1, "down": -1}
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One coordinate of the cube."""
+    """A coordinate of the cube."""
 
     name: str
     dims: tuple[str, ...]
@@ -39,17 +39,17 @@ class ParameterAxis:
 
 @dataclass(frozen=True)
 class InitialStates:
-    """Initial states in a flat order, without making a table of a grid.
+    """Initial states in a flat order. A grid is not expanded to a table.
 
     Attributes
     ----------
     dims, shape
-        Dims of the initial conditions in a sweep.
+        Dims of the initial conditions in a sweep, and their sizes.
     columns
-        Values of each state: a number for all, one value per row, or with `grid` one per step of the
-        grid's dim [rad, rad/s].
+        Values of each state, in the model's units: one number for all, one value per row, or with `grid`
+        one value per step of the grid's dim.
     grid
-        The grid dim of each state, or None.
+        Index of each state's grid dim, None for a fixed state; None as a whole without a grid.
     """
 
     dims: tuple[str, ...]
@@ -61,7 +61,7 @@ class InitialStates:
         return math.prod(self.shape)
 
     def at(self, flat: np.ndarray) -> np.ndarray:
-        """Return the states with these flat indices, shape (n, n_states), in the model's units."""
+        """Return the initial states with given flat indices, shape (n, n_states), in the model's units."""
         out = np.empty((len(flat), len(self.columns)))
         steps = np.unravel_index(flat, self.shape) if self.shape else ()
         for i, column in enumerate(self.columns):
@@ -83,7 +83,7 @@ def parameter_axes(spec: Spec) -> tuple[ParameterAxis, ...]:
 
 
 def _state_value(table: Any, state: str) -> tuple[Any, float]:
-    """Return what the table gives for a state, and the factor to SI units. Degrees end here."""
+    """Return a state's value from the table, and the factor that converts it to SI units."""
     in_degrees = table.of(degrees_key(state))
     if in_degrees is not None:
         return in_degrees, math.pi / 180
@@ -92,7 +92,7 @@ def _state_value(table: Any, state: str) -> tuple[Any, float]:
 
 
 def initial_states(starts: Starts) -> InitialStates:
-    """Return the initial conditions of a specification."""
+    """Return the initial states of a specification."""
     if isinstance(starts, GridStarts):
         return _grid(starts)
     columns = _rows(starts) if isinstance(starts, ListStarts) else _samples(starts)
@@ -127,7 +127,7 @@ def _rows(starts: ListStarts) -> list[np.ndarray]:
 
 
 def _samples(starts: RandomStarts) -> list[np.ndarray]:
-    # A number is drawn for every state whatever is fixed, so that fixing a state leaves the others.
+    # a number is drawn for fixed states, too, so that fixing one does not change the others
     names = starts.system.state_names
     uniform = np.random.Generator(np.random.PCG64(starts.seed)).random((starts.n, len(names)))
     columns = []
@@ -141,7 +141,7 @@ def _samples(starts: RandomStarts) -> list[np.ndarray]:
 def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
     """Return the cube's coordinates, numbers only.
 
-    ``direction`` is +1 (up) or -1 (down) here; `open_run` shows words.
+    ``direction`` is +1 (up) or -1 (down) here; `open_run` returns it as text.
     """
     model = spec.model
     found = [
@@ -212,8 +212,8 @@ class Inputs:
     frequency_hz : ndarray, (branch, point)
     initial_states : ndarray, (branch, n_states)
     step_size : ndarray, (branch,), or None
-        Step with which each branch goes on from where it was left [s]; NaN where it has ended before. None
-        where all begin.
+        First step of each branch that continues an earlier task [s]; NaN for a branch that has ended. None
+        for a task in which all branches begin.
     """
 
     parameters: np.ndarray
@@ -230,10 +230,10 @@ class Inputs:
 
 
 class CellMap:
-    """Between the cells of a block of the cube and the branches and points of the kernel.
+    """A map between the cells of a block of the cube and the branches and points of the kernel.
 
-    In a sweep each cell is a branch of one point. In a continuation the branches of a block walk its part
-    of the path, those that go down from its end.
+    In a sweep each cell is a branch with one point. In a continuation the branches of a block walk the
+    block's part of the path: upward ones from its first point, downward ones from its last.
     """
 
     def __init__(self, spec: Spec) -> None:
@@ -270,7 +270,7 @@ class CellMap:
         )
 
     def last_cells(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
-        """Return the cells of a block in which its branches are left; all walk in one direction."""
+        """Return the cells of a block where its branches end. All its branches walk in one direction."""
         assert self.path is not None
         part = block[self.path]
         down = self._down(np.array([block[-1].start]))[0]
@@ -278,7 +278,7 @@ class CellMap:
         return tuple(last if i == self.path else s for i, s in enumerate(block))
 
     def _start_of(self, index: np.ndarray) -> np.ndarray:
-        """Flat index of the initial state of each branch."""
+        """Return the flat index of each branch's initial state."""
         own = index[len(self._axes) :]
         if self._walk is not None:
             return np.asarray(own[0] % len(self._states))
@@ -287,7 +287,7 @@ class CellMap:
         return np.asarray(np.ravel_multi_index(tuple(own), self._states.shape))
 
     def _branch_first(self, cells: np.ndarray, block: tuple[slice, ...]) -> np.ndarray:
-        """Return cell indices, shape (dim, branch, point), in the order in which the kernel walks them."""
+        """Return cell indices, shape (dim, branch, point), with points in the order of the walk."""
         sizes = [s.stop - s.start for s in block]
         index = cells + np.array([s.start for s in block], dtype=np.int64).reshape(-1, 1)
         if self.path is None:
@@ -299,13 +299,13 @@ class CellMap:
         return walked
 
     def _down(self, branches: np.ndarray) -> np.ndarray:
-        """Which branches walk down."""
+        """Return which branches walk down."""
         assert self._walk is not None
         directions = np.array([d == "down" for d in self._walk.directions])
         return np.asarray(directions[branches // len(self._states)])
 
     def outputs(self, block: tuple[slice, ...], values: np.ndarray) -> np.ndarray:
-        """Bring a kernel's result, shape (branch, point, ...), into the block's shape."""
+        """Reshape a kernel's result, shape (branch, point, ...), to the block's shape."""
         sizes = [s.stop - s.start for s in block]
         own = values.shape[2:]
         if self.path is None:

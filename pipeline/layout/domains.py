@@ -1,4 +1,4 @@
-"""Whether the equations have values where a run begins: said before anything is derived or computed."""
+"""Check that the equations have values at the initial states of a run, before anything is computed."""
 
 from __future__ import annotations
 
@@ -20,21 +20,23 @@ if TYPE_CHECKING:
     from magpend_core.models.text.domains import Fault
 
 MOST_STARTS = 4096
-"""Starts at which the equations are evaluated: all, or so many evenly spread."""
+"""Most starts at which the equations are evaluated. Of more starts so many are chosen, evenly spread."""
 MOST_CORNERS = 64
-"""Corners of the box of parameters at which they are."""
+"""Most corners of the box of swept parameters at which the equations are evaluated."""
 
 
 def check_starts(spec: Spec) -> None:
-    """Refuse a run whose equations, as text, have no value at its starts.
+    """Refuse a run whose model is a text and whose equations have no value at its starts.
 
-    They are evaluated at time 0 at all starts, or 4096 of them, for the ends of every axis. Where they have
-    values at some of the ends, cells without are told by their status.
+    They are evaluated at time 0 at all starts (at most `MOST_STARTS`), at both ends of every axis. If they
+    have values at some of the ends, the run is not refused: the status of its cells shows where they have
+    none.
 
     Raises
     ------
     SpecError
-        Naming each part of the text that has no value, what is wrong, and the numbers.
+        If they have none. The message names each part of the text without a value, the reason, and the
+        numbers.
     """
     states = initial_states(spec.initial_conditions)
     chosen = np.unique(np.linspace(0, len(states) - 1, min(len(states), MOST_STARTS)).astype(np.int64))
@@ -53,16 +55,17 @@ def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str,
     Parameters
     ----------
     model
-        Any; of one that is no text nothing is said here.
+        Any model; one that is not a text is not checked.
     states
-        (n, n_states).
+        Initial states in the model's units, shape (n, n_states).
     points
-        Parameters by name, and ``frequency_hz`` (None for none); the states are looked at for each.
+        Parameter points at which the states are checked: values by parameter name, and ``frequency_hz``
+        (None for none).
 
     Raises
     ------
     SpecError
-        As `check_starts`.
+        If the equations have no value; see `check_starts`.
     """
     if not isinstance(model, TextModel):
         return
@@ -77,7 +80,7 @@ def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str,
     columns |= {"t": zero, "phase": zero, "f": np.repeat(frequency, n)}
     faults = domain_faults(model.definition, columns)
     parts = [{name: v[i * n : (i + 1) * n] for name, v in columns.items()} for i in range(len(points))]
-    # an axis may touch a pole: then cells of other parameters have values
+    # an axis may end at a pole; cells at other parameters then have values
     if faults and (len(points) == 1 or all(domain_faults(model.definition, part) for part in parts)):
         raise SpecError([_sentence(model, fault, columns, n * len(points)) for fault in faults])
 

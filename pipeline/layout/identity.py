@@ -1,4 +1,4 @@
-"""What makes two runs the same run: a digest, and the difference key by key."""
+"""Define when two runs are the same run: by a digest, and by the keys in which they differ."""
 
 from __future__ import annotations
 
@@ -21,18 +21,24 @@ from pipeline.spec.parsing import Spec
 
 _PIPELINE = Path(__file__).parents[1]
 CODE = ("layout.cells", "compute.task")
-"""Modules of the pipeline that decide the numbers of every task; those of refined grids and of products are
-added where they are used. The numerical core and the model have versions of their own."""
+"""Modules of the pipeline that decide the numbers of every task.
+
+Modules for refined grids and for products are added where they are used. The numerical core and the model
+have their own versions.
+
+Modules for refined grids and for products are added where they are used. The numerical core and the model
+have their own versions.
+"""
 
 
 def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
-    """Return all that decides the store's bytes: specification, parameter values, layout, kernel, code.
+    """Return everything that decides the store's bytes: specification, parameters, layout, kernel, code.
 
-    The title and ``[execution]`` are left out; the layout that the latter leads to is in. So are the
-    coordinates as numbers: what a range or a seed stands for.
+    The title and ``[execution]`` are left out; the chunks that follow from ``[execution]`` are included. So
+    is a digest of the coordinates, the numbers that ranges and seeds stand for.
     """
     tables = {k: v for k, v in spec.as_dict().items() if k not in ("title", "execution")}
-    if spec.drive is not None:  # what the file is called does not matter, and its digest speaks for its text
+    if spec.drive is not None:  # the file's name does not matter, and its digest stands for its text
         tables["drive"] = {k: v for k, v in tables["drive"].items() if k not in ("file", "text")}
     return {
         **({} if spec.refine is None else {"refinement": REFINEMENT}),
@@ -48,7 +54,7 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
 
 
 def _coordinates_digest(spec: Spec) -> str:
-    """Digest of the coordinates' names, dims, types and bytes."""
+    """Return a digest of the coordinates' names, dims, types and bytes."""
     digest = hashlib.sha256()
     for coordinate in coordinates(spec):
         values = np.asarray(coordinate.values)
@@ -59,7 +65,7 @@ def _coordinates_digest(spec: Spec) -> str:
 
 
 def code_of(spec: Spec) -> list[str]:
-    """Modules of the pipeline that decide the numbers of a run's tasks."""
+    """Return the modules of the pipeline that decide the numbers of a run's tasks."""
     products = [CELL_PRODUCTS[name].compute.partition(":")[0] for name in spec.products]
     refined = ["compute.refinement"] if spec.refine is not None else []
     walked = ["compute.walking"] if spec.continuation is not None else []
@@ -69,27 +75,27 @@ def code_of(spec: Spec) -> list[str]:
 
 @lru_cache
 def code_version(module: str) -> str:
-    """Digest of the meaning of a module of the pipeline; see `magpend_core.meaning`."""
+    """Return a digest of a module's meaning; see `magpend_core.meaning`."""
     return meaning_digest([_PIPELINE / f"{module.replace('.', '/')}.py"])
 
 
 def canonical(data: Any) -> str:
-    """One text for equal data: sorted keys, shortest numbers that read back the same."""
+    """Return JSON that is equal for equal data: sorted keys, shortest round-trip numbers."""
     return json.dumps(data, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def digest_of(identity: Mapping[str, Any]) -> str:
-    """Digest of an identity, 32 hexadecimal digits."""
+    """Return the digest of an identity, 32 hexadecimal digits."""
     return hashlib.sha256(canonical(_numbers(identity)).encode()).hexdigest()[:32]
 
 
 def _numbers(data: Any) -> Any:
-    """Make ``2`` and ``2.0`` the same, and no two numbers that differ."""
+    """Convert whole floats to int, so that ``2`` and ``2.0`` give one digest; -0.0 stays."""
     if isinstance(data, Mapping):
         return {k: _numbers(v) for k, v in data.items()}
     if isinstance(data, (list, tuple)):
         return [_numbers(v) for v in data]
-    # -0.0 has its own bits, and so have the cells that start there
+    # -0.0 has its own bits, and cells that start there may have other results
     is_minus_zero = data == 0 and isinstance(data, float) and math.copysign(1.0, data) < 0
     return int(data) if isinstance(data, float) and data.is_integer() and not is_minus_zero else data
 

@@ -1,10 +1,10 @@
-"""Letters of attractors: the same in tables and in figures."""
+"""Name attractors by letters, the same in tables and in figures."""
 
 from __future__ import annotations
 
 
 def letter(attractor: int) -> str:
-    """Letter of an id: A to Z, then AA and on; a dash for no attractor."""
+    """Return the letter of an attractor id: A to Z, then AA and so on; a dash for a negative id."""
     if attractor < 0:
         return "-"
     text = ""

@@ -1,4 +1,4 @@
-"""What is too much: refused before anything is computed or created, with what it takes and what there is."""
+"""Refuse runs that are too large before anything is computed or created."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ if TYPE_CHECKING:
     from pipeline.layout.plan import Plan
 
 MOST_TASKS = 100_000
-"""Tasks of a run: beyond, what is known of each takes longer to read than its cells to compute."""
+"""Most tasks of a run. Reading the records of more tasks would take longer than computing their cells."""
 
 MOST_BRANCHES = 10_000_000
-"""Branches of a continuation, of each of which the cube keeps the start as coordinates."""
+"""Most branches of a continuation. The cube keeps the initial state of each as coordinates."""
 
 MOST_CHUNK_BYTES = 2**31 - 1 - 16
-"""What blosc can compress in one piece."""
+"""Most bytes that blosc can compress in one piece."""
 
 FILE_BYTES = 4096
-"""What a file takes on a disk besides its content, at most."""
+"""Most bytes that a file takes on a disk besides its content."""
 
 GO_ON = "MAGPEND_SPACE"
-"""Environment variable; ``0`` lets a run begin for which there may be no room."""
+"""Environment variable; ``0`` lets a run begin although the disk may be too small for it."""
 
 
 def check_plan(plan: Plan) -> None:
@@ -37,7 +37,7 @@ def check_plan(plan: Plan) -> None:
     Raises
     ------
     SpecError
-        With all problems.
+        If there is a problem; the message lists all of them.
     """
     problems = _task_problems(plan) + _chunk_problems(plan)
     if plan.path is not None and plan.shape[-1] > MOST_BRANCHES:
@@ -80,26 +80,28 @@ def _chunk_problems(plan: Plan) -> list[str]:
 
 
 def check_space(plan: Plan, folder: Path | None, n_cells: int | None = None) -> None:
-    """Refuse a run for which there may be no room.
+    """Refuse a run for which the disk may be too small.
 
     Parameters
     ----------
     plan
-        What will be computed.
+        Plan of the run.
     folder
-        The run directory, there or not; None where nobody knows what room there is, as in an object store.
+        The run directory, which need not exist; None where the free space is unknown, as in an object
+        store.
     n_cells
-        Cells that are still to be computed; by default all.
+        Number of cells that are still to be computed; by default all.
 
     Raises
     ------
     SpecError
-        With the bytes, or files, that are needed and that there are. Not where `GO_ON` is ``0``.
+        If bytes or files may be lacking, unless `GO_ON` is ``0``. The message states what is needed and what
+        is free.
 
     Notes
     -----
-    What cells take when compressed is not known before. They take no more than uncompressed, by some bytes
-    a file: that bound counts.
+    The compressed size of cells is not known beforehand. The check uses an upper bound: the uncompressed size
+    and `FILE_BYTES` per file.
     """
     if folder is None or os.environ.get(GO_ON) == "0":
         return
@@ -123,13 +125,13 @@ def check_space(plan: Plan, folder: Path | None, n_cells: int | None = None) -> 
 
 
 def _nearest(folder: Path) -> Path:
-    """Return the folder, or the first above it that is there."""
+    """Return the folder, or its nearest parent that exists."""
     absolute = folder.absolute()
     return next(place for place in (absolute, *absolute.parents) if place.exists())
 
 
 def _free_files(place: Path) -> int | None:
-    """Files for which there is room; None where that is not limited or not known."""
+    """Return the number of files that the disk has room for; None if unlimited or unknown."""
     if not hasattr(os, "statvfs"):
         return None
     found = os.statvfs(place)
@@ -137,7 +139,7 @@ def _free_files(place: Path) -> int | None:
 
 
 def in_words(n_bytes: float) -> str:
-    """Spell a number of bytes."""
+    """Format a number of bytes, such as ``1.5 GB``."""
     units = ["bytes", "kB", "MB", "GB", "TB", "PB"]
     while n_bytes >= 1000 and len(units) > 1:
         n_bytes /= 1000

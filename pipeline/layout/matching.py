@@ -1,7 +1,7 @@
-"""Which cells of one run are cells of another: the same numbers go in, bit for bit. Pure numpy.
+"""Find the cells of one run in another: cells with bitwise equal inputs. Pure numpy.
 
-A cell's result depends on what it is integrated from alone, so a run can take the cells that another holds,
-whatever the axes, starts and tasks of either.
+A cell's result depends on its inputs alone: parameters, initial state, and how it is integrated. A run can
+therefore take over another run's cells, even if their axes, starts and tasks differ.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from pipeline.spec.parsing import Spec
 from pipeline.spec.tables import FREQUENCY
 
 NOWHERE = -1
-"""Place of a cell that a run does not have."""
+"""Index that stands for a cell that the run does not have."""
 
 _CODE = (*CODE, "compute.walking", "compute.recorded", "spec.drives")
 
 
 def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Part of a run's identity that decides how a cell is integrated, whatever it is integrated from.
+    """Return the part of a run's identity that decides how any cell is integrated.
 
-    Left out are the cells (axes, starts, parameters), their layout, what is inferred between them, the number
-    of kept sections, and the products, which have their own conditions.
+    It leaves out the cells themselves (axes, starts, parameters), their layout, the rules of inference
+    between them, the number of kept sections, and the products, which have their own conditions.
     """
     spec = identity["spec"]
     integration = {name: value for name, value in spec["integration"].items() if name != "n_keep"}
@@ -42,21 +42,22 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Return a line for each thing that keeps the cells of one run from being those of another."""
+    """Return the differences that keep cells of two runs from being the same, a line for each."""
     return differences(deciding(old), deciding(new))
 
 
 @dataclass(frozen=True)
 class Way:
-    """The part of its path that a block of a continuation walks.
+    """The path of a continuation, and the part of it that a block covers.
 
     Attributes
     ----------
     direction : str
+        ``"up"`` or ``"down"``.
     values : ndarray
         The whole path, in the order in which it is walked.
     first : int
-        How many points of it come before the block.
+        Number of points on the path before the block.
     """
 
     direction: str
@@ -65,7 +66,7 @@ class Way:
 
 
 def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
-    """Return what a block walks, all in one direction; None in a sweep."""
+    """Return the path of a block's branches, which walk in one direction; None in a sweep."""
     if spec.continuation is None:
         return None
     path, values = _path_of(spec)
@@ -77,7 +78,7 @@ def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
 
 
 def _path_of(spec: Spec) -> tuple[int, np.ndarray]:
-    """Number and values of the axis along which branches walk."""
+    """Return index and values of the axis along which branches walk."""
     assert spec.continuation is not None
     axes = parameter_axes(spec)
     path = [a.parameter for a in axes].index(spec.continuation.path)
@@ -85,15 +86,15 @@ def _path_of(spec: Spec) -> tuple[int, np.ndarray]:
 
 
 class Finder:
-    """Finds cells of a run by what they are integrated from.
+    """A search for cells of a run by their inputs.
 
-    A cell of a walk depends on all that come before it. So those of walks from one initial state are the same
-    up to the first point that differs, and none beyond.
+    A cell of a continuation depends on all cells before it. Two continuations from one initial state
+    therefore agree up to the first parameter value that differs, and nowhere beyond.
 
     Parameters
     ----------
     spec
-        Of the run that has the cells.
+        Specification of the run that has the cells.
     """
 
     def __init__(self, spec: Spec) -> None:
@@ -112,14 +113,14 @@ class Finder:
         self.shape = (*(len(a.values) for a in self._axes), *n_last)
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
-        """Return the flat index in this run of each cell, shape (branch, point), `NOWHERE` if it has it not.
+        """Return each cell's flat index in this run, shape (branch, point), or `NOWHERE`.
 
         Parameters
         ----------
         inputs
-            Branches as they begin, not as they go on in a later block.
+            Branches with the initial states from which they begin, not those of a later block.
         way
-            What they walk; None in a sweep.
+            The path of the branches; None in a sweep.
         """
         n_branches, n_points = inputs.frequency_hz.shape
         here = self._fixed(inputs)
@@ -150,7 +151,7 @@ class Finder:
         return np.where(here, place * n_starts + start[:, None], NOWHERE)
 
     def _fixed(self, inputs: Inputs) -> np.ndarray:
-        """Which branches have this run's values of all that it does not sweep."""
+        """Return which branches have this run's values of all parameters that it does not sweep."""
         swept = {a.parameter for a in self._axes}
         fixed = [i for i, name in enumerate(self._names) if name not in swept]
         here = (_bits(inputs.parameters[:, 0, fixed]) == _bits(self._packed[fixed])).all(axis=1)
@@ -165,14 +166,14 @@ class Finder:
 
 
 def _n_alike(old: np.ndarray, new: np.ndarray) -> int:
-    """Number of points at the begin of two paths that are the same."""
+    """Return the number of leading points that two paths share."""
     n = min(len(old), len(new))
     differ = np.flatnonzero(_bits(old[:n]) != _bits(new[:n]))
     return int(differ[0]) if len(differ) else n
 
 
 class _Grid:
-    """Initial states of a grid."""
+    """The initial states of a grid, searchable."""
 
     def __init__(self, states: InitialStates) -> None:
         self._states = states
@@ -181,7 +182,7 @@ class _Grid:
         return len(self._states)
 
     def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flat index of each state, and whether it is there."""
+        """Return the flat index of each state, and whether the grid contains it."""
         assert self._states.grid is not None
         here = np.ones(len(wanted), bool)
         place = np.zeros(len(wanted), np.int64)
@@ -196,7 +197,7 @@ class _Grid:
 
 
 class _Rows:
-    """Initial states of a list or of samples."""
+    """The initial states of a list or of samples, searchable."""
 
     def __init__(self, states: InitialStates) -> None:
         self._table = states.at(np.arange(len(states)))
@@ -208,26 +209,26 @@ class _Rows:
         return len(self._table)
 
     def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flat index of each state, the first of equal ones, and whether it is there."""
+        """Return the index of each state's first equal row, and whether there is one."""
         place = np.searchsorted(self._marks, _marks(wanted))
         row = self._order[np.minimum(place, len(self._order) - 1)]
-        # a mark that two states share makes the second one absent, never another
+        # if two different states share a mark, the second one is not found; a wrong one is never returned
         return row, (_bits(self._table[row]) == _bits(wanted)).all(axis=1)
 
 
 def _bits(values: Any) -> np.ndarray:
-    """Numbers as they are stored: 0.0 and -0.0 differ, NaN is NaN."""
+    """Return the bit patterns of numbers: 0.0 and -0.0 differ, equal NaN patterns agree."""
     return np.asarray(np.ascontiguousarray(values, np.float64).view(np.int64)).reshape(np.shape(values))
 
 
 def _on_axis(axis: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index of each value on an axis in rising order, and whether it is there."""
+    """Return the index of each value on a rising axis, and whether it is there."""
     step = np.minimum(np.searchsorted(axis, values), len(axis) - 1)
     return step, _bits(axis[step]) == _bits(values)
 
 
 def _marks(rows: np.ndarray) -> np.ndarray:
-    """One number for each row, the same for equal ones."""
+    """Return a hash for each row, equal for equal rows."""
     mark = np.zeros(len(rows), np.uint64)
     for column in _bits(rows).view(np.uint64).T:
         mark = (mark ^ column) * np.uint64(0x9E3779B97F4A7C15)
@@ -236,12 +237,12 @@ def _marks(rows: np.ndarray) -> np.ndarray:
 
 
 def apart(old: Spec, new: Spec) -> list[str]:
-    """Say why two runs that are integrated alike have no cell in common.
+    """Explain why two runs that are integrated alike have no cell in common.
 
     Returns
     -------
     list of str
-        A line for each parameter, and for the starts, of which they share no value.
+        A line for each parameter without a common value, and for the starts if none is common.
     """
     lines = []
     left, right = _swept(old), _swept(new)
@@ -257,7 +258,7 @@ def apart(old: Spec, new: Spec) -> list[str]:
 
 
 def _swept(spec: Spec) -> dict[str, np.ndarray]:
-    """All values of each parameter and of the frequency."""
+    """Return all values of each parameter and of the frequency."""
     hz = np.nan if spec.frequency_hz is None else spec.frequency_hz
     values = {
         FREQUENCY: np.array([hz]),

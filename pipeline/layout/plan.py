@@ -1,11 +1,11 @@
-"""From a specification to a plan: cells, tasks, chunks, bytes, time. Pure: nothing is created.
+"""Turn a specification into a plan: cells, tasks, chunks, bytes, time. Pure: nothing is created.
 
 A task computes a block of cells and owns whole chunks of every variable. The layout follows from the
-specification alone, never from the number of workers, so that a run can be resumed anywhere and its
-files are the same bytes.
+specification alone, never from the number of workers. A run can therefore be resumed anywhere, with the same
+bytes in its files.
 
-A branch of a continuation is walked in tasks one after the other, each from where the one before, its
-predecessor, has left it; what is walked up and what is walked down are different tasks.
+A branch of a continuation is computed by a sequence of tasks. Each begins where its predecessor ended. Upward
+and downward branches are in different tasks.
 """
 
 from __future__ import annotations
@@ -28,23 +28,24 @@ from pipeline.spec.tables import FREQUENCY
 
 MICROSECONDS_PER_PERIOD, MICROSECONDS_PER_SECOND = 9.0, 21.5
 """Rule of thumb for one trajectory on one core at rtol 1e-8: a period of length T takes
-9 us + 21.5 us T/s (measured between 0.1 and 3 Hz on AVX-512, good to 20 %)."""
+9 us + 21.5 us T/s (measured between 0.1 and 3 Hz on AVX-512, good to 20 %).
+"""
 
 MICROSECONDS_PER_INTERVAL = 0.9
-"""Time that a trajectory takes more for each interval of a recorded torque."""
+"""Additional time per trajectory for each interval of a recorded torque."""
 
 RTOL_OF_RULE = 1e-8
 ROOT = 6
-"""The time grows with the sixth root of 1/rtol."""
+"""The time is proportional to (1/rtol)^(1/6)."""
 
 LEAST_LATTICE = 64
-"""Tiles of a refined grid have about this many cells of the first lattice, where 64 MB hold them.
+"""Cells of the first lattice in a tile of a refined grid, about, if 64 MB hold them.
 
-A boundary is followed within a tile, not from one to the next: small tiles overlook more.
+A basin boundary is followed within a tile but not into the next one, so smaller tiles miss more of it.
 """
 
 LANES = 16
-"""Trajectories per task come in multiples of this, so that the kernel's lanes are full."""
+"""Tasks take multiples of this number of trajectories, so that the kernel's lanes are full."""
 
 WANTED_TASKS = 32
 LEAST_SECONDS, MOST_SECONDS = 2.0, 20.0
@@ -54,15 +55,16 @@ TASK_BYTES = 64_000_000
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run will do.
+    """The plan of a run: cells, tasks and chunks, with estimates of size and time.
 
     Attributes
     ----------
     kind : str
+        ``"sweep"`` or ``"continuation"``.
     dims, shape : tuple
-        Cell dims of the cube.
+        Cell dims of the cube, and their sizes.
     path : int or None
-        The dim that branches walk; None in a sweep.
+        Index of the dim that branches walk; None in a sweep.
     block : tuple of int
         Cells of a task, per dim.
     variables : tuple of Variable
@@ -74,9 +76,9 @@ class Plan:
     is_recorded : bool
         Whether the drive is a recording.
     directions : tuple of str
-        Directions in which branches walk, each for an equal part of the branches; none in a sweep.
+        Directions in which branches walk, each for an equal part of the branches; empty in a sweep.
     seconds_at : ndarray or None
-        Estimated time of a cell on one core at each value of the frequency's dim [s], if there is one.
+        Estimated time of a cell on one core at each swept frequency [s]; None if it is not swept.
     """
 
     kind: str
@@ -93,22 +95,22 @@ class Plan:
 
     @property
     def n_cells(self) -> int:
-        """Cells of the cube."""
+        """Number of cells of the cube."""
         return math.prod(self.shape)
 
     @property
     def n_points(self) -> int:
-        """Points per branch; 1 in a sweep."""
+        """Number of points per branch; 1 in a sweep."""
         return 1 if self.path is None else self.shape[self.path]
 
     @property
     def n_tasks(self) -> int:
-        """Tasks of the run."""
+        """Number of tasks of the run."""
         return math.prod(self.task_grid)
 
     @property
     def task_grid(self) -> tuple[int, ...]:
-        """Tasks along each dim."""
+        """Number of tasks along each dim."""
         return tuple(-(-n // b) for n, b in zip(self.shape, self.block, strict=True))
 
     @property
@@ -122,7 +124,7 @@ class Plan:
         return self.n_cells * self.seconds_per_cell
 
     def seconds(self, index: int) -> float:
-        """Estimated time of a task on one core [s]."""
+        """Estimate the time of a task on one core [s]."""
         seconds = self.seconds_per_cell
         if self.seconds_at is not None:
             seconds = float(self.seconds_at[self.task(index)[self.dims.index(FREQUENCY_DIM)]].mean())
@@ -134,7 +136,7 @@ class Plan:
         return tuple(slice(p * b, min((p + 1) * b, n)) for p, b, n in places)
 
     def _place(self, index: int) -> tuple[int, ...]:
-        """Place of a task in the grid of tasks."""
+        """Return the place of a task in the grid of tasks."""
         if not 0 <= index < self.n_tasks:
             raise IndexError(f"task {index} does not exist; there are {self.n_tasks}.")
         places = []
@@ -144,21 +146,21 @@ class Plan:
         return tuple(reversed(places))
 
     def walks_down(self, index: int) -> bool:
-        """Whether the branches of a task walk down."""
+        """Return whether the branches of a task walk down."""
         if self.path is None or not self.directions:
             return False
         first = self._place(index)[-1] * self.block[-1]
         return self.directions[first * len(self.directions) // self.shape[-1]] == "down"
 
     def depth(self, index: int) -> int:
-        """How many tasks come before a task on its walk; 0 in a sweep."""
+        """Return the number of tasks before a task on its walk; 0 in a sweep."""
         if self.path is None:
             return 0
         place = self._place(index)[self.path]
         return self.task_grid[self.path] - 1 - place if self.walks_down(index) else place
 
     def predecessor(self, index: int) -> int | None:
-        """Return the task that leaves the branches where this one takes them up; None if they start here."""
+        """Return the task whose last states this task starts from; None if its branches begin here."""
         if self.path is None or self.depth(index) == 0:
             return None
         stride = math.prod(self.task_grid[self.path + 1 :])
@@ -169,31 +171,31 @@ class Plan:
         return (self.task(i) for i in range(self.n_tasks))
 
     def cells_in(self, index: int) -> int:
-        """Cells of a task."""
+        """Return the number of cells of a task."""
         return math.prod(s.stop - s.start for s in self.task(index))
 
     def chunks(self, variable: Variable) -> tuple[int, ...]:
-        """Chunk shape of a variable: the task's block, cut along the path where it is too large."""
+        """Return the chunk shape of a variable: the task's block, cut along the path if it is too large."""
         sizes = self.sizes
         chunk = list(self.block)
         if self.path is not None:
             n_points = chunk[self.path]
             per_point = math.prod(chunk) // n_points * variable.itemsize(sizes)
             most = max(1, CHUNK_BYTES // per_point)
-            # as few chunks as can be; tasks that follow each other share none
+            # as few chunks as possible; successive tasks share none
             apart = self.task_grid[self.path] > 1
             chunk[self.path] = _part(n_points, most) if apart else _share(n_points, most)
         return (*chunk, *(sizes[d] for d in variable.own_dims))
 
 
 def make_plan(spec: Spec) -> Plan:
-    """Lay out a run.
+    """Plan a run: choose the block of a task, and estimate size and time.
 
-    Tasks take a thirty-second part of the run each, but between 2 and 20 s of one core's time by
-    the rule of thumb, and at most 8 MB in a sweep; always whole multiples of 16 trajectories unless
-    ``execution.trajectories_per_task`` says otherwise. In a refined grid they are tiles: one parameter
-    point, about as many cells along each grid dim, multiples of the stride. In a continuation they are
-    about 16 branches of one direction over so many points that they take that time, none more than 20 s.
+    A task takes a thirty-second part of the run, but between 2 and 20 s of one core by the rule of thumb, and
+    at most 8 MB in a sweep. It has a multiple of 16 trajectories, unless ``execution.trajectories_per_task``
+    is given. In a refined grid a task is a tile: one parameter point, and about equally many cells along each
+    grid dim, in multiples of the stride. In a continuation it is about 16 branches of one direction, over as
+    many points as that time allows, at most 20 s.
     """
     cells = CellMap(spec)
     seconds = _seconds_per_cell(spec)
@@ -221,25 +223,25 @@ def make_plan(spec: Spec) -> Plan:
 
 
 def seconds_per_period(frequency_hz: np.ndarray, rtol: float) -> np.ndarray:
-    """Time of a drive period of one trajectory on one core by the rule of thumb [s]."""
+    """Estimate the time of a drive period of one trajectory on one core [s], by the rule of thumb."""
     microseconds = MICROSECONDS_PER_PERIOD + MICROSECONDS_PER_SECOND / np.asarray(frequency_hz)
     return np.asarray(microseconds * 1e-6 * (RTOL_OF_RULE / rtol) ** (1 / ROOT))
 
 
 def mean_seconds_per_period(spec: Spec) -> float:
-    """`seconds_per_period`, in the mean over the run's frequencies [s]."""
+    """Return the mean of `seconds_per_period` over the run's frequencies [s]."""
     frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else spec.frequency_hz
     return float(np.mean(seconds_per_period(np.asarray(frequency), spec.integration.rtol)))
 
 
 def periods_per_cell(spec: Spec) -> tuple[float, float]:
-    """Most drive periods of a cell's sections, and those of its products in units of their time."""
+    """Return the most drive periods of a cell's sections, and the cost of its products in periods."""
     products = sum(CELL_PRODUCTS[name].cost(options) for name, options in spec.products.items())
     return float(spec.integration.n_transient + spec.integration.n_keep), float(products)
 
 
 def _seconds_at(spec: Spec) -> np.ndarray | None:
-    """Time of a cell at each value of the frequency's axis [s]; None if it is none."""
+    """Return the time of a cell at each swept frequency [s]; None if the frequency is not swept."""
     if FREQUENCY not in spec.axes:
         return None
     frequency = spec.axes[FREQUENCY].array()
@@ -247,7 +249,7 @@ def _seconds_at(spec: Spec) -> np.ndarray | None:
 
 
 def _seconds_per_cell(spec: Spec) -> float:
-    """Mean time of a cell [s]."""
+    """Return the mean time of a cell [s]."""
     periods = sum(periods_per_cell(spec))
     seconds = periods * mean_seconds_per_period(spec)
     if spec.recorded is not None and spec.recorded.kind == TORQUE:
@@ -257,23 +259,23 @@ def _seconds_per_cell(spec: Spec) -> float:
 
 
 def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:
-    """Trajectories per task."""
+    """Return the number of trajectories per task."""
     wanted_seconds = _wanted_seconds(n_cells * seconds_per_cell)
     per_cell = _bytes_per_cell(spec)
     limit = CHUNK_BYTES if n_points == 1 else TASK_BYTES
     n = min(wanted_seconds / (seconds_per_cell * n_points), limit / (per_cell * n_points))
-    # blocks are filled dim by dim, which can take twice as many
+    # blocks are filled dim by dim, which can double the number of tasks
     n = max(n, 2 * n_cells / n_points / MOST_TASKS)
     return max(1, round(n / LANES)) * LANES
 
 
 def _wanted_seconds(core_seconds: float) -> float:
-    """Time of a task of a run that takes so long on one core [s]."""
+    """Return the wanted time of a task for a run of given time on one core [s]."""
     return min(max(core_seconds / WANTED_TASKS, LEAST_SECONDS), MOST_SECONDS)
 
 
 def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float) -> tuple[int, ...]:
-    """Cells of a task of a continuation: branches of one direction, over a part of the path."""
+    """Return the cells of a continuation's task: branches of one direction, over a part of the path."""
     assert spec.continuation is not None
     assert cells.path is not None
     n_points, directions = cells.shape[cells.path], spec.continuation.directions
@@ -281,7 +283,7 @@ def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float
     largest = max(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
     n_seeds = cells.shape[-1] // len(directions)
     if len(directions) > 1:
-        # fewer than such a group would put branches of both directions into one task
+        # any other number would put branches of both directions into one task
         n_seeds = _group(n_seeds, wanted, TASK_BYTES // _bytes_per_cell(spec))
         wanted = max(wanted, n_seeds)
     block = list(_block((*cells.shape[:-1], n_seeds), cells.path, wanted))
@@ -298,23 +300,23 @@ def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float
 
 
 def _group(n_seeds: int, wanted: int, most: int) -> int:
-    """Seeds per task: a divisor near the wanted number, so that no task holds branches of both directions."""
+    """Return the number of seeds per task: a divisor, so that no task has branches of both directions."""
     divisors = [d for d in range(1, min(n_seeds, max(most, 1)) + 1) if n_seeds % d == 0]
     return min(divisors, key=lambda d: (max(d / wanted, wanted / d), -d))
 
 
 def _share(n: int, most: int) -> int:
-    """Size of the parts of `n` things, as few as can be and about equal, of at most `most`."""
+    """Return the size of equal parts of `n`: as few parts as possible, none larger than `most`."""
     return -(-n // -(-n // most))
 
 
 def _part(n: int, most: int) -> int:
-    """Largest size of at most `most` that divides `n`."""
+    """Return the largest divisor of `n` that is at most `most`."""
     return n // next(k for k in range(-(-n // most), n + 1) if n % k == 0)
 
 
 def _bytes_per_cell(spec: Spec) -> int:
-    """Bytes of a cell's variables, uncompressed."""
+    """Return the uncompressed bytes of a cell's variables."""
     sizes = sizes_of(spec.model, spec.products, spec.integration.n_keep)
     return sum(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
 
@@ -332,9 +334,10 @@ def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, 
 
 
 def _tile(shape: tuple[int, ...], stride: int, wanted: int) -> tuple[int, ...]:
-    """Sides of a tile of at most `wanted` cells, if that is possible: multiples of the stride or whole axes.
+    """Return the sides of a tile of at most `wanted` cells if possible: multiples of the stride.
 
-    The least side that can grows first; then the tiles along an axis are made about equal.
+    A side may also be a whole axis. The shortest side that can grow is enlarged first. Then the tiles along
+    an axis are made about equal.
     """
     sides = [min(stride, n) for n in shape]
     while growing := [i for i, n in enumerate(shape) if sides[i] < n]:

@@ -1,7 +1,7 @@
-"""The variables that every cube has, and those of its products, which stand in `pipeline.products`.
+"""Define the variables of a cube: those of every cube, and those of its products.
 
-Every variable has the cell dims of the run (swept parameters, initial conditions or branches) first,
-then its own.
+Every variable has the cell dims of the run first (swept parameters, initial conditions or branches), then its
+own dims. `pipeline.products` declares the variables of products.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FORMAT = 3
 """Version of the run directory's layout."""
 
 REFINEMENT = 1
-"""Version of what is inferred in refined grids (`pipeline.compute.refinement`); part of their identity."""
+"""Version of the inference in refined grids (`pipeline.compute.refinement`), part of their identity."""
 
 
 def base_variables(model: Model) -> tuple[Variable, ...]:
@@ -45,11 +45,11 @@ RETURN_TIME = Variable(
 REST_STATE = Variable(
     "rest_state", ("state",), "float64", math.nan, "", "state in which a cell that does not return was left"
 )
-"""What cubes of sections by crossing have besides."""
+"""Additional variables of cubes whose sections are taken at crossings."""
 
 
 def _counts(periods: str) -> tuple[Variable, ...]:
-    """Numbers of a cell, with the word for its periods."""
+    """Return the variables of a cell's status and counts, with the model's word for its periods."""
     codes = flag_attrs(Status)
     return (
         Variable("status", (), "int8", int(Status.PENDING), "1", "what became of the cell", codes),

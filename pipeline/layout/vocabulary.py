@@ -1,6 +1,6 @@
-"""Names and codes that runs, analyses, tables and figures share, and the model of a dataset.
+"""Define names and codes that runs, analyses, tables and figures share, and find a dataset's model.
 
-Imports no kernel, so that figures need none.
+This module imports no kernel, so that figures need no compiler.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ if TYPE_CHECKING:
     from magpend_core.engine.system import System
 
 FREQUENCY_DIM = "frequency"
-"""Its dim in a cube [Hz]."""
+"""Dim of the drive frequency in a cube [Hz]."""
 
 BRANCH, START = "branch", "initial_condition"
-"""Dims of a continuation's walks, and of starts that are no grid."""
+"""Dims of a continuation's branches, and of starts that are not a grid."""
 
 KINDS = ("absent", "equilibrium", "periodic_orbit", "torus", "chaotic_set", "bounded_set")
 ABSENT, EQUILIBRIUM, PERIODIC_ORBIT, TORUS, CHAOTIC_SET, BOUNDED_SET = range(len(KINDS))
 """Values of `kind`, see `pipeline.analysis.attractors`."""
 
 APERIODIC = (TORUS, CHAOTIC_SET, BOUNDED_SET)
-"""Kinds of sets that sections fill without closing."""
+"""Kinds of sets whose orbits do not close."""
 
 STABILITIES = ("absent", "attracts", "unstable", "transient", "not_settled", "neutral")
 _, ATTRACTS, UNSTABLE, TRANSIENT, NOT_SETTLED, NEUTRAL = range(len(STABILITIES))
-"""Values of `stability`: what has been shown of a set; see `pipeline.analysis.attractors.stability`."""
+"""Values of `stability`; see `pipeline.analysis.attractors.stability`."""
 
 EVIDENCE = ("none", "eigenvalues", "multipliers", "approach", "stayed", "left", "volume")
-"""Values of `evidence`: what the stability of a set rests on."""
+"""Values of `evidence`: the grounds for the stability of a set."""
 
 DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "extended", "at_rest", "diverges")
 UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES = range(len(DECISIONS))
@@ -53,28 +53,28 @@ UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES =
 ) = Status  # fmt: skip
 
 FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, NO_RETURN, CHATTER)
-"""What became of cells that could not be integrated to the end."""
+"""Status of cells that could not be integrated to the end."""
 
 _GRID_SUFFIX = "_0"
 
 
 def grid_dim(state: str) -> str:
-    """Dim of a grid of initial values of a state."""
+    """Return the dim of a grid of initial values of a state."""
     return f"{state}{_GRID_SUFFIX}"
 
 
 def is_grid_dim(dim: str) -> bool:
-    """Whether a cube's dim is one of a grid of initial states."""
+    """Return whether a cube's dim belongs to a grid of initial states."""
     return dim.endswith(_GRID_SUFFIX)
 
 
 def is_start_dim(dim: str) -> bool:
-    """Whether a cube's dim tells the cells of one parameter point apart."""
+    """Return whether a cube's dim numbers the cells at one parameter point."""
     return dim in (BRANCH, START) or is_grid_dim(dim)
 
 
 def start_dims(dims: Iterable[object]) -> tuple[str, ...]:
-    """Return those of a cube's dims that tell the cells of one parameter point apart."""
+    """Return the dims of a cube that number the cells at one parameter point."""
     return tuple(str(d) for d in dims if is_start_dim(str(d)))
 
 
@@ -85,12 +85,12 @@ def split_dims(cells: xr.DataArray) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def axis_name(parameter: str) -> str:
-    """Name of a parameter's axis in a cube; both names of the frequency are understood."""
+    """Return the dim of a parameter in a cube; both names of the frequency are accepted."""
     return FREQUENCY_DIM if parameter in (FREQUENCY, FREQUENCY_DIM) else parameter
 
 
 def parameter_name(axis: str) -> str:
-    """Name in a specification of what an axis of a cube sweeps."""
+    """Return the specification's name of the parameter that a cube's axis sweeps."""
     return FREQUENCY if axis in (FREQUENCY, FREQUENCY_DIM) else axis
 
 
@@ -101,14 +101,14 @@ def model_attribute(model: Model) -> str:
 
 
 def model_of(ds: xr.Dataset) -> Model:
-    """Return the model of a cube, or of what was derived from it, by its attribute ``model``.
+    """Return the model of a cube or of a dataset derived from it, by its attribute ``model``.
 
-    Seen through its section, if the attributes ``section_...`` name one.
+    If the attributes ``section_...`` name a section by crossing, the model has that section.
 
     Raises
     ------
     ModelError
-        If it is none. Nothing is imported: of a Python object the description is enough to draw.
+        If the attribute names no model. A Python object is not imported: its description suffices to draw.
     """
     model = load_model(str(ds.attrs.get("model", DEFAULT)))
     of = ds.attrs.get(f"{_SECTION}of")
@@ -119,18 +119,18 @@ def model_of(ds: xr.Dataset) -> Model:
 
 
 _SECTION = "section_"
-"""Beginning of the names of attributes that tell a section by crossing."""
+"""Prefix of the attributes that describe a section by crossing."""
 
 
 def section_attributes(crossing: Crossing | None) -> dict[str, Any]:
-    """Attributes of a dataset that tell its section; `model_of` reads them."""
+    """Return the attributes that describe a dataset's section; `model_of` reads them."""
     if crossing is None:
         return {}
     return {f"{_SECTION}{key}": value for key, value in asdict(crossing).items()}
 
 
 def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return those of a dataset's attributes that tell what was integrated."""
+    """Return a dataset's attributes that describe what was integrated: model, parameters, section."""
     return {
         str(key): value
         for key, value in attrs.items()
@@ -139,14 +139,14 @@ def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
-    """Drive frequency at a parameter point [Hz], NaN if nothing tells.
+    """Return the drive frequency at a parameter point [Hz]; NaN if it is unknown.
 
-    Of a flow seen at crossings it is one over the longest wait for the next: what the engine takes for it.
+    For a flow with sections at crossings it is one over the longest time between crossings, as in the engine.
 
     Parameters
     ----------
     model
-        What is integrated.
+        Model that is integrated.
     values
         Coordinates of the point by name.
     """
@@ -156,12 +156,12 @@ def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
 
 
 def parameters_of(ds: xr.Dataset) -> Parameters:
-    """Return the parameters of a run, by its attribute ``parameters``: a line ``name = value`` for each.
+    """Return the parameters of a run by its attribute ``parameters``: a line ``name = value`` for each.
 
     Raises
     ------
     ValueError
-        If they are not there, or not those of the model.
+        If the attribute is missing, or its names are not the model's parameters.
     """
     lines = str(ds.attrs.get("parameters", "")).splitlines()
     values = {name.strip(): float(value) for name, _, value in (line.partition("=") for line in lines)}
@@ -171,5 +171,5 @@ def parameters_of(ds: xr.Dataset) -> Parameters:
 
 
 def system_of(ds: xr.Dataset) -> System:
-    """Return what the engine integrated; imports the compiler."""
+    """Return the system that the engine integrated; this imports the compiler."""
     return model_of(ds).system

@@ -1,4 +1,4 @@
-"""Words for what sections are taken at: the same in cubes, tables and figures."""
+"""Name the periods and sections of a model, the same in cubes, tables and figures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from magpend_core.models.model import Model
 
 
 def period_of(model: Model | None) -> str:
-    """What passes between two sections of a model: a drive period, a return, a strobe period."""
+    """Return the word for the time between two sections: drive period, return or strobe period."""
     if model is None:
         return "drive period"
     if model.crossing is not None:
@@ -15,17 +15,17 @@ def period_of(model: Model | None) -> str:
 
 
 def periods_of(model: Model | None) -> str:
-    """The same, several of them."""
+    """Return the plural of `period_of`."""
     return f"{period_of(model)}s"
 
 
 def section_name(model: Model | None) -> str:
-    """What the section is called: stroboscopic, or Poincare's."""
+    """Return the name of a model's section: stroboscopic or Poincar\u00e9."""
     return "stroboscopic section" if model is None or model.crossing is None else "Poincar\u00e9 section"
 
 
 def once(model: Model | None) -> str:
-    """What a dot of the section stands for."""
+    """Return the meaning of a dot of the section, such as "once per drive period"."""
     if model is None or model.crossing is None:
         return f"once per {period_of(model)}"
     return f"crossing of {model.crossing.sentence}"

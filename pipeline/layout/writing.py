@@ -1,4 +1,4 @@
-"""Files written whole: no link is followed, and an error names the file and what to do."""
+"""Write files whole. No link is followed, and an error names the file and the remedy."""
 
 from __future__ import annotations
 
@@ -35,15 +35,18 @@ _REMEDIES = {
 
 
 class NoFileError(FileNotFoundError):
-    """Something that is no plain file is where a file should be; the message is why."""
+    """An error for anything but a plain file where a file should be; the message says why."""
 
 
 class LinkError(NoFileError):
-    """A link is where a file should be; it is not followed."""
+    """An error for a link where a file should be."""
 
 
 class WritingError(OSError):
-    """A file could not be written; the message names it, the cause and the remedy. `errno` is the cause's."""
+    """An error for a file that could not be written; the message names file, cause and remedy.
+
+    `errno` is the cause's.
+    """
 
     def __str__(self) -> str:
         return str(self.strerror)
@@ -51,7 +54,7 @@ class WritingError(OSError):
 
 @contextlib.contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """Turn an error of the file system into one that names what was written, and the remedy.
+    """Turn a file system error into one that names the file and the remedy.
 
     Raises
     ------
@@ -77,21 +80,21 @@ def writing(path: Path | str) -> Iterator[None]:
 
 
 def open_plain(path: Path, mode: str, **options: Any) -> IO[Any]:
-    """Open a plain file. A link is not followed; a folder, a pipe or a device is not opened.
+    """Open a plain file. Links are not followed; folders, pipes and devices are refused.
 
     Parameters
     ----------
     path, mode, options
-        As for `open`.
+        Arguments of `open`.
 
     Raises
     ------
     LinkError
-        If a link is there.
+        If the path is a link.
     NoFileError
-        If something else than a plain file is there.
+        If the path is anything else but a plain file.
     FileNotFoundError
-        If nothing is there.
+        If the path does not exist.
     """
     return open(path, mode, opener=_open_plain, **options)
 
@@ -116,12 +119,12 @@ def _open_plain(path: str, flags: int) -> int:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file so that after a crash it is there whole or not at all; a link at its place is replaced.
+    """Write a file that is whole or absent after a crash; a link at its place is replaced.
 
     Raises
     ------
     WritingError
-        If it cannot be written.
+        If the file cannot be written.
     """
     temporary = temporary_beside(path)
     with writing(path):
@@ -139,12 +142,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def temporary_beside(path: Path) -> Path:
-    """A name that nobody else has, in the same folder."""
+    """Return a unique temporary name in the same folder."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
 
 
 def sync_folder(path: Path) -> None:
-    """Have a folder's entries on the disk."""
+    """Make a folder's entries durable."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -153,7 +156,7 @@ def sync_folder(path: Path) -> None:
 
 
 def write_netcdf(path: Path, ds: xr.Dataset) -> None:
-    """Write a dataset as NetCDF, as `write_atomically` does."""
+    """Write a dataset as NetCDF, whole or not at all."""
     write_atomically(path, netcdf_bytes(ds))
 
 

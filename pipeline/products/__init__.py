@@ -1,1 +1,1 @@
-"""What a run computes of its cells, and what analyses find in a cube; kept in ``derived/``."""
+"""Declare what a run computes of its cells, and what analyses and figures compute from a cube."""

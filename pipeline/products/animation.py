@@ -1,4 +1,4 @@
-"""Options of animations: the point of a run, how fast, for how long, and how large."""
+"""Define the options of animations: parameter point, speed, length, size."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from pipeline.products.attractors import AttractorOptions
 from pipeline.products.product import option
 
 MOST_FRAMES = 5000
-"""Frames of the longest film: some minutes of drawing, some hundred megabytes as GIF."""
+"""Most frames of a film; it takes some minutes to draw, and some hundred megabytes as GIF."""
 
 
 class AnimationOptions(AttractorOptions):
-    """What an animation shows of a run, and its clock."""
+    """Options of an animation of a run."""
 
-    at: dict[str, float] = option({}, "Value of an axis of the run: the parameter point that is shown.")
-    nearest: bool = option(False, "Take the nearest values that the axes have for --at, and say which.")
-    degrees: bool = option(False, "Degrees instead of radians.")
+    at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point to show.")
+    nearest: bool = option(False, "Use the axes' values nearest to --at, and print them.")
+    degrees: bool = option(False, "Use degrees instead of radians.")
     portrait: str = option("", "State whose phase portrait is shown.")
     seconds: float = option(8.0, "Length of the film.", unit="s", gt=0.0, le=600.0)
     fps: float = option(25.0, "Frames per second.", unit="1/s", gt=0.0, le=120.0)
-    speed: float | None = option(None, "Seconds of the model in a second of film.", gt=0.0)
+    speed: float | None = option(None, "Seconds of the model per second of film.", gt=0.0)
     size: int = option(800, "Width of a frame.", unit="pixels", ge=200, le=4000)

@@ -1,4 +1,4 @@
-"""Attractors, where going up and down differ, and which sets stay."""
+"""Declare the analyses of attractors, hysteresis, and sets that do not close."""
 
 from __future__ import annotations
 
@@ -10,39 +10,42 @@ _ROOM = "pipeline.analysis.attractors.product"
 
 
 class IdentifyOptions(Options):
-    """How attractors are found."""
+    """Options for finding attractors."""
 
     tolerance: float = option(
         0.0,
-        "Distance, in units of the states' scales, within which a closed cell belongs to an orbit; 0 takes "
+        "Largest distance of a closed cell from its orbit, in units of the states' scales; 0 stands for "
         "ten times the run's closure tolerance, at least 1e-4.",
         ge=0.0,
     )
     polish: bool = option(True, "Refine orbits by Newton's method, which integrates a point per orbit.")
-    residual: float = option(1e-10, "Scaled residual that Newton's method is to reach.", gt=0.0)
+    residual: float = option(1e-10, "Scaled residual at which Newton's method has converged.", gt=0.0)
     max_orbit_period: int = option(
-        32, "Longest period looked for in cells that are not closed.", unit="drive periods or returns", ge=1
+        32,
+        "Longest orbit period that is sought in cells that are not closed.",
+        unit="drive periods or returns",
+        ge=1,
     )
     n_points: int = option(64, "Section points stored per attractor.", ge=1)
     mirror_threshold: float = option(0.3, "Largest distance of a mirror partner from the image.", gt=0.0)
     extend: bool = option(
-        True, "Extend samples of the cells that no orbit accounts for, to show what they are on."
+        True, "Extend the integration of sample cells that are on no known orbit, to find their sets."
     )
     budget: float = option(
         1.0,
-        "Longest extension at a parameter point, in units of what the run itself integrated there.",
+        "Longest extension at a parameter point, in units of the run's own integration there.",
         ge=0.0,
     )
-    n_sample: int = option(32, "Cells of the first sample that is extended.", ge=1)
+    n_sample: int = option(32, "Number of cells in the first sample that is extended.", ge=1)
     lifetime_confidence: float = option(0.95, "Level of the intervals of lifetimes.", gt=0.0, lt=1.0)
 
     @property
     def effort(self) -> tuple[float, int]:
-        """Budget of the extension and sample, 0 without one: of two results the larger knows more."""
+        """Budget and sample of the extension, zeros without it; the larger of two efforts knows more."""
         return (self.budget, self.n_sample) if self.extend and self.budget else (0.0, 0)
 
     def with_effort(self, effort: tuple[float, int]) -> Self:
-        """Return the same options with another budget of the extension and another sample."""
+        """Return the same options with another budget and sample of the extension."""
         budget, n_sample = effort
         if not budget:
             return self.model_copy(update={"extend": False})
@@ -50,19 +53,19 @@ class IdentifyOptions(Options):
 
 
 class AttractorOptions(IdentifyOptions):
-    """How attractors are found, and how their ids are carried along the axes."""
+    """Options for finding attractors, and for matching their ids along the axes."""
 
-    threshold: float = option(0.3, "Matching: largest distance between appearances of one id.", gt=0.0)
+    threshold: float = option(0.3, "Matching: largest distance between sets with one id.", gt=0.0)
     look_back: int = option(3, "Matching: steps over which an id is remembered.", ge=1)
     connect: bool = option(
         True,
-        "Matching: follow closed orbits along the axes, which integrates; without it, ids rest on distance.",
+        "Matching: follow closed orbits along the axes by integration; otherwise match by distance.",
     )
 
 
 IDENTIFIED = Analysis(
     "identified",
-    "Attractors of each parameter point by itself.",
+    "Find the attractors of each parameter point on its own.",
     IdentifyOptions,
     compute=f"{_ROOM}:identified",
 )
@@ -71,9 +74,9 @@ ATTRACTORS = Analysis(
     "attractors",
     """Find the attractors at every parameter point, show that they attract, and follow them along the axes.
 
-    A table per parameter point, or with more than six points a line per attractor with the range in
-    which it exists. Cells that no orbit accounts for are extended, at most for as long as the run took.
-    Shares are those of the cells that end on attractors, with 95 % intervals.""",
+    Prints a table per parameter point, or with more than six points a line per attractor with the
+    range in which it exists. Cells on no known orbit are integrated further, at most as long as in the
+    run itself. Basin fractions are fractions of the cells that end on attractors, with 95 % intervals.""",
     AttractorOptions,
     compute=f"{_ROOM}:attractors",
     table="pipeline.analysis.attractors.table:attractors_table",
@@ -83,7 +86,7 @@ ATTRACTORS = Analysis(
 
 HYSTERESIS = Analysis(
     "hysteresis",
-    "Say where a continuation meets other attractors going up than going down, and where it jumps.",
+    "List where a continuation follows different attractors upwards and downwards, and where it jumps.",
     AttractorOptions,
     compute="pipeline.analysis.attractors.hysteresis_product:hysteresis",
     table="pipeline.analysis.attractors.hysteresis_table:hysteresis_table",
@@ -94,10 +97,11 @@ HYSTERESIS = Analysis(
 
 SETTLING = Analysis(
     "settling",
-    """Print what was shown of each set that does not close: does it stay, or do its cells leave, where to?
+    """List each set that does not close: whether its cells stay or leave, and where they go.
 
-    With --budget a larger sample of it is integrated for longer; what is found then holds for all analyses of
-    the run. Lifetimes are in drive periods or returns.""",
+    With --budget a larger sample is integrated for longer; the result then counts for all analyses of
+    the run.
+    Transient lifetimes are in drive periods or returns.""",
     AttractorOptions,
     compute="pipeline.analysis.attractors.settling_product:settling",
     table="pipeline.analysis.attractors.settling_table:settling_table",

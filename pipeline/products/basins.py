@@ -1,4 +1,4 @@
-"""Basins of attraction of a sweep and their numbers."""
+"""Declare the analysis of basins of attraction."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _ROOM = "pipeline.analysis.basins.product"
 
 
 class BasinOptions(AttractorOptions):
-    """How basins are measured."""
+    """Options for measuring basins."""
 
     interval: Literal["wilson", "clopper-pearson"] = option("wilson", "Confidence interval of the fractions.")
     confidence: float = option(0.95, "Level of all intervals.", gt=0.0, lt=1.0)
     box: int = option(5, "Basin entropy: side of the boxes.", unit="cells", ge=2)
-    block: int = option(1, "Basin entropy: side of the squares of boxes that the bootstrap draws.", ge=1)
+    block: int = option(1, "Basin entropy: side of the bootstrap's blocks, in boxes.", ge=1)
     scaling: Literal["perturbation", "boxes", "entropy"] = option(
-        "perturbation", "Uncertainty exponent: what scales."
+        "perturbation", "Uncertainty exponent: scaling that is fitted."
     )
     radius: int = option(1, "Wada test: radius of the fattened boundary.", unit="cells", ge=1)
     metric: Literal["taxicab", "chessboard"] = option("taxicab", "Wada test: distance between cells.")

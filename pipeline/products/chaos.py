@@ -1,4 +1,4 @@
-"""Regular or chaotic: exponents, dimensions, the 0-1 test."""
+"""Declare the analyses of chaos: exponents, dimensions, 0-1 test."""
 
 from __future__ import annotations
 
@@ -9,36 +9,38 @@ _ROOM = "pipeline.analysis.chaos.product"
 
 
 class ChaosOptions(AttractorOptions):
-    """When motion counts as chaotic."""
+    """Options for telling regular from chaotic motion."""
 
-    n_sigma: float = option(3.0, "Standard errors by which an exponent differs from 0.", gt=0.0)
-    least: float = option(0.005, "Least modulus of an exponent that differs from 0.", unit="1/s", ge=0.0)
+    n_sigma: float = option(3.0, "Number of standard errors by which an exponent must differ from 0.", gt=0.0)
+    least: float = option(0.005, "Least modulus of an exponent that counts as nonzero.", unit="1/s", ge=0.0)
     n_frequencies: int = option(100, "0-1 test: number of frequencies.", ge=10)
-    stride: int = option(1, "0-1 test: use every so many-th section.", ge=1)
+    stride: int = option(1, "0-1 test: step between the sections that are used.", ge=1)
     seed: int = option(0, "0-1 test: seed of the frequencies.", ge=0)
     n_max: int = option(
         2000,
-        "Most section points of a correlation dimension; 0 leaves it out.",
+        "Most section points for the correlation dimension; 0 computes none.",
         ge=0,
     )
 
 
 class DimensionOptions(AttractorOptions):
-    """How a correlation dimension is fitted."""
+    """Options for fitting a correlation dimension."""
 
-    at: dict[str, float] = option({}, "Value of a swept parameter; by default all its values.")
-    theiler: int = option(1, "Pairs of sections at most so far apart in time are left out.", ge=0)
-    n_max: int = option(10_000, "Most section points used of an attractor.", ge=100)
-    floor: float = option(1e-6, "Distance, in units of the states' scales, that is not resolved.", gt=0.0)
+    at: dict[str, float] = option({}, "Value of a swept parameter; by default all values.")
+    theiler: int = option(
+        1, "Theiler window: pairs of sections at most so far apart in time are left out.", ge=0
+    )
+    n_max: int = option(10_000, "Most section points of an attractor.", ge=100)
+    floor: float = option(1e-6, "Smallest resolved distance, in units of the states' scales.", gt=0.0)
 
 
 CHAOS = Analysis(
     "chaos",
     """Tell regular from chaotic attractors: exponents, multipliers, dimensions, 0-1 test.
 
-    A line per attractor, or with more than six points the ranges in which each kind of motion occurs.
-    Exponents of orbits are those of their multipliers; those of other sets need [products] lyapunov in the
-    run's specification, the 0-1 test 200 sections.""",
+    Prints a line per attractor, or with more than six points the ranges in which each kind of motion
+    occurs. Exponents of orbits follow from their multipliers. Exponents of other sets need [products]
+    lyapunov in the run's specification. The 0-1 test needs 200 sections.""",
     ChaosOptions,
     compute=f"{_ROOM}:chaos",
     table="pipeline.analysis.chaos.table:chaos_table",
@@ -51,8 +53,9 @@ DIMENSION = Analysis(
     "dimension",
     """Measure the correlation dimension of each set that attracts and does not close.
 
-    A sample of each is run on first, as `settling` does: transients and motions that are still closing have
-    no dimension. Takes seconds per point, and thousands of sections for two digits.""",
+    A sample of each set is integrated further first, as in `settling`, since transients and motions that
+    are still closing have no dimension. This takes seconds per parameter point. Two digits need thousands
+    of sections.""",
     DimensionOptions,
     compute=f"{_ROOM}:dimension",
     table="pipeline.analysis.chaos.table:dimension_table",

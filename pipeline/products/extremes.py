@@ -1,4 +1,4 @@
-"""The product ``extremes``: minimum, maximum and mean of named quantities over each kept drive period."""
+"""Declare the product ``extremes``: minimum, maximum and mean of quantities over each kept drive period."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KINDS = ("min", "max", "mean")
 
 
 class ExtremesOptions(Options):
-    """``[products] extremes = {...}``."""
+    """Options of ``[products] extremes``."""
 
     quantities: tuple[str, ...] = option(
         help="Names of quantities and states of the model, such as an energy.", min_length=1, strict=False

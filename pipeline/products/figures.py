@@ -1,4 +1,4 @@
-"""The figures: what each shows, and its options. They are drawn in `pipeline.plots`."""
+"""Declare the figures and their options; `pipeline.plots` draws them."""
 
 from __future__ import annotations
 
@@ -13,105 +13,113 @@ Per = Literal["s", "period"]
 
 
 def _without(options: FigureOptions, name: str) -> str:
-    """The label of options as if one of them were as by default."""
+    """Return the label of options with one of them at its default."""
     return FigureOptions.label(options.model_copy(update={name: ""}))
 
 
 class BifurcationOptions(StateOptions):
-    """A bifurcation diagram."""
+    """Options of a bifurcation diagram."""
 
     quantity: str = option(
         "",
-        "Instead of a state at the sections, a quantity over each kept period: NAME.min, NAME.max or "
-        "NAME.mean; the run needs the product extremes.",
+        "Quantity over each kept period instead of a state: NAME.min, NAME.max or NAME.mean; the run needs "
+        "the product extremes.",
     )
-    layout: Literal["overlay", "side"] = option("overlay", "Both directions in one panel, or a panel each.")
+    layout: Literal["overlay", "side"] = option("overlay", "Both directions in one panel, or one panel each.")
 
     def label(self) -> str:
-        """What the file's name says; no state where a quantity is drawn."""
+        """Return the label for the file's name; without the state if a quantity is drawn."""
         return super().label() if not self.quantity else _without(self, "state")
 
 
 class SectionOptions(AttractorOptions, StateOptions):
-    """Section points of one parameter point."""
+    """Options of a figure of section points at one parameter point."""
 
-    against: str = option("", "State that is drawn upwards; by default the rate of the other, or the next.")
+    against: str = option(
+        "", "State on the vertical axis; by default the other state's rate, or the next state."
+    )
     colour: Literal["motion", "attractor"] = option(
-        "motion", "What has a colour: the kind of motion, or each attractor, which are found first."
+        "motion", "Colour by class of motion, or by attractor; attractors are computed first."
     )
 
 
 class AttractorFigureOptions(AttractorOptions, FigureOptions):
-    """A figure of the attractors at one parameter point."""
+    """Options of a figure of the attractors at one parameter point."""
 
 
 class BasinFigureOptions(AttractorFigureOptions):
-    """A figure of basins."""
+    """Options of a figure of basins."""
 
-    shade: bool = option(False, "Darken what took longer to converge.")
+    shade: bool = option(False, "Darken cells that took longer to converge.")
 
 
 class CoexistingOptions(AttractorOptions, StateOptions):
-    """All attractors over a parameter."""
+    """Options of a figure of all attractors over a parameter."""
 
 
 class RegimeOptions(AttractorFigureOptions):
-    """A map of two parameters."""
+    """Options of a map over two parameters."""
 
-    show: Literal["periods", "attractors", "number"] = option("periods", "What is told apart.")
+    show: Literal["periods", "attractors", "number"] = option("periods", "Property that is coloured.")
 
 
 class LyapunovFigureOptions(StateOptions):
-    """Exponents over a parameter, or as a map."""
+    """Options of a figure of exponents over a parameter, or as a map."""
 
-    spectrum: bool = option(False, "All stored exponents, not the largest alone.")
-    as_map: bool = option(False, "A map over two parameters instead of a diagram over one.", flag="--map")
+    spectrum: bool = option(False, "Draw all stored exponents, not only the largest.")
+    as_map: bool = option(
+        False, "Draw a map over two parameters instead of a diagram over one.", flag="--map"
+    )
     per: Per = option("s", "Exponents per second, or per drive period or return.")
 
     def label(self) -> str:
-        """What the file's name says; no state on a map."""
+        """Return the label for the file's name; without the state on a map."""
         return _without(self, "state") if self.as_map else super().label()
 
 
 class ConvergenceOptions(FigureOptions):
-    """How exponents converge."""
+    """Options of a figure of the convergence of exponents."""
 
-    exponent: int = option(1, "Which exponent, 1 the largest.", ge=1)
+    exponent: int = option(1, "Index of the exponent; 1 is the largest.", ge=1)
     per: Per = option("s", "Exponents per second, or per drive period or return.")
 
 
 class DimensionFigureOptions(DimensionOptions, FigureOptions):
-    """A correlation sum and its fit."""
+    """Options of a figure of a correlation sum and its fit."""
 
 
 class _AlongOptions(BranchOptions, FigureOptions):
     """Options of a figure along a parameter."""
 
     def label(self) -> str:
-        """What the file's name says; the drive's frequency goes without saying."""
+        """Return the label for the file's name; without the parameter if it is the frequency."""
         return _without(self, "parameter") if self.parameter == "frequency_hz" else super().label()
 
 
 class BranchFigureOptions(_AlongOptions, StateOptions):
-    """Branches over a diagram."""
+    """Options of a figure of branches over a diagram."""
 
-    over: str = option("", "Run over the same parameter that is drawn below; by default DIR.")
-    shown: int | None = option(None, "Longest period drawn.", unit="drive periods or returns", ge=1)
+    over: str = option(
+        "", "Run whose diagram is drawn below; it must sweep the same parameter. By default DIR."
+    )
+    shown: int | None = option(
+        None, "Longest orbit period that is drawn.", unit="drive periods or returns", ge=1
+    )
 
 
 class MultiplierOptions(_AlongOptions):
-    """Multipliers along a branch."""
+    """Options of a figure of multipliers along a branch."""
 
-    branch: int = option(0, "Number of the branch, as in the table.", ge=0)
+    branch: int = option(0, "Index of the branch, as in the table.", ge=0)
 
 
 class CurveFigureOptions(CurveOptions, _AlongOptions):
-    """Curves of bifurcations."""
+    """Options of a figure of bifurcation curves."""
 
 
 BIFURCATION = Figure(
     "bifurcation",
-    "Draw a bifurcation diagram: motions over the swept parameter, in the colours of their class.",
+    "Draw a bifurcation diagram: section points over the swept parameter, coloured by class of motion.",
     BifurcationOptions,
     "pipeline.plots.bifurcation:draw",
 )
@@ -120,7 +128,7 @@ SECTION = Figure(
     "section",
     """Draw the section of one parameter point in the plane of two states.
 
-    Parts of it with --xlim and --ylim; many points are counted on pixels.""",
+    Choose a part with --xlim and --ylim. Many points are drawn as counts per pixel.""",
     SectionOptions,
     "pipeline.plots.section:draw",
 )
@@ -136,14 +144,14 @@ GALLERY = Figure(
     "gallery",
     """Draw the attractors of one parameter point: phase portraits, and the model's own drawing of the path.
 
-    Integrates one period of each, for the portraits.""",
+    One period of each attractor is integrated for the portraits.""",
     AttractorFigureOptions,
     "pipeline.plots.gallery:draw",
 )
 
 BASINS = Figure(
     "basins",
-    "Draw basins of attraction: which attractor each initial state of a grid ends on.",
+    "Draw basins of attraction: the attractor on which each initial state of a grid ends.",
     BasinFigureOptions,
     "pipeline.plots.basins:draw",
 )
@@ -157,7 +165,7 @@ FRACTIONS = Figure(
 
 REGIMES = Figure(
     "regimes",
-    "Draw a map of two swept parameters: which periods or attractors coexist, or how many.",
+    "Draw a map of two swept parameters: coexisting periods or attractors, or their number.",
     RegimeOptions,
     "pipeline.plots.regimes:draw",
 )
@@ -171,7 +179,7 @@ LYAPUNOV = Figure(
 
 CONVERGENCE = Figure(
     "convergence",
-    "Draw how the Lyapunov exponents of the cells of one parameter point converge.",
+    "Draw the convergence of the Lyapunov exponents of the cells at one parameter point.",
     ConvergenceOptions,
     "pipeline.plots.convergence:draw",
 )

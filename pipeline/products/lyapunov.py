@@ -1,4 +1,4 @@
-"""The product ``lyapunov``: exponents along each cell's attractor, from its last kept section on."""
+"""Declare the product ``lyapunov``: exponents along each cell's attractor, from its last kept section."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from pipeline.products.product import CellProduct, Options, option
 from pipeline.products.variable import Variable, flag_attrs
 
 TANGENT_COST, MORE_COST, FEW = 2.0, 1.8, 4
-"""Cost of a period with up to `FEW` tangent vectors in units of one without, and of each vector beyond them.
+"""Cost of a period with up to `FEW` tangent vectors, and of each further vector, in plain periods.
 
 Measured with the pendulum (1.6 for one vector, 2 for all four) and with Lorenz-96 (16 for 12, 73 for 40).
 """
 
 
 class LyapunovOptions(Options):
-    """``[products] lyapunov = {...}``."""
+    """Options of ``[products] lyapunov``."""
 
     n_exponents: int | None = option(
-        None, "Exponents, from the largest on; by default one for each state.", ge=1
+        None, "Number of exponents, from the largest on; by default one for each state.", ge=1
     )
     n_transient: int = option(
-        200, "Time in which the tangent vectors turn into their directions.", unit="drive periods or returns",
+        200, "Time in which the tangent vectors align.", unit="drive periods or returns",
         ge=0, le=1_000_000,
     )  # fmt: skip
     n_periods: int = option(
         400, "Time over which growth is averaged.", unit="drive periods or returns", ge=2, le=100_000_000
     )
-    n_blocks: int = option(16, "Blocks of that time, for standard errors.", ge=2, le=1000)
+    n_blocks: int = option(16, "Number of blocks of that time, for standard errors.", ge=2, le=1000)
 
     @model_validator(mode="after")
     def _whole_blocks(self) -> Self:
@@ -45,7 +45,7 @@ class LyapunovOptions(Options):
 
 
 class LyapunovFlag(IntEnum):
-    """How far a cell's Lyapunov exponents can be trusted."""
+    """The trust in a cell's Lyapunov exponents."""
 
     ABSENT = 0
     GOOD = 1
@@ -55,7 +55,7 @@ class LyapunovFlag(IntEnum):
 
     @property
     def sentence(self) -> str:
-        """What it means."""
+        """Meaning of the flag."""
         return _FLAG_SENTENCES[self]
 
 

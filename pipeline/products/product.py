@@ -1,8 +1,8 @@
-"""The product door: what a run can compute of its cells, find in its cube, or draw.
+"""Define products: what a run can compute of its cells, find in its cube, or draw.
 
-A product is a declaration: one model of its options, a line of help, and the names of the functions that
-do the work as ``"module:function"``, imported when they are called. So the command line, the specification
-and the reference pages read what there is without importing any of it. `pipeline.products.registry` lists
+A product is a declaration: a model of its options, a line of help, and the names of its functions as
+``"module:function"``. A function is imported when it is called. The command line, the specification and the
+reference pages can therefore list products without importing their code. `pipeline.products.registry` lists
 the products by name.
 """
 
@@ -21,7 +21,7 @@ from pipeline.products.variable import Variable
 
 FILE_FORMATS = ("png", "pdf", "svg")
 COLUMN_MM = 85.0
-"""Width of a journal's column."""
+"""Width of a journal's column [mm]."""
 
 
 def option(default: Any = ..., help: str = "", *, unit: str = "", flag: str = "", **bounds: Any) -> Any:
@@ -30,7 +30,7 @@ def option(default: Any = ..., help: str = "", *, unit: str = "", flag: str = ""
     Parameters
     ----------
     default
-        ``...`` makes the option a required one.
+        Default value; ``...`` makes the option required.
     help
         One sentence, without the unit.
     unit
@@ -38,23 +38,23 @@ def option(default: Any = ..., help: str = "", *, unit: str = "", flag: str = ""
     flag
         Name on the command line if it is not the field's own, such as ``--from``.
     bounds
-        ``ge``, ``gt``, ``le``, ``lt``, ``min_length``: pydantic's; stated in the help and checked before
-        anything is computed.
+        Bounds of pydantic: ``ge``, ``gt``, ``le``, ``lt``, ``min_length``. The help states them, and they are
+        checked before anything is computed.
     """
     return Field(default, description=help, json_schema_extra={"unit": unit, "flag": flag}, **bounds)
 
 
 class Options(BaseModel):
-    """Options of a product: types, defaults, bounds and help, in this one place."""
+    """The options of a product: types, defaults, bounds and help."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     def plain(self) -> dict[str, Any]:
-        """All options as JSON values."""
+        """Return all options as JSON values."""
         return self.model_dump(mode="json")
 
     def changed(self) -> dict[str, Any]:
-        """Options that differ from their defaults, as JSON values."""
+        """Return the options that differ from their defaults, as JSON values."""
         return {
             name: value
             for name, value in self.plain().items()
@@ -62,12 +62,12 @@ class Options(BaseModel):
         }
 
     def part(self, model: type[Options]) -> dict[str, Any]:
-        """Options that another model has too, for the analysis that takes these."""
+        """Return the options that another model also has, for the analysis with that model."""
         return {name: getattr(self, name) for name in model.model_fields}
 
 
 def default_of(model: type[Options], name: str) -> Any:
-    """Default of an option as a JSON value, ``None`` if it is a required one."""
+    """Return the default of an option as a JSON value; None for a required option."""
     info: FieldInfo = model.model_fields[name]
     value = info.get_default(call_default_factory=True)
     if value is PydanticUndefined:
@@ -75,22 +75,18 @@ def default_of(model: type[Options], name: str) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-class NoOptions(Options):
-    """A product without options."""
-
-
 @dataclass(frozen=True)
 class Table:
-    """What an analysis has to say.
+    """The result of an analysis as a table.
 
     Attributes
     ----------
     rows : list of dict
-        For ``--csv`` and ``--json``: all rows have the same keys; numbers in SI units, unrounded.
+        Rows for ``--csv`` and ``--json``, with equal keys; numbers in SI units, unrounded.
     lines : list of str
-        What is printed.
+        Lines to print.
     nothing : str
-        Why nothing was found, where that is an error of the command; else empty.
+        Reason for an empty result, if that is an error of the command; else empty.
     """
 
     rows: Sequence[Mapping[str, Any]]
@@ -100,32 +96,34 @@ class Table:
 
 @dataclass(frozen=True)
 class CellProduct:
-    """What is computed of every cell during a run, asked for by ``[products] NAME = {...}``.
+    """A product that a run computes of every cell, requested by ``[products] NAME = {...}``.
 
     Attributes
     ----------
     name : str
         Key in the specification's table ``[products]``.
     help : str
+        One sentence on the product.
     options : type of Options
+        Model of its options.
     variables : callable
-        ``variables(options, model)``: the tuple of `Variable` that the cube gets.
+        ``variables(options, model)`` returns the tuple of `Variable` that the cube gets.
     sizes : callable
-        ``sizes(options, model)``: the sizes of their own dims by name.
+        ``sizes(options, model)`` returns the sizes of their own dims by name.
     cost : callable
-        ``cost(options)``: what a cell takes, in drive periods of a plain integration.
+        ``cost(options)`` returns the work per cell, in drive periods of a plain integration.
     compute : str
-        ``"module:function"``: ``compute(job, options)`` with a `pipeline.compute.task.Job`, the cells as they
-        were integrated; returns the variables, with leading dims (branch, point).
+        ``"module:function"``: ``compute(job, options)`` with a `pipeline.compute.task.Job`, which holds
+        integrated cells, returns the variables with leading dims (branch, point).
     settle : callable
-        ``settle(options, model)``: the options with what follows from the model filled in; raises
-        ValueError with a sentence that begins with the option's name if they do not fit it.
+        ``settle(options, model)`` returns the options with values that follow from the model filled in. It
+        raises ValueError with a sentence that begins with the option's name if they do not fit the model.
     coordinates : callable
-        ``coordinates(options, model)``: values of the product's own dims by name, where they have names.
+        ``coordinates(options, model)`` returns the labels along the product's own dims, by dim.
     integrate : callable
-        ``integrate(options)``: keywords of `magpend_core.run_branches` that the product needs.
+        ``integrate(options)`` returns keywords of `magpend_core.run_branches` that the product needs.
     shortest : callable
-        ``shortest(options)``: the options with the least work, for what is compiled ahead.
+        ``shortest(options)`` returns the options with the least work, for compiling ahead.
     """
 
     name: str
@@ -143,33 +141,35 @@ class CellProduct:
 
 @dataclass(frozen=True)
 class Analysis:
-    """What can be found in a stored cube: ``magpend analyse NAME DIR``, kept in ``DIR/derived``.
+    """An analysis of a stored cube: ``magpend analyse NAME DIR``, kept in ``DIR/derived``.
 
     Attributes
     ----------
     name : str
+        Name of the analysis and its command.
     help : str
-        First paragraph: one sentence for lists. Further ones: what the reader of the table must know.
+        First paragraph: one sentence for lists. Further paragraphs: help for readers of the table.
     options : type of Options
+        Model of its options.
     compute : str
-        ``"module:function"``: ``compute(run, options)`` gives a Dataset. ``run.cube()`` is the cube,
+        ``"module:function"``: ``compute(run, options)`` returns a Dataset. ``run.cube()`` is the cube, and
         ``run.derive(name, **options)`` another analysis of the same cells.
     table : str
-        ``"module:function"``: ``table(ds)`` gives a `Table`. Empty: a result that others build on, without
-        a command.
+        ``"module:function"``: ``table(ds)`` returns a `Table`. Empty for a result that other analyses use and
+        that has no command.
     needs : str
-        ``"module:function"`` or empty: ``needs(run, options)`` raises ValueError with a sentence if the
-        run does not have what the analysis takes; called before anything is computed.
+        ``"module:function"`` or empty: ``needs(run, options)`` raises ValueError with a sentence if the run
+        does not suit the analysis. It is called before anything is computed.
     settle : str
-        ``"module:function"`` or empty: ``settle(run, options)`` gives the options with what follows from
-        the run filled in (an interval, the value that an axis has), so that two spellings of one thing
-        are one result.
+        ``"module:function"`` or empty: ``settle(run, options)`` returns the options with values that follow
+        from the run filled in (an interval, the nearest value of an axis), so that equivalent options share
+        one result.
     builds_on : tuple of str
-        Analyses that `compute` derives: their code is part of this one's version.
+        Analyses that `compute` derives; their code counts in this one's version.
     figure : str
-        Name of the figure that shows it best, or empty.
+        Name of the figure that shows the result best, or empty.
     ignores : tuple of str
-        Options that change nothing in the result.
+        Options that do not change the result.
     """
 
     name: str
@@ -187,22 +187,22 @@ class Analysis:
 class FigureOptions(Options):
     """Options that every figure has."""
 
-    at: dict[str, float] = option({}, "Value of an axis that the figure has no room for.")
+    at: dict[str, float] = option({}, "Value of an axis that the figure does not show.")
     nearest: bool = option(
         False,
-        "Take the nearest values that the axes have for --at, and say which; otherwise others are refused.",
+        "Use the axes' values nearest to --at, and print them; otherwise --at must match.",
     )
-    degrees: bool = option(False, "Degrees instead of radians.")
+    degrees: bool = option(False, "Use degrees instead of radians.")
     width: float = option(
         178.0, "Width of the figure; 85 is a journal's column", unit="mm", ge=40.0, le=1000.0
     )
     xlim: tuple[float, float] | None = option(None, "Range of the horizontal axis, in its unit.")
     ylim: tuple[float, float] | None = option(None, "Range of the vertical axis, in its unit.")
-    out: str = option("", "Figure file; by default in DIR/figures, named by what it shows.")
+    out: str = option("", "Figure file; by default in DIR/figures, named by its options.")
     format: Literal["", "png", "pdf", "svg"] = option("", "File format; by default png, or that of --out.")
 
     def label(self) -> str:
-        """What the file's name says beside the figure's: options that are not as by default."""
+        """Return the part of the file's name for options that differ from their defaults."""
         given = {name: value for name, value in self.changed().items() if name not in ("out", "format")}
         first = [name for name in _SPEAKS_FOR_ITSELF if name in given]
         order = [*first, *(name for name in given if name not in first)]
@@ -210,9 +210,9 @@ class FigureOptions(Options):
 
 
 class StateOptions(FigureOptions):
-    """Options of a figure of one state; its name is always in the file's."""
+    """Options of a figure of one state; the file's name always holds the state."""
 
-    state: str = option("", "State that is drawn; by default the model's first.")
+    state: str = option("", "State to draw; by default the model's first.")
 
 
 _SPEAKS_FOR_ITSELF = ("state", "quantity", "layout", "show")
@@ -229,26 +229,28 @@ def _words(name: str, value: Any) -> str:
 
 
 def _word(value: Any) -> str:
-    # all digits: values that differ are other pictures
+    # all digits, since other values give other figures
     return f"{value:.15g}" if isinstance(value, float) else str(value).replace("/", "-")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """What can be drawn of a run: ``magpend plot NAME DIR``.
+    """A figure of a run: ``magpend plot NAME DIR``.
 
     Attributes
     ----------
     name : str
-        Also begins the file's name.
+        Name of the figure, with which the file's name begins.
     help : str
+        First paragraph: one sentence for lists.
     options : type of FigureOptions
+        Model of its options.
     draw : str
-        ``"module:function"``: ``draw(run, options)`` gives a `pipeline.plots.style.DataFigure`: the figure
-        and the Dataset drawn. It reads ``run.cube()`` and ``run.derive(name, **options)`` and integrates
-        nothing of its own.
+        ``"module:function"``: ``draw(run, options)`` returns a `pipeline.plots.style.DataFigure`, the figure
+        with the Dataset drawn. It reads ``run.cube()`` and ``run.derive(name, **options)``, and integrates
+        nothing itself.
     needs : str
-        As in `Analysis`.
+        See `Analysis`.
     """
 
     name: str
@@ -262,6 +264,6 @@ Product = CellProduct | Analysis | Figure
 
 
 def function_of(name: str) -> Callable[..., Any]:
-    """Import the function that ``"module:function"`` names."""
+    """Import and return the function that ``"module:function"`` names."""
     found: Callable[..., Any] = resolve_name(name)
     return found

@@ -1,4 +1,4 @@
-"""All products by name. A new one is a new file and a line here."""
+"""List all products by name. A new product is a new file and a line here."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ P = TypeVar("P", CellProduct, Analysis, Figure)
 
 
 class Registry(Mapping[str, P], Generic[P]):
-    """Products by name, each imported when it is asked for.
+    """Products by name; each is imported when it is first used.
 
     Parameters
     ----------
     kind
-        What they are, for messages.
+        Word for the products, for messages.
     places
         ``"module:object"`` by name.
     """
@@ -60,7 +60,7 @@ ANALYSES: Registry[Analysis] = Registry(
 )
 
 COMMANDS = tuple(name for name in ANALYSES if name != "identified")
-"""Analyses that have a table, and so a command."""
+"""Analyses that have a table, and therefore a command."""
 
 FIGURES: Registry[Figure] = Registry(
     "figure",

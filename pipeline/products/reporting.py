@@ -1,4 +1,4 @@
-"""How far a computation is: whoever computes says it here, whoever shows it listens.
+"""Report the progress of a computation to a listener.
 
     for orbit in track(orbits, "polishing orbits"):
         ...
@@ -6,7 +6,7 @@
     with reporting(display):
         derive(...)
 
-Nothing is shown, and next to nothing costs, where nobody listens. Results do not depend on it.
+Without a listener nothing is shown, and reporting takes almost no time. Results do not depend on it.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ T = TypeVar("T")
 
 
 class Listener(Protocol):
-    """What shows progress."""
+    """A function that shows progress."""
 
     def __call__(self, what: str, done: float, total: float, expected_s: float = 0.0) -> None:
-        """Take that `done` of `total` parts of a piece of work are finished; see `report`."""
+        """Take a report that `done` of `total` parts of a piece of work are finished; see `report`."""
 
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 def report(what: str, done: float, total: float, expected_s: float = 0.0) -> None:
-    """Say that `done` of `total` parts of a piece of work are finished.
+    """Report that `done` of `total` parts of a piece of work are finished.
 
     Parameters
     ----------
     what
         The work in a word or two, such as ``following branches``.
     done, total
-        In any unit; `total` may grow while the work shows how much there is, and is 0 if nobody knows.
+        Amounts in any unit; `total` may grow during the work, and is 0 if it is unknown.
     expected_s
-        About how long the rest will take, for as long as nothing better is known [s].
+        Expected time of the rest, used until the speed is known [s].
     """
     listener = _listener.get()
     if listener is not None:
@@ -47,19 +47,19 @@ def report(what: str, done: float, total: float, expected_s: float = 0.0) -> Non
 
 
 def is_heard() -> bool:
-    """Whether anybody listens."""
+    """Return whether there is a listener."""
     return _listener.get() is not None
 
 
 def track(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
-    """Yield items, and report how many are done.
+    """Yield items, and report the number of finished ones.
 
     Parameters
     ----------
     items
         The parts of the work.
     what
-        As in `report`.
+        Name of the work, see `report`.
     total
         Number of items; by default their length.
     """
@@ -72,7 +72,7 @@ def track(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T
 
 @contextlib.contextmanager
 def reporting(listener: Listener) -> Iterator[None]:
-    """Let a listener hear all reports from within."""
+    """Send all reports from inside this context to a listener."""
     token = _listener.set(listener)
     try:
         yield

@@ -1,4 +1,4 @@
-"""What a variable of a cube is; the registry of those that every cube has is `pipeline.layout.schema`."""
+"""Define a variable of a cube; `pipeline.layout.schema` lists those of every cube."""
 
 from __future__ import annotations
 
@@ -10,19 +10,22 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable of the cube.
+    """A variable of a cube.
 
     Attributes
     ----------
     name : str
+        Name in the cube.
     own_dims : tuple of str
         Dims after the cell dims.
     dtype : str
-        In the store.
+        Data type in the store.
     fill : float or int
-        What a pending cell reads as.
+        Value of a pending cell.
     units : str
+        Unit; empty if the elements have different ones.
     long_name : str
+        Description in words.
     attrs : mapping
         Further attributes.
     """
@@ -36,19 +39,19 @@ class Variable:
     attrs: Mapping[str, Any] = field(default_factory=dict)
 
     def attributes(self) -> dict[str, Any]:
-        """All attributes as written to the store."""
+        """Return all attributes as written to the store."""
         units = {"units": self.units} if self.units else {}
         return {**units, "long_name": self.long_name, **self.attrs}
 
     def itemsize(self, sizes: Mapping[str, int]) -> int:
-        """Bytes per cell, uncompressed."""
+        """Return the uncompressed bytes per cell."""
         import numpy as np
 
         return int(np.dtype(self.dtype).itemsize) * math.prod(sizes[d] for d in self.own_dims)
 
 
 def flag_attrs(codes: Any) -> dict[str, Any]:
-    """CF attributes of a variable of codes: an `IntEnum` whose members have a `sentence`."""
+    """Return CF attributes of a variable of codes, from an `IntEnum` whose members have a `sentence`."""
     return {
         "flag_values": [int(s) for s in codes],
         "flag_meanings": " ".join(s.name.lower() for s in codes),

@@ -1,1 +1,1 @@
-"""Reports: what a study found as one HTML page, and the paper's figures computed and judged."""
+"""Report the results of runs and studies as HTML pages, with the paper's figures and claims judged."""

@@ -1,8 +1,9 @@
-"""What can be measured of a study's results: estimates with the interval in which the truth lies.
+"""Measure a study's results: estimates with 95 % intervals.
 
-A measure is a function of results and options that gives an `Estimate`. Nothing here knows a model: motions
-are the words of the run's own classifier, axes and quantities have names. Intervals are of 95 %: of shares by
-Clopper and Pearson, of what is located on an axis between its neighbouring values.
+A measure is a function of results and options that returns an `Estimate`. No measure depends on a model:
+classes of motion are the labels of the run's own classifier; axes and quantities are given by name. All
+intervals are 95 % intervals. Those of fractions are Clopper and Pearson's. The interval of a place on an axis
+reaches between the neighbouring values of the axis.
 """
 
 from __future__ import annotations
@@ -34,21 +35,22 @@ NOWHERE = math.nan
 
 @dataclass(frozen=True)
 class Estimate:
-    """What came out.
+    """A measured value with its interval.
 
     Attributes
     ----------
     value : float
+        The estimate; NaN if nothing could be measured.
     low, high : float
-        Interval of 95 %; NaN where nothing could be measured.
+        95 % interval; NaN if nothing could be measured.
     text : str
-        What was counted or located, for people.
+        A phrase on the counted or located objects.
     step : float or None
-        Largest step of the axis there, where it limits what can be told.
+        Largest step of the axis there, if it limits the resolution.
     n : int or None
-        Independent cells, curves or periods that it rests on.
+        Number of independent cells, curves or periods behind the estimate.
     missing : str
-        Why nothing could be measured, empty otherwise.
+        Reason why nothing could be measured; otherwise empty.
     """
 
     value: float
@@ -61,12 +63,12 @@ class Estimate:
 
 
 def absent(why: str, step: float | None = None) -> Estimate:
-    """Nothing could be measured, and why."""
+    """Return the estimate for a missing measurement, with the reason."""
     return Estimate(NOWHERE, NOWHERE, NOWHERE, step=step, missing=why)
 
 
 def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
-    """Cells of a run over its only axis, as (axis, cell), and the axis' name."""
+    """Return the cells of a run over its only axis, as (axis, cell), and the axis' name."""
     cube = results.run(name).cube()
     axes, starts = split_dims(cube["status"])
     wide = [d for d in axes if cube.sizes[d] > 1] or list(axes[:1])
@@ -83,7 +85,7 @@ def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
 
 
 def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
-    """Cells at the values of the axis that are asked for: ``at`` one, or from ``low`` to ``high``."""
+    """Return the cells at the requested values of the axis: ``at`` one, or from ``low`` to ``high``."""
     values = ds[axis].values
     if "at" in options:
         at = _index(ds, axis, float(options["at"]))
@@ -94,7 +96,7 @@ def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
 
 
 def _index(ds: xr.Dataset, axis: str, value: float) -> int | None:
-    """Place of a value on an axis; None if the axis does not have it."""
+    """Return the index of a value on an axis; None if the axis does not have it."""
     try:
         return place(ds[axis], value)
     except ValueError:
@@ -106,7 +108,7 @@ def _step(values: np.ndarray) -> float | None:
 
 
 def _matches(ds: xr.Dataset, options: Options) -> np.ndarray:
-    """Which cells are what is asked for: ``period`` one or several (0: not closed), ``motion`` a word."""
+    """Return which cells have the wanted ``period`` (one or several; 0: not closed) and ``motion``."""
     wanted = options.get("period")
     periods = ds["orbit_period"].values
     found = np.ones(periods.shape, bool)
@@ -130,10 +132,11 @@ def _share(count: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
 
 
 def least_share(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Share of the cells that have a period, or a motion, where it is least within a range of the axis.
+    """Return the fraction of cells with a period or motion, at the axis value where it is least.
 
-    Options: ``at``, or ``low`` and ``high``; ``period``, ``motion``. The interval is Clopper and Pearson's,
-    its level divided among the values of the axis (Bonferroni), since the least of many shares is taken.
+    Options: ``at``, or ``low`` and ``high``; ``period``, ``motion``. The interval is Clopper and Pearson's.
+    Its level is corrected for the number of axis values (Bonferroni), since the least of many fractions is
+    taken.
     """
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, options)
@@ -149,9 +152,9 @@ def least_share(results: Results, of: Sequence[str], options: Options) -> Estima
 
 
 def largest_share(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Share of the cells that have a period, or a motion, where it is largest within a range of the axis.
+    """Return the fraction of cells with a period or motion, at the axis value where it is largest.
 
-    Options and interval as of `least_share`.
+    Options and interval: see `least_share`.
     """
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, options)
@@ -174,7 +177,7 @@ def _asked(options: Options) -> str:
 def window(
     results: Results, of: Sequence[str], options: Options
 ) -> tuple[Estimate, int, int, xr.Dataset, str]:
-    """Return the unbroken stretch about a value in which every cell has a period, and its places."""
+    """Return the width of the interval about a value in which all cells have a period, with its places."""
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})
     values, n = here[axis].values, here.sizes["cell"]
@@ -202,19 +205,19 @@ def window(
 
 
 def window_width(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Width of the unbroken stretch about a value in which every cell has a period.
+    """Return the width of the unbroken interval about a value in which every cell has a period.
 
-    Options: ``contains``, ``period`` (and ``motion``), ``low`` and ``high``. Its ends lie between
-    neighbouring values of the axis: that is the interval.
+    Options: ``contains``, ``period`` (and ``motion``), ``low`` and ``high``. Each end lies between
+    neighbouring values of the axis, which gives the interval of the estimate.
     """
     return window(results, of, options)[0]
 
 
 def beside_window(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Share of the cells next to such a stretch, on both sides, that have another period.
+    """Return the fraction of cells next to a window, on both sides, that have another period.
 
-    Options: as of `window_width`; ``other`` the periods that are looked for, ``within`` how far from its
-    ends.
+    Options: those of `window_width`; ``other``, the periods that count; ``within``, the largest distance from
+    the window's ends.
     """
     found, first, last, here, axis = window(results, of, options)
     if found.missing or found.value == 0.0:
@@ -231,11 +234,12 @@ def beside_window(results: Results, of: Sequence[str], options: Options) -> Esti
 
 
 def change_of_period(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Value of the axis at which the period of most cells changes, from below to above.
+    """Return the axis value at which the period of most cells changes.
 
-    Options: ``below`` and ``above``, the periods on its two sides; ``low`` and ``high``. The interval reaches
-    from the last value with the one to the next with the other: next to a bifurcation, where motions close
-    slowly, most cells may have neither. It spans all such places if there are several.
+    Options: ``below`` and ``above``, the periods on the two sides; ``low`` and ``high``. The interval reaches
+    from the last value with the period ``below`` to the next with the period ``above``. Between them, near a
+    bifurcation, most cells may have neither, since motions close slowly. If there are several changes, the
+    interval spans them all.
     """
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, options)
@@ -256,11 +260,11 @@ def change_of_period(results: Results, of: Sequence[str], options: Options) -> E
 
 
 def located_bifurcation(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Where bifurcations of a kind lie, found by following the orbits on which cells of a run end.
+    """Return the place of bifurcations of a type, by continuation of orbits from the run's cells.
 
     Options: ``type``, as `magpend analyse branches` names it; ``low`` and ``high``; ``max_period``, the
-    longest of orbits followed. The interval spans all that are found; each is located by itself, whatever the
-    step of the run's axis.
+    longest period of continued orbits. The interval spans all bifurcations found. Each is located exactly,
+    independent of the step of the run's axis.
     """
     from pipeline.analysis.branches.table import table_of
     from pipeline.layout.vocabulary import parameter_name
@@ -278,7 +282,7 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
 
 
 def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Share of the cells that end on the rarest of some motions at one value: above 0, all coexist.
+    """Return the fraction of cells on the rarest of some motions at one value; above 0, all coexist.
 
     Options: ``at``, ``motions``, ``period``.
     """
@@ -298,10 +302,10 @@ def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Esti
 
 
 def largest_exponent(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Largest Lyapunov exponent at one value [1/s], the mean over cells that are not closed.
+    """Return the largest Lyapunov exponent at one value [1/s], averaged over cells that are not closed.
 
-    Options: ``at``. The interval is that of the mean over the cells (Student's t): they are on one set, so
-    that what differs is the finite time of each.
+    Options: ``at``. The interval is that of the mean over cells (Student's t). The cells are on one set, so
+    their exponents differ only because of finite time.
     """
     ds, axis = _cells(results, of[0])
     if "lyapunov" not in ds:
@@ -321,9 +325,9 @@ def largest_exponent(results: Results, of: Sequence[str], options: Options) -> E
 
 
 def agreement(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Share of the values that two runs have in common at which most cells of both have the same period.
+    """Return the fraction of common axis values at which most cells of two runs have the same period.
 
-    Options: ``low``, ``high``. Periods count up to 16; not closed is one outcome.
+    Options: ``low``, ``high``. Periods above 16 count as one outcome, and so do cells that are not closed.
     """
     outcomes = []
     for name in of[:2]:
@@ -342,10 +346,10 @@ def agreement(results: Results, of: Sequence[str], options: Options) -> Estimate
 
 
 def share_above(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Share of a drive period, from its begin on, for which a quantity of the model at rest is positive.
+    """Return the fraction of a drive period, from its start, during which a quantity at rest is positive.
 
-    Options: ``quantity``, ``frequency_hz``. The instant at which it changes sign is found by bisection; it
-    must be positive from the begin on, and change once.
+    Options: ``quantity``, ``frequency_hz``. The time of the sign change is found by bisection. The quantity
+    must be positive at the start and change sign once.
     """
     from magpend_core import evaluate
 
@@ -376,7 +380,7 @@ def share_above(results: Results, of: Sequence[str], options: Options) -> Estima
 
 
 def recorded_duty_cycle(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Share of the period in which a recorded drive is high, from its edges."""
+    """Return the duty cycle of a recorded drive, from its edges."""
     from pipeline.rig.edges import edges_of
 
     timing = edges_of(results.recording(of[0])).frequency()
@@ -415,4 +419,4 @@ MEASURES: dict[str, Measure] = {
     "width_spread": _of_torques("width_spread"),
     "signs_apart": _of_torques("signs_apart"),
 }
-"""By the names that studies use."""
+"""Measures by the names that studies use."""

@@ -1,9 +1,8 @@
-"""A page of a report: what stands on it, and how it becomes one HTML file.
+"""Define the content of a report page, and render it as one HTML file.
 
-A page is data: a title, sections, and in each section blocks of a few kinds (`Picture`, `Grid`, `Text`,
-`Note`, `Facts`, `Source`, `Outcome`). The template turns every text into text: nothing that a run, a
-specification or a study says becomes markup. The file needs nothing beside itself, asks nothing of a network
-and runs no script.
+A page is data: a title, and sections with blocks of a few kinds (`Picture`, `Grid`, `Text`, `Note`, `Facts`,
+`Source`, `Outcome`). The template escapes every text, so no text of a run, a specification or a study becomes
+markup. The file has no external resources and no script.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ if TYPE_CHECKING:
 
 _TEMPLATES = Path(__file__).with_name("templates")
 _DPI = 150
-"""Of the pictures on a page: 1050 pixels for the width of a journal's page, sharp on most screens."""
+"""Resolution of pictures: 1050 pixels for the width of a journal's page, sharp on most screens."""
 
 MOST_ROWS = 60
-"""Rows of a table that a page shows; the command beside it gives them all."""
+"""Most rows of a table on a page; the command beside the table lists all."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +38,15 @@ class Picture:
     Attributes
     ----------
     png : bytes
+        Content of the PNG file.
     width, height : int
-        [pixels]
+        Size [pixels].
     alt : str
-        What it shows, for those who do not see it.
+        Description for readers who do not see the picture.
     caption : str
+        Caption below the picture.
     command : str
-        What draws it alone.
+        Command that draws the picture.
     """
 
     png: bytes
@@ -58,7 +59,7 @@ class Picture:
 
     @property
     def source(self) -> str:
-        """The picture as an address that holds it."""
+        """Data URL with the picture's content."""
         return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
 
 
@@ -69,14 +70,17 @@ class Grid:
     Attributes
     ----------
     columns : sequence of str
+        Names of the columns.
     rows : sequence of sequences of str
+        Cells of each row.
     caption : str
+        Caption of the table.
     command : str
-        What gives all its rows.
+        Command that lists all rows.
     n_more : int
-        Rows that are left out.
+        Number of rows that are left out.
     stacked : bool
-        Whether a row becomes lines on a narrow screen, for tables with sentences in them.
+        Whether each row becomes several lines on a narrow screen, for tables with sentences.
     """
 
     columns: Sequence[str]
@@ -98,7 +102,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence, with the command that gives what it says is missing."""
+    """A sentence, with a command for the missing or additional result."""
 
     text: str
     command: str = ""
@@ -115,7 +119,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Source:
-    """A text as it is, folded away: a specification."""
+    """A text that is shown unchanged and folded, such as a specification."""
 
     title: str
     text: str
@@ -124,23 +128,24 @@ class Source:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A statement, what came out, and whether it holds.
+    """A claim, the measured result, and the verdict.
 
     Attributes
     ----------
     statement : str
-        What is claimed, in words of our own.
+        The claim, paraphrased.
     source : str
-        Who claims it, and where.
+        Author and place of the claim.
     found : str
-        What came out, with its interval.
+        The measured result with its interval.
     verdict : str
         See `pipeline.report.verdicts`.
     reason : str
-        Why, where the numbers alone do not say.
+        Reason for the verdict, if the numbers alone do not show it.
     required : bool
+        Whether the command fails if the claim is contradicted.
     command : str
-        What computes the numbers alone.
+        Command that computes the result.
     """
 
     statement: str
@@ -167,14 +172,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Page:
-    """All of a report.
+    """A report as data.
 
     Attributes
     ----------
     title : str
+        Title of the page.
     summary : sequence of blocks
-        Above the sections.
+        Blocks above the sections.
     parts : sequence of Part
+        Sections of the page.
     made_by : str
         Program and version.
     """
@@ -186,7 +193,7 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """Return a page as HTML: the same page, the same bytes."""
+    """Return a page as HTML; equal pages give equal bytes."""
     style = (_TEMPLATES / "page.css").read_text("utf-8")
     return (
         _environment().get_template("page.html.j2").render(page=page, style=style, parts=anchored(page.parts))
@@ -194,14 +201,14 @@ def render(page: Page) -> str:
 
 
 def write(page: Page, path: Path) -> None:
-    """Write a page; it is at its place whole or not at all."""
+    """Write a page as HTML, whole or not at all."""
     from pipeline.layout.writing import write_atomically
 
     write_atomically(path, render(page))
 
 
 def anchored(parts: Sequence[Part], prefix: str = "part") -> list[dict[str, Any]]:
-    """Return the sections with an anchor each, for the list of contents."""
+    """Return the sections, each with an anchor for the table of contents."""
     return [
         {"title": part.title, "blocks": part.blocks, "anchor": name, "parts": anchored(part.parts, name)}
         for name, part in ((f"{prefix}-{i}", part) for i, part in enumerate(parts, 1))
@@ -219,7 +226,7 @@ def _environment() -> Environment:
 
 
 def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -> Picture:
-    """Return a figure as a picture of a page."""
+    """Return a figure as a picture block."""
     from pipeline.plots.style import TEXT_LOCK
 
     buffer = io.BytesIO()
@@ -232,7 +239,7 @@ def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -
 def grid_of(
     rows: Sequence[Mapping[str, Any]], caption: str = "", command: str = "", most: int = MOST_ROWS
 ) -> Grid:
-    """Return rows of numbers and words as a table; columns in which nothing stands are left out."""
+    """Return rows of numbers and texts as a table block; empty columns are left out."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[text_of(row.get(name)) for name in names] for row in rows[:most]]
     kept = [k for k in range(len(names)) if any(line[k] not in ("", "-") for line in cells)]
@@ -242,7 +249,7 @@ def grid_of(
 
 
 def text_of(value: Any) -> str:
-    """Spell a value of a table: six digits, a dash where there is none."""
+    """Format a value of a table: six digits, a dash for a number that is not finite."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -254,5 +261,5 @@ def text_of(value: Any) -> str:
 
 
 def plain(text: str) -> str:
-    """Return a label without the marks of mathematics: for those who hear it."""
+    """Strip math markup from a label, for screen readers."""
     return re.sub(r"\s+", " ", re.sub(r"[$\\{}]", "", text)).strip()

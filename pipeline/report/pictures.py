@@ -1,4 +1,4 @@
-"""Pictures of a study: figures of runs, recordings and torque readings, and quantities over a period."""
+"""Draw the pictures of a study: figures of runs, recordings, torque readings, and model quantities."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from pipeline.plots.style import DataFigure
 
 _FINE = 2001
-"""Instants of a drive period."""
+"""Points over a drive period."""
 
 
 def picture(results: Results, table: PictureTable) -> Block:
-    """Return a picture of a study, or the sentence that says why there is none."""
+    """Return a picture of a study, or a note with the reason why it was not drawn."""
     alt = f"{table.caption.rstrip('.')} ({table.of})"
     try:
         drawn = _DRAW[table.kind](results, table)
@@ -73,7 +73,7 @@ _DRAW = {
 
 
 def _command(results: Results, table: PictureTable) -> str:
-    """Return the command that draws a picture alone, of what the study has computed."""
+    """Return the command that draws a picture from the study's results."""
     if table.kind == "plot":
         place = shlex.quote(str(results.folder / "runs" / table.of))
         return command_of(f"plot {table.figure}", table.options, place)
@@ -90,11 +90,11 @@ def draw_quantities(parameters: Parameters, names: tuple[str, ...], frequency_hz
     Parameters
     ----------
     parameters
-        Of the model.
+        Parameters of the model.
     names
-        Quantities of its own.
+        Names of the model's quantities.
     frequency_hz
-        Of the drive [Hz].
+        Drive frequency [Hz].
     """
     from magpend_core import evaluate
     from pipeline.plots import style

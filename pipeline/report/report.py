@@ -1,4 +1,4 @@
-"""One page on one or several runs: ``magpend report``."""
+"""Make a page on one or several runs: ``magpend report``."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ def report(
     only_stored: bool = False,
     echo: Echo = print,
 ) -> Page:
-    """Return the page on some runs.
+    """Return the page on one or several runs.
 
     Parameters
     ----------
     directories
         Run directories; each is opened before anything is computed.
     title
-        Of the page; by default that of the run, or how many there are.
+        Title of the page; by default the run's, or the number of runs.
     also
-        Analyses that are computed besides those of `pipeline.report.runs.CHEAP`, as ``magpend analyse`` does.
+        Analyses that are computed in addition to `pipeline.report.runs.CHEAP`, as ``magpend analyse`` does.
     only_stored
-        Compute nothing: draw and list what stands in the cubes and in ``derived/``.
+        Whether to compute nothing, and to show only the cubes and the results in ``derived/``.
     echo
-        Prints a line.
+        Function that prints a line.
 
     Raises
     ------
     SpecError
         If an analysis is unknown.
     RefusedError, DamagedError, UnreadableError
-        As `pipeline.store.run.Run.open`.
+        See `pipeline.store.run.Run.open`.
     """
     unknown = [unknown_name("analysis", name, SHOWN) for name in also if name not in SHOWN]
     if unknown:
@@ -55,12 +55,12 @@ def report(
 
 
 def made_by() -> str:
-    """Program and version."""
+    """Return program and version."""
     return f"magpend {metadata.version('magpend')}"
 
 
 def _summary(runs: Sequence[AnalysedRun]) -> Grid:
-    """What is on the page, if there are several runs."""
+    """Return the table of runs for a page with several runs."""
     rows = [
         (
             run.info.title or run.name,

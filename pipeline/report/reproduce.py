@@ -1,4 +1,4 @@
-"""A study carried out and judged: ``magpend reproduce``."""
+"""Carry out a study and judge its claims: ``magpend reproduce``."""
 
 from __future__ import annotations
 
@@ -29,17 +29,22 @@ Echo = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Judgement:
-    """A claim, what came out, and its verdict.
+    """A claim with its estimate and its verdict.
 
     Attributes
     ----------
     figure : str
+        Number of the figure.
     claim : ClaimTable
+        The claim.
     estimate : Estimate
+        The measured value with its interval.
     verdict : Verdict
+        The verdict.
     plain : Verdict
-        The verdict as if nothing had been calibrated.
+        The verdict as if nothing had been calibrated on the claim.
     reason : str
+        Reason for the verdict, if the numbers alone do not show it.
     """
 
     figure: str
@@ -51,19 +56,22 @@ class Judgement:
 
     @property
     def fails(self) -> bool:
-        """Whether a required claim is contradicted; of one that was calibrated on, what came out changed."""
+        """Whether a required claim is contradicted, calibrated or not."""
         return self.claim.required and self.plain is Verdict.NOT_MET
 
 
 @dataclass(frozen=True)
 class Reproduced:
-    """What a study came to.
+    """The results of a study.
 
     Attributes
     ----------
     folder : Path
+        Folder with all results.
     page : Path
+        Path of the HTML page.
     judgements : list of Judgement
+        Judged claims.
     """
 
     folder: Path
@@ -85,29 +93,29 @@ def reproduce(
     workers: int | None = None,
     echo: Echo = print,
 ) -> Reproduced:
-    """Compute what a study needs, or what is missing of it, judge its claims and write its page.
+    """Compute what is missing of a study, judge its claims and write its page.
 
     Parameters
     ----------
     study
         See `pipeline.report.study.load_study`.
     folder
-        Where everything goes; made if it is not there. What it holds already is taken.
+        Folder for all results, which is made if necessary. Results that it holds already are used.
     figures
         Numbers of the figures; by default all.
     smoke
-        Take the small sizes of the specifications.
+        Whether to use the small sizes of the specifications.
     workers
-        As for `pipeline.runs.run.run`.
+        See `pipeline.runs.run.run`.
     echo
-        Prints a line.
+        Function that prints a line.
 
     Raises
     ------
     SpecError
         If a figure is unknown; before anything is computed.
     Exception
-        As `pipeline.runs.run.run`; what was committed stays, and the same call goes on.
+        See `pipeline.runs.run.run`. Committed tasks stay, and the same call continues.
     """
     chosen = _chosen(study, figures)
     results = Results(study, folder, smoke=smoke, workers=workers, echo=echo)
@@ -137,10 +145,9 @@ def _chosen(study: Study, figures: Sequence[str]) -> list[FigureTable]:
 
 
 def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
-    """Measure what a claim is about, and judge it.
+    """Measure the quantity of a claim, and judge the claim.
 
-    A grid that is coarser, or a sample that is smaller, than the claim asks for decides nothing, whatever
-    came out.
+    The verdict is undecided if the axis is coarser, or the sample smaller, than the claim requires.
     """
     try:
         found = MEASURES[claim.measure](results, claim.of, claim.options)
@@ -163,7 +170,7 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
 
 
 def _decides(claim: ClaimTable) -> str:
-    """Say what would decide a claim that was not measured."""
+    """Return a sentence on the size of a run that would decide an unmeasured claim."""
     steps = f"steps of {claim.step:g} and less" if claim.step else ""
     cells = f"{claim.n} cells and more" if claim.n else ""
     both = " with ".join(part for part in (steps, cells) if part)
@@ -171,7 +178,7 @@ def _decides(claim: ClaimTable) -> str:
 
 
 def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]) -> Part:
-    """Return the section of a figure: what the text says, pictures, verdicts, where they come from."""
+    """Return the section of a figure: the paper's text, pictures, verdicts, command."""
     many = len(figure.numbers) > 1
     blocks: list[Block] = []
     if figure.says:
@@ -201,7 +208,7 @@ def _outcome(judgement: Judgement) -> Outcome:
 
 
 def spelled(judgement: Judgement) -> str:
-    """Say what came out, with its interval, and what would meet the claim."""
+    """Return the result of a judgement with its interval, and the claimed range."""
     found, claim = judgement.estimate, judgement.claim
     if found.missing:
         return "not measured."
@@ -213,7 +220,7 @@ def spelled(judgement: Judgement) -> str:
 
 
 def _digits(width: float) -> str:
-    """Return the format in which an interval of a width shows two digits of it."""
+    """Return a number format that shows two digits of an interval's width."""
     if not (math.isfinite(width) and width > 1e-8):
         return "{:.7g}"
     return f"{{:.{min(max(0, 1 - math.floor(math.log10(width))), 9)}f}}"
@@ -227,7 +234,7 @@ def _range(claim: ClaimTable) -> str:
 
 
 def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
-    """Return what stands above the figures: what it shows, what this is, all claims, versions."""
+    """Return the blocks above the figures: counts of verdicts, source, all claims, versions."""
     table = results.study.table
     counts = {verdict: sum(j.verdict is verdict for j in judgements) for verdict in Verdict}
     failed = sum(j.fails for j in judgements)
@@ -253,7 +260,7 @@ def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
 
 
 def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
-    """Say how many claims a study decides, and what is left open."""
+    """Return a sentence on how many claims are met, not met or undecided."""
     tests = decided_first(judgements)
     met, failed, left = (
         sum(j.verdict is v for j in tests) for v in (Verdict.MET, Verdict.NOT_MET, Verdict.UNDECIDED)
@@ -264,13 +271,13 @@ def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
 
 
 def decided_first(judgements: Sequence[Judgement]) -> list[Judgement]:
-    """Return the claims that nothing was calibrated on, the decided ones before the others."""
+    """Return the claims that are tests, decided ones first."""
     tests = [j for j in judgements if j.verdict is not Verdict.CALIBRATED]
     return sorted(tests, key=lambda j: j.verdict is Verdict.UNDECIDED)
 
 
 def calibrated_on(judgements: Sequence[Judgement]) -> str:
-    """List the claims that parameters were calibrated on in one paragraph; empty if there are none."""
+    """Return a paragraph that lists the claims used for calibration; empty if there are none."""
     own = [j for j in judgements if j.verdict is Verdict.CALIBRATED]
     if not own:
         return ""
@@ -286,7 +293,7 @@ def calibrated_on(judgements: Sequence[Judgement]) -> str:
 
 
 def _provenance(results: Results) -> list[Part]:
-    """Return the section on what the figures were computed from: digests, versions, specifications."""
+    """Return the section on the runs behind the figures: digests, versions, specifications."""
     runs = results.computed()
     if not runs:
         return []
@@ -301,7 +308,7 @@ def _provenance(results: Results) -> list[Part]:
 
 
 def _rows(judgements: Sequence[Judgement]) -> str:
-    """Spell all claims as JSON, for programs."""
+    """Return all judgements as JSON."""
     rows = [
         {
             "figure": j.figure, "statement": j.claim.statement, "source": j.claim.source,

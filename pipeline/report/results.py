@@ -1,4 +1,4 @@
-"""What a study computes: runs, recordings of virtual rigs, fits of torque readings; each once."""
+"""Compute the results of a study once: runs, recordings of virtual rigs, fits of torque readings."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ Echo = Callable[[str], None]
 
 
 class Results:
-    """Results of a study in a folder.
+    """The results of a study in a folder.
 
-    Runs lie in ``runs/`` and are completed, not repeated; recordings and fits take seconds and are made anew,
-    to the same numbers.
+    Runs lie in ``runs/`` and are completed, not repeated. Recordings and fits take seconds and are computed
+    again, with the same numbers.
 
     Parameters
     ----------
     study
-        What is computed.
+        Study to compute.
     folder
-        Where; it is made.
+        Folder of the results, which is made if necessary.
     smoke
-        Take the small sizes of the specifications.
+        Whether to use the small sizes of the specifications.
     workers
-        As for `pipeline.runs.run.run`.
+        See `pipeline.runs.run.run`.
     echo
-        Prints a line.
+        Function that prints a line.
     """
 
     def __init__(self, study: Study, folder: Path, *, smoke: bool, workers: int | None, echo: Echo) -> None:
@@ -50,12 +50,12 @@ class Results:
         self._torques: dict[str, Any] = {}
 
     def prepare(self, names: set[str]) -> None:
-        """Compute the runs among the names; all that the names stand for is read first.
+        """Check all inputs with the given names, then compute the runs among them.
 
         Raises
         ------
         SpecError
-            Naming all that is wrong with specifications, rigs and headers, before anything is computed.
+            If specifications, rigs or headers are wrong; before anything is computed, with all problems.
         """
         self._check(names)
         for name in self.study.table.runs:
@@ -90,7 +90,7 @@ class Results:
         return measured(self.study.table.torques[name].header, self.study.path.parent)
 
     def run(self, name: str) -> AnalysedRun:
-        """Return a run, computed or completed first."""
+        """Return a run; compute or complete it first."""
         if name not in self._runs:
             place = self.folder / "runs" / name
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -100,7 +100,7 @@ class Results:
         return self._runs[name]
 
     def computed(self) -> dict[str, AnalysedRun]:
-        """Return the runs that were computed so far."""
+        """Return the runs that have been computed so far."""
         return dict(self._runs)
 
     def rig(self, name: str) -> Rig:
@@ -110,7 +110,7 @@ class Results:
         return load_rig(self.study.file(self.study.table.recordings[name].rig))
 
     def recording(self, name: str) -> xr.Dataset:
-        """Return what a virtual rig records; labelled as simulated."""
+        """Return the recording of a virtual rig, marked as simulated."""
         if name not in self._recordings:
             from pipeline.rig.recordings import read_recording
             from pipeline.rig.recordings.writing import write_raw
@@ -126,7 +126,7 @@ class Results:
         return self._recordings[name]
 
     def series(self, name: str, n_periods: int) -> xr.Dataset:
-        """Return a recording and the model from the same state."""
+        """Return a recording, and the model from the same state."""
         from pipeline.rig.measured.series import series_of
 
         return series_of(self.recording(name), self.rig(name).parameters, n_periods=n_periods)

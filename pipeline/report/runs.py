@@ -1,8 +1,8 @@
-"""Sections of a report on one run: diagram, attractors, bifurcations, exponents, parameters, provenance.
+"""Write the sections of a report on one run: diagram, attractors, bifurcations, exponents, parameters.
 
-What stands in the cube and in ``derived/`` is shown. The attractors, and of a continuation its hysteresis,
-are found first if they were not, as ``magpend analyse`` does; whatever else is missing is named, with its
-command.
+A report shows the cube and the results in ``derived/``. Attractors, basins, and the hysteresis of a
+continuation are computed if they are missing, as ``magpend analyse`` does. For other missing results the
+report names the command.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 CHEAP = ("attractors", "hysteresis", "basins")
-"""Analyses that a report computes unless it is told not to."""
+"""Analyses that a report computes by default."""
 
 SHOWN = ("attractors", "hysteresis", "basins", "branches", "curves", "chaos", "dimension", "settling")
-"""Analyses in the order in which a report has them."""
+"""Analyses in the order of a report."""
 
 _HEADINGS = {
     "hysteresis": "Hysteresis",
@@ -58,14 +58,14 @@ _CAPTIONS = {
 
 
 class Shown:
-    """A run that is reported on.
+    """A run that is reported on, with its cube.
 
     Parameters
     ----------
     run
-        It.
+        The run.
     computed
-        Analyses that may be computed; others are shown if they are stored.
+        Analyses that may be computed; other analyses are shown only if they are stored.
     """
 
     def __init__(self, run: AnalysedRun, computed: tuple[str, ...]) -> None:
@@ -75,11 +75,11 @@ class Shown:
 
     @property
     def directory(self) -> str:
-        """The run directory as a command takes it."""
+        """Run directory, quoted for a command."""
         return shlex.quote(self.run.name)
 
     def options_of(self, name: str) -> list[dict[str, Any]]:
-        """Return the options with which an analysis can be shown: stored ones, or those by default."""
+        """Return the options with which an analysis can be shown: those stored, or the defaults."""
         known = stored_options(self.run, name)
         return known or ([{}] if name in self.computed else [])
 
@@ -87,21 +87,21 @@ class Shown:
 def part_of(
     source: str | AnalysedRun, echo: Callable[[str], None], computed: tuple[str, ...] = CHEAP
 ) -> Part:
-    """Return the section of a run.
+    """Return the section of a report on one run.
 
     Parameters
     ----------
     source
         Run directory, or an opened run.
     echo
-        Prints a line; says what is computed.
+        Function that prints a line about each computation.
     computed
-        Analyses that are computed where they are not stored.
+        Analyses that are computed if they are not stored.
 
     Raises
     ------
     RefusedError, DamagedError, UnreadableError
-        As `pipeline.store.run.Run.open`.
+        See `pipeline.store.run.Run.open`.
     """
     shown = Shown(AnalysedRun.of(source, echo), computed)
     title = shown.run.info.title or shown.run.name.rpartition("/")[2]
@@ -117,7 +117,7 @@ def part_of(
 
 
 def _state(shown: Shown) -> Iterator[Block]:
-    """What the run is, and how far."""
+    """Yield facts about the run and its progress."""
     run, found = shown.run, state(shown.run)
     swept = ", ".join(f"{name} {_span(shown.cube, name)}" for name in shown.axes) or "nothing"
     model = run.model
@@ -137,7 +137,7 @@ def _state(shown: Shown) -> Iterator[Block]:
 
 
 def _span(cube: xr.Dataset, name: str) -> str:
-    """Range of an axis, its unit and how many values it has."""
+    """Return the range of an axis, its unit and its number of values."""
     values, unit = cube[name].values, str(cube[name].attrs.get("units", "1"))
     if values.size == 1:
         return f"{values[0]:g}{'' if unit == '1' else ' ' + unit}"
@@ -145,7 +145,7 @@ def _span(cube: xr.Dataset, name: str) -> str:
 
 
 def _parameters(shown: Shown) -> Iterator[Block]:
-    """Parameters with their values, units and sources."""
+    """Yield the table of parameters with values, units and sources."""
     run = shown.run
     chosen = run.model.preset(run.spec.parameters.chosen)
     over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
@@ -170,7 +170,7 @@ def _parameters(shown: Shown) -> Iterator[Block]:
 
 
 def _diagram(shown: Shown) -> Iterator[Block]:
-    """Draw what the cube shows over its axes, or its section if nothing is swept."""
+    """Yield the bifurcation diagram, or the section points if nothing is swept."""
     if len(shown.axes) > 1:
         at = _first_of_others(shown)
         yield from _drawn(
@@ -183,7 +183,7 @@ def _diagram(shown: Shown) -> Iterator[Block]:
 
 
 def _first_of_others(shown: Shown) -> dict[str, float]:
-    """Values of the axes that a diagram over one of them has no room for."""
+    """Return the first values of the axes that a diagram does not show."""
     continuation = shown.run.spec.continuation
     path = next(
         (d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0]
@@ -192,7 +192,7 @@ def _first_of_others(shown: Shown) -> dict[str, float]:
 
 
 def _attractors(shown: Shown) -> Iterator[Block]:
-    """Attractors with periods, motions, ranges and shares; pictures of them."""
+    """Yield the attractors with periods, motions, ranges and basin fractions, and figures of them."""
     known = shown.options_of("attractors")
     if not known:
         yield _missing(shown, "attractors")
@@ -229,7 +229,7 @@ def _attractors(shown: Shown) -> Iterator[Block]:
 
 
 def _counted(rows: list[dict[str, Any]], told: str) -> str:
-    """Numbers of attractors and of other sets, and what the cells end on."""
+    """Return the numbers of attractors and of other sets, and the sentence on the cells' ends."""
     attract = {r["attractor_id"] for r in rows if r["stability"] == "attracts"}
     others = {r["attractor_id"] for r in rows} - attract
     more = f", {len(others)} other set{'s' * (len(others) != 1)}" if others else ""
@@ -237,7 +237,7 @@ def _counted(rows: list[dict[str, Any]], told: str) -> str:
 
 
 def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, float]:
-    """Values of the axes at which most attractors coexist, the first of equals."""
+    """Return the axis values at which most attractors coexist, the first of equals."""
     counts: dict[tuple[float, ...], int] = {}
     for row in rows:
         place: tuple[float, ...] = tuple(row[name] for name in axes)
@@ -249,7 +249,7 @@ def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, flo
 def _attractor_grid(
     ds: xr.Dataset, rows: list[dict[str, Any]], axes: tuple[str, ...]
 ) -> tuple[list[str], list[list[str]]]:
-    """Return a line per attractor: kind, period, motion, where it exists, largest share with its interval."""
+    """Return a row per attractor: kind, period, motion, ranges, largest fraction with its interval."""
     motion, sampled = any("side" in r for r in rows), any("fraction" in r for r in rows)
     names = ["", "kind", "stability", "shown by", "period", *(["motion"] if motion else []), *axes, "cells"]
     names += ["share (95 % interval)"] if sampled else []
@@ -269,7 +269,7 @@ def _attractor_grid(
 
 
 def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
-    """Return the largest share of an attractor, with its interval and where that is."""
+    """Return the largest basin fraction of an attractor, with its interval and place."""
     best = max(rows, key=lambda row: float(np.nan_to_num(row["fraction"], nan=-1.0)))
     if not np.isfinite(best["fraction"]):  # it attracts nowhere
         return "-"
@@ -281,7 +281,7 @@ def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
 
 
 def _analyses(shown: Shown) -> Iterator[Part]:
-    """Return a section for every other analysis: its table and its figure, or how to get it."""
+    """Yield a section for every other analysis: table and figure, or the command that computes it."""
     for name in SHOWN[1:]:
         if not _suits(shown, name):
             continue
@@ -293,8 +293,8 @@ def _analyses(shown: Shown) -> Iterator[Part]:
 
 
 def _suits(shown: Shown, name: str) -> bool:
-    """Whether an analysis can say something of a run of this kind."""
-    if shown.run.spec.recorded is not None:  # its drive ends, so that no cell can be run on
+    """Return whether an analysis applies to a run of this kind."""
+    if shown.run.spec.recorded is not None:  # the recording ends, so no cell can be integrated further
         return False
     if name == "hysteresis":
         return shown.run.spec.continuation is not None and shown.run.spec.continuation.direction == "both"
@@ -313,7 +313,7 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     unit = str(found[path].attrs.get("units", "1")) if path in found.coords else "1"
     axis = f"{path} [{unit}]" if unit != "1" else path
     rows = [_with_letters(row, axis) for row in function_of(ANALYSES[name].table)(found).rows]
-    # as they were settled, so that a page made from what is stored by now is the same
+    # the settled options, so that a page made from the stored result is the same
     options = settled_options(name, found.attrs)
     command = command_of(f"analyse {name}", options, shown.directory)
     if rows:
@@ -336,7 +336,7 @@ _OF_ATTRACTORS = {
 
 
 def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """Return a row in which attractors have the letters of the figures, and ends of a range their axis."""
+    """Return a row with letters for attractors and the axis' name for ends of a range."""
     found: dict[str, Any] = {}
     for name, value in row.items():
         if name in _OF_ATTRACTORS:
@@ -347,7 +347,7 @@ def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
 
 
 def _exponents(shown: Shown) -> Iterator[Block]:
-    """Lyapunov exponents of the cube, if it has them."""
+    """Yield the Lyapunov exponents of the cube, if it has them."""
     if shown.run.spec.recorded is not None:
         return
     if "lyapunov" not in shown.run.spec.products:
@@ -364,7 +364,7 @@ def _exponents(shown: Shown) -> Iterator[Block]:
 
 
 def provenance_of(run: AnalysedRun, spec: str = "SPEC") -> Iterator[Block]:
-    """Command, digests and versions of a run, and its specification; no host and no path of a home."""
+    """Yield command, digests, versions and specification of a run, without host and home path."""
     info = run.info
     made = dict(info.versions)
     facts = {
@@ -380,7 +380,7 @@ def provenance_of(run: AnalysedRun, spec: str = "SPEC") -> Iterator[Block]:
 
 
 def _drawn(shown: Shown, name: str, caption: str, **options: Any) -> Iterator[Block]:
-    """Return a figure, or the sentence that says why there is none."""
+    """Yield a figure, or a note with the reason why it was not drawn."""
     try:
         drawn = figure(shown.run, name, options)
     except SpecError as error:
@@ -397,7 +397,7 @@ def _missing(shown: Shown, name: str) -> Note:
 
 
 def command_of(words: str, options: Mapping[str, Any], place: str) -> str:
-    """Return the command that gives one thing alone."""
+    """Return the command for one analysis or figure."""
     verb, _, name = words.partition(" ")
     model = (ANALYSES if verb == "analyse" else FIGURES)[name].options
     parts = []
@@ -414,5 +414,5 @@ def command_of(words: str, options: Mapping[str, Any], place: str) -> str:
 
 
 def text_of_option(value: Any) -> str:
-    """Spell the value of an option for the command line."""
+    """Format the value of an option for the command line."""
     return " ".join(f"{part:.15g}" for part in value) if isinstance(value, list | tuple) else str(value)

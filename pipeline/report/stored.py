@@ -1,4 +1,4 @@
-"""What was found in a run already: results in its ``derived/`` that belong to the cells as they are."""
+"""Find the stored results of a run that belong to its present cells."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from pipeline.store.run import Run
 
 
 def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
-    """Return the options of every stored result of an analysis that `pipeline.runs.derive.derive` would take.
+    """Return the options of every stored result that `pipeline.runs.derive.derive` would use.
 
     Parameters
     ----------
     run
         An opened run.
     name
-        Of the analysis.
+        Name of the analysis.
 
     Returns
     -------
@@ -47,10 +47,9 @@ def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
 
 
 def settled_options(name: str, attrs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that a result of an analysis was found with, as its attributes hold them.
+    """Return the options of a stored result that differ from the defaults.
 
-    What was left open is settled in them, like a range that is that of the axis: those that differ from their
-    defaults.
+    Options that were left open are filled in, such as a range that defaults to the axis'.
     """
     given = json.loads(str(attrs["derived_options"]))
     found: dict[str, Any] = ANALYSES[name].options.model_validate(_tuples(given)).changed()
@@ -58,7 +57,7 @@ def settled_options(name: str, attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _tuples(value: Any) -> Any:
-    """Lists of JSON as the tuples that options hold."""
+    """Convert the lists of JSON to the tuples that options hold."""
     if isinstance(value, dict):
         return {name: _tuples(part) for name, part in value.items()}
     return tuple(_tuples(part) for part in value) if isinstance(value, list) else value

@@ -1,4 +1,4 @@
-"""A study: what is computed, which figures are drawn of it, what is claimed of them; read from TOML."""
+"""Read a study from TOML: its runs, its figures, and its claims."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from pipeline.spec.problems import SpecError, problems_of, unknown_name, validat
 from pipeline.spec.tables import Table
 
 STUDY = "study.toml"
-"""File of a study that ships, in a folder of its name."""
+"""File name of a study that ships; its folder has the study's name."""
 
 
 class RunTable(Table):
-    """``[runs.NAME]``."""
+    """A table ``[runs.NAME]``: a run of the study."""
 
     spec: str = Field(
-        description="Specification: a file, seen from the study, or the name of one that ships."
+        description="Specification: a file, relative to the study, or the name of one that ships."
     )
 
 
 class RecordingTable(Table):
-    """``[recordings.NAME]``."""
+    """A table ``[recordings.NAME]``: a recording of a virtual rig."""
 
-    rig: str = Field(description="Virtual rig: a file, seen from the study.")
+    rig: str = Field(description="Virtual rig: a file, relative to the study.")
 
 
 class TorqueTable(Table):
-    """``[torques.NAME]``."""
+    """A table ``[torques.NAME]``: torque readings that are fitted."""
 
     header: str = Field(description="Header of torque readings: a file, or the name of one that ships.")
 
 
 class PictureTable(Table):
-    """``[[figures.pictures]]``."""
+    """A table ``[[figures.pictures]]``: a picture of a figure."""
 
     kind: Literal["plot", "quantities", "recording", "series", "torques"] = Field(
         description="plot: a figure of a run, by the name of its command; quantities: quantities of the "
@@ -47,98 +47,104 @@ class PictureTable(Table):
         "torques: a figure of a fit of torque readings."
     )
     of: str = Field(description="Name of the run, the recording or the torque readings.")
-    figure: str = Field("", description="Which figure of a run or of torque readings.")
-    quantities: Annotated[tuple[str, ...], Field(strict=False)] = Field((), description="Which quantities.")
+    figure: str = Field("", description="Name of the figure of a run or of torque readings.")
+    quantities: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        (), description="Names of the quantities."
+    )
     frequency_hz: Annotated[float, Field(gt=0)] | None = Field(None, description="Drive frequency [Hz].")
-    caption: str = Field(description="A sentence below it.")
+    caption: str = Field(description="Sentence below the picture.")
     options: dict[str, Any] = Field({}, description="Options of the figure, as its command has them.")
 
 
 class ClaimTable(Table):
-    """``[[figures.claims]]``."""
+    """A table ``[[figures.claims]]``: a claim with the measure that decides it."""
 
-    statement: str = Field(description="What is claimed, in words of one's own.")
-    source: str = Field(description="Who claims it, and where.")
-    measure: str = Field(description="What measures it, see pipeline.report.measures.")
+    statement: str = Field(description="The claim, paraphrased.")
+    source: str = Field(description="Author and place of the claim.")
+    measure: str = Field(description="Name of the measure, see pipeline.report.measures.")
     of: Annotated[tuple[str, ...], Field(strict=False, min_length=1)] = Field(
-        description="What is measured: names of runs, recordings or torque readings."
+        description="Names of the measured runs, recordings or torque readings."
     )
     options: dict[str, Any] = Field({}, description="Options of the measure.")
     least: float = Field(-math.inf, allow_inf_nan=True, description="Least value that meets the claim.")
     most: float = Field(math.inf, allow_inf_nan=True, description="Largest value that meets the claim.")
-    unit: str = Field("", description="Unit of these.")
+    unit: str = Field("", description="Unit of least and most.")
     step: Annotated[float, Field(gt=0)] | None = Field(
-        None, description="Coarsest step of the axis that can decide; with a coarser one it is undecided."
+        None, description="Coarsest step of the axis that can decide the claim."
     )
     n: Annotated[int, Field(ge=1)] | None = Field(
-        None, description="Fewest cells (or curves, or periods) that can decide."
+        None, description="Fewest cells (or curves, or periods) that can decide the claim."
     )
     calibrated: bool = Field(
-        False, description="Whether parameters were calibrated on it: it is no test then."
+        False, description="Whether parameters were calibrated on the claim, so that it is no test."
     )
-    required: bool = Field(False, description="Whether the command fails where it is contradicted.")
+    required: bool = Field(False, description="Whether the command fails if the claim is contradicted.")
 
 
 class FigureTable(Table):
-    """``[[figures]]``."""
+    """A table ``[[figures]]``: one or several figures of the paper."""
 
-    number: str = Field(description="Its number, or several.")
-    title: str = Field(description="What it is.")
-    says: str = Field("", description="What the text says of it, in words of one's own, with the place.")
-    note: str = Field("", description="What differs here.")
+    number: str = Field(description="Number of the figure, or several numbers.")
+    title: str = Field(description="Title of the figure.")
+    says: str = Field("", description="Statement of the paper's text, paraphrased, with its place.")
+    note: str = Field("", description="Difference from the paper.")
     pictures: Annotated[tuple[PictureTable, ...], Field(strict=False)] = Field(
-        (), description="What is drawn."
+        (), description="Pictures of the figure."
     )
-    claims: Annotated[tuple[ClaimTable, ...], Field(strict=False)] = Field((), description="What is claimed.")
+    claims: Annotated[tuple[ClaimTable, ...], Field(strict=False)] = Field(
+        (), description="Claims about the figure."
+    )
 
     @property
     def numbers(self) -> list[str]:
-        """Numbers of the figures that it stands for."""
+        """Numbers of the paper's figures in this section."""
         return self.number.replace(",", " ").split()
 
     @property
     def needs(self) -> set[str]:
-        """Names of all that it is made from."""
+        """Names of all runs, recordings and torque readings that the figure needs."""
         return {p.of for p in self.pictures} | {name for claim in self.claims for name in claim.of}
 
 
 class StudyTable(Table):
-    """A study, whole."""
+    """The whole study."""
 
     title: str = Field(description="Title of the report.")
-    source: str = Field(description="What is reproduced: the citation.")
-    about: Annotated[tuple[str, ...], Field(strict=False)] = Field((), description="What a reader must know.")
-    runs: dict[str, RunTable] = Field({}, description="What is computed.")
-    recordings: dict[str, RecordingTable] = Field({}, description="What virtual rigs record.")
+    source: str = Field(description="Citation of the reproduced paper.")
+    about: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        (), description="Paragraphs that introduce the report."
+    )
+    runs: dict[str, RunTable] = Field({}, description="Runs that are computed.")
+    recordings: dict[str, RecordingTable] = Field({}, description="Recordings of virtual rigs.")
     torques: dict[str, TorqueTable] = Field({}, description="Torque readings that are fitted.")
     figures: Annotated[tuple[FigureTable, ...], Field(strict=False, min_length=1)] = Field(
-        description="The figures, in order."
+        description="Figures, in order."
     )
 
 
 class Study:
-    """A study and where it stands.
+    """A study with its name and its file.
 
     Parameters
     ----------
     name
-        By which it was asked for.
+        Name of the study.
     path
-        Its file.
+        Path of the study's file.
     table
-        What it says.
+        Content of the file.
     """
 
     def __init__(self, name: str, path: Path, table: StudyTable) -> None:
         self.name, self.path, self.table = name, path, table
 
     def file(self, name: str) -> Path:
-        """Return a file that the study names, seen from it."""
+        """Return the path of a file that the study names."""
         return self.path.parent / name
 
 
 def shipped_studies() -> dict[str, Path]:
-    """Paths of the studies that ship, by name."""
+    """Return the paths of the studies that ship, by name."""
     try:
         folder = Path(str(resources.files("workflows")))
     except ModuleNotFoundError:
@@ -147,12 +153,12 @@ def shipped_studies() -> dict[str, Path]:
 
 
 def load_study(name: str | Path) -> Study:
-    """Read a study: a file, or the name of one that ships.
+    """Read a study: a file, or the name of a study that ships.
 
     Raises
     ------
     SpecError
-        Naming all that is wrong with it: keys, names of what it is made from, measures.
+        If keys, names or measures are wrong; the message lists all problems.
     """
     path, shipped = Path(name), shipped_studies()
     if not path.suffix and str(name) in shipped:
@@ -170,7 +176,7 @@ def load_study(name: str | Path) -> Study:
 
 
 def _problems(table: StudyTable) -> list[str]:
-    """Sentences on names that nothing has."""
+    """Return problems with names that do not exist."""
     from pipeline.report.measures import MEASURES
 
     known = [*table.runs, *table.recordings, *table.torques]
@@ -194,7 +200,7 @@ def _problems(table: StudyTable) -> list[str]:
 
 
 def _plot_problems(at: str, picture: PictureTable) -> list[str]:
-    """Sentences on the figure of a run that nobody draws, and on options that it does not have."""
+    """Return problems with the figure of a run: an unknown name, or unknown options."""
     if picture.figure not in FIGURES:
         return [f"{at}.figure: {unknown_name('figure', picture.figure, FIGURES)}"]
     try:

@@ -1,4 +1,4 @@
-"""What a fit of torque curves says of the law that is fitted: measures and figures."""
+"""Measure and draw fits of torque curves for a study."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DRAWS, _SEED = 2000, 2018
 
 
 def measured(header: str, folder: Path) -> Measurement:
-    """Read torque readings: a header by its path, seen from a folder, or the name of one that ships."""
+    """Read torque readings by the path of their header, relative to a folder, or by a shipped name."""
     from pipeline.rig.magnet.measurement import find_measurement, read_measurement
 
     own = folder / header
@@ -35,7 +35,7 @@ def fitted(readings: Measurement) -> Outcome:
 
 
 def drawn(outcome: Outcome, name: str) -> DataFigure:
-    """Draw one of `pipeline.rig.magnet.figures.FIGURES`."""
+    """Draw a figure of `pipeline.rig.magnet.figures.FIGURES`."""
     from pipeline.rig.magnet.figures import FIGURES
 
     if name not in FIGURES:
@@ -44,7 +44,7 @@ def drawn(outcome: Outcome, name: str) -> DataFigure:
 
 
 def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Share of the curves that a bump of their own describes with at least ``r2``."""
+    """Return the fraction of curves whose own bump fits with at least ``r2``."""
     from pipeline.analysis.intervals import binomial_interval
 
     r2 = np.array([fit.quality.r2 for fit in outcome.curves])
@@ -55,9 +55,9 @@ def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
 
 
 def gain_over_dipoles(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """How much of what point dipoles leave over (in squares) the joint fit explains: 1 is all, 0 nothing.
+    """Return the fraction of the point dipoles' squared residuals that the joint fit removes.
 
-    The interval is a bootstrap over whole curves, whose residuals may be as alike as they like.
+    The interval is a bootstrap over whole curves, so residuals within a curve may be correlated.
     """
     own, other = (_squares(outcome, r) for r in (outcome.joint.residuals, outcome.dipoles.residuals))
     rng = np.random.default_rng(_SEED)
@@ -74,9 +74,9 @@ def _squares(outcome: Outcome, residuals: np.ndarray) -> np.ndarray:
 
 
 def width_spread(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """How much the bumps' widths change with the locked angle, as a share of their mean.
+    """Return the change of the bumps' widths over the locked angle, relative to their mean.
 
-    A parabola in the locked angle is fitted to the widths; its range over the angles measured is divided by
+    A parabola in the locked angle is fitted to the widths. Its range over the measured angles is divided by
     its mean. The interval is a bootstrap over the curves.
     """
     width = np.array([_width(fit.values) for fit in outcome.curves])
@@ -102,7 +102,7 @@ def _width(values: Mapping[str, float]) -> float:
 
 
 def signs_apart(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Share of the readings whose torque has the sign of their side of the fitted transition line."""
+    """Return the fraction of readings whose torque has the sign of their side of the transition line."""
     from magpend_core.models.pendulum import magnet_torque as laws
     from pipeline.analysis.intervals import binomial_interval
 

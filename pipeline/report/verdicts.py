@@ -1,4 +1,4 @@
-"""Verdicts on statements: what came out, with its interval, against what is claimed."""
+"""Judge claims: compare an interval with a claimed range."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from enum import Enum
 
 
 class Verdict(Enum):
-    """Whether a statement holds.
+    """A verdict on a claim.
 
-    A statement on which parameters were calibrated is no test of anything: it has a verdict of its own,
-    whatever came out.
+    A claim on which parameters were calibrated tests nothing. It has its own verdict, whatever the result.
     """
 
     MET = "met"
@@ -19,12 +18,12 @@ class Verdict(Enum):
 
     @property
     def words(self) -> str:
-        """What people read."""
+        """Verdict in words."""
         return self.value
 
     @property
     def css(self) -> str:
-        """Class of the block on a page."""
+        """CSS class of the block on a page."""
         return self.name.lower().replace("_", "-")
 
     def __str__(self) -> str:
@@ -37,14 +36,14 @@ def judged(low: float, high: float, least: float, most: float) -> Verdict:
     Parameters
     ----------
     low, high
-        The interval in which the measured number lies with its confidence; NaN where nothing was measured.
+        Confidence interval of the measured number; NaN if nothing was measured.
     least, most
-        What is claimed, infinite where it has no bound.
+        Claimed range; infinite on a side without a bound.
 
     Returns
     -------
     Verdict
-        Met if the whole interval lies within the claim, not met if none of it does, otherwise undecided.
+        Met if the interval lies inside the claimed range, not met if it lies outside, otherwise undecided.
     """
     if not low <= high:  # NaN too
         return Verdict.UNDECIDED

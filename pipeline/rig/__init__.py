@@ -1,1 +1,1 @@
-"""The bench: recordings, the magnet torque, identification, measured beside computed diagrams."""
+"""Work with a test rig: recordings, magnet torque, identification, measured diagrams."""

@@ -1,4 +1,4 @@
-"""From a recording to a drive file: what the motor did, as `pipeline.spec.drives` reads it."""
+"""Make a drive file from a recording, in the format that `pipeline.spec.drives` reads."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from pipeline.spec.problems import SpecError
 Floats = npt.NDArray[np.float64]
 
 LONG = 1.5
-"""A period that is longer than the median by this factor has perhaps lost an edge."""
+"""Factor over the median period above which a period may have lost an edge."""
 
 
 @dataclass(frozen=True)
 class DriveFile:
-    """A drive file before it is written, and what is in it.
+    """The text of a drive file, with a summary of it.
 
     Attributes
     ----------
     text : str
-        Its content.
+        Content of the file.
     timing : Timing or None
-        Frequency, jitter and duty cycle by its edges; None for a torque that is not periodic.
+        Frequency, jitter and duty cycle of its edges; None for a torque that is not periodic.
     n_rows : int
-        Of its table.
+        Rows of the file's table.
     n_samples : int
-        Of the recording.
+        Samples of the recording.
     error : float
-        Largest difference between the torque's samples and the lines of the file; 0 for edges.
+        Largest distance of the torque's samples from the file's interpolated torque; 0 for edges.
     notes : tuple of str
-        What looks as if an edge had been missed.
+        Warnings about periods that may have lost an edge.
     """
 
     text: str
@@ -47,22 +47,23 @@ class DriveFile:
 
 
 def drive_file(recording: xr.Dataset, kind: str, *, tolerance: float = 0.0) -> DriveFile:
-    """Make a drive file of a recording.
+    """Make a drive file from a recording.
 
     Parameters
     ----------
     recording
-        As `pipeline.rig.recordings.read_recording` gives it, with a drive, in one piece.
+        Recording from `pipeline.rig.recordings.read_recording`, with a drive, in one piece.
     kind
-        ``"edges"``: the instants at which the drive switches; ``"torque"``: its values.
+        ``"edges"`` for the times at which the drive switches; ``"torque"`` for its values.
     tolerance
-        Samples of a torque are left out that lie within this of the lines between those that stay [N m].
+        Samples of a torque are dropped if linear interpolation between the others meets them within this
+        distance [N m].
 
     Raises
     ------
     SpecError
-        If there is no drive, it is a signal and a torque is asked for, the recording has a gap, or it has not
-        what a drive file needs: two rising edges with one falling edge between each two.
+        If there is no drive, if a torque is asked for and the drive is a signal, if the recording has a gap,
+        or if it lacks two rising edges with one falling edge between each two.
     """
     problems = _problems(recording, kind, tolerance)
     if problems:
@@ -98,7 +99,7 @@ def _problems(recording: xr.Dataset, kind: str, tolerance: float) -> list[str]:
 
 
 def _head(recording: xr.Dataset, what: str, kind: str) -> list[str]:
-    """Remarks on where a drive comes from, and the header."""
+    """Return a comment that names the recording, and the header of the table."""
     attrs = recording.attrs
     simulated = " (simulated)" if attrs.get("simulated") else ""
     source = f"{attrs.get('file', 'a recording')}{simulated}, sha256 {attrs.get('sha256', 'not known')}"
@@ -144,7 +145,7 @@ def _torque(recording: xr.Dataset, tolerance: float) -> DriveFile:
     kept = thinned(time, level, tolerance)
     try:
         timing: Timing | None = edges_of(recording.isel(sample=inside)).frequency()
-    except SpecError:  # it need not switch
+    except SpecError:  # a torque need not switch
         timing = None
     rows = [f"{t!r},{x!r}" for t, x in zip(time[kept].tolist(), level[kept].tolist(), strict=True)]
     text = "\n".join([*_head(recording, "Torque", TORQUE), *rows]) + "\n"
@@ -153,7 +154,7 @@ def _torque(recording: xr.Dataset, tolerance: float) -> DriveFile:
 
 
 def thinned(time: Floats, level: Floats, tolerance: float) -> npt.NDArray[np.int64]:
-    """Choose samples such that the lines between them pass all others within a tolerance.
+    """Select samples so that linear interpolation between them meets all others within a tolerance.
 
     Parameters
     ----------
@@ -165,8 +166,8 @@ def thinned(time: Floats, level: Floats, tolerance: float) -> npt.NDArray[np.int
     Returns
     -------
     ndarray
-        Numbers of the samples that stay, the first and the last among them. From each, the line goes on as
-        long as one slope serves all that it passes.
+        Indices of the selected samples; the first and the last are included. Each line is extended as long as
+        one slope meets all samples on the way.
     """
     kept, low, high = [0], -np.inf, np.inf
     for i in range(1, len(time)):

@@ -1,8 +1,8 @@
-"""Edges of a measured drive signal, and what they say of its frequency, jitter and duty cycle.
+"""Detect the edges of a measured drive signal; estimate its frequency, jitter and duty cycle.
 
-The motor of a rig is told to switch; when it did is measured. The instants at which the signal rises through
-its middle are the sections' instants, and a line through them against their number is the drive's period:
-with n edges its error falls as n^-3/2; counting periods reaches one sample over n.
+A recording shows when the motor of a rig did switch. The sections lie at the times at which the signal rises
+through its middle. The slope of a line through these times against their number is the drive period. With n
+edges its error falls as n^-3/2; that of counting periods is one sampling interval over n.
 """
 
 from __future__ import annotations
@@ -22,28 +22,30 @@ Floats = npt.NDArray[np.float64]
 
 DRIVE = "drive"
 _LEAST_CONTRAST = 6.0
-"""Least distance of the two levels in units of the noise: white noise alone splits into halves 1.35 apart."""
+"""Least distance of the two levels in units of the noise. White noise alone splits into halves 1.35 apart."""
 _MOST_JITTER = 0.2
-"""Edges that scatter by more than this share of a period about a line are no periodic drive."""
+"""Largest jitter of a periodic drive, as a fraction of its period."""
 _HARMONICS = 40
-"""Of the sawtooth by which instants are rounded to samples."""
+"""Harmonics of the sawtooth that describes the rounding of edge times to samples."""
 _DRIFTS = 9
 _GAP = 1.5
-"""A step in time of so many sampling intervals is a gap: an edge inside it has no instant."""
+"""Step in time, in sampling intervals, from which on it is a gap. An edge inside a gap has no known time."""
 
 
 class Timing(NamedTuple):
-    """What a line through the rising edges says; errors are standard errors.
+    """The frequency, jitter and duty cycle from a line through the rising edges.
+
+    Errors are standard errors.
 
     Attributes
     ----------
     frequency_hz, frequency_error_hz : float
     jitter_s : float
-        Root mean square of the edges about the line [s].
+        Root mean square distance of the edges from the line [s].
     duty_cycle, duty_cycle_error : float
-        Share of the period in the high state; NaN if no falling edge lies between rising ones.
+        Fraction of the period in the high state; NaN if no falling edge lies between rising ones.
     n_periods : int
-        From the first edge to the last.
+        Number of periods from the first edge to the last.
     """
 
     frequency_hz: float
@@ -56,17 +58,17 @@ class Timing(NamedTuple):
 
 @dataclass(frozen=True)
 class Edges:
-    """Instants at which a drive signal passes the middle between its two levels.
+    """The times at which a drive signal crosses the middle between its two levels.
 
     Attributes
     ----------
     rising, falling : ndarray
-        Instants [s], rising in time.
+        Times of the edges [s], in rising order.
     resolution_s : float
-        Sampling interval if the signal switches from one sample to the next, so that an instant is only known
-        to lie between two samples; 0 if samples lie on the flanks.
+        Sampling interval if the signal switches between two samples, so that an edge is only known to lie
+        between them [s]; 0 if samples lie on the flanks.
     noise_s : float
-        Standard error of an instant [s] that the signal's noise leaves on its flanks.
+        Standard error of an edge's time from the signal's noise on its flanks [s].
     """
 
     rising: Floats
@@ -76,20 +78,20 @@ class Edges:
 
     @property
     def error_s(self) -> float:
-        """Standard error of an instant [s], of sampling and the signal's noise: not of the drive itself."""
+        """Standard error of an edge's time from sampling and noise [s], without the drive's own jitter."""
         return math.hypot(self.resolution_s / math.sqrt(12), self.noise_s)
 
     def between(self, start_s: float, end_s: float) -> Edges:
-        """Edges in ``start_s <= t < end_s``."""
+        """Return the edges in ``start_s <= t < end_s``."""
         rising, falling = ((t[(t >= start_s) & (t < end_s)]) for t in (self.rising, self.falling))
         return replace(self, rising=rising, falling=falling)
 
     def frequency(self) -> Timing:
-        """Fit a line through the rising edges against their number: frequency, jitter and duty cycle.
+        """Fit a line through the rising edges against their number; return frequency, jitter and duty cycle.
 
-        Edges that are missing in between are counted by the median distance of neighbours. The standard
-        errors take the edges' jitter as independent, and count what sampling hides: where edges fall on the
-        same few places between two samples, their scatter says little of an offset of up to half of one.
+        Missing edges are counted by the median distance of neighbours. The standard errors assume independent
+        jitter. They include the rounding to samples: if edges fall on the same few places between samples,
+        their scatter does not reveal an offset of up to half a sampling interval.
 
         Raises
         ------
@@ -117,37 +119,38 @@ class Edges:
         return Timing(1 / period, error / period**2, jitter, duty, duty_error, int(number[-1]))
 
     def _duty_cycle(self, fitted: Floats, period: float, jitter: float) -> tuple[float, float]:
-        """Mean share of the high state, and its standard error; each falling edge follows its rising one."""
+        """Return the mean duty cycle and its standard error; falling edges are paired with rising ones."""
         before = np.searchsorted(self.rising, self.falling, side="right") - 1
         high = np.where(before >= 0, self.falling - self.rising[before], np.inf)
         before, high = before[high < period], high[high < period]
         if high.size < 2:
             return math.nan, math.nan
         mean, even = float(high.mean()), np.full(high.size, 1 / high.size)
-        # both kinds of edges scatter alike, or the high states' own scatter is larger
+        # assume equal jitter for both kinds of edges, unless the high states scatter more
         each = max(jitter, float(high.std(ddof=1)) / math.sqrt(2))
         errors = [self._error(t, even, each) for t in (fitted[before], fitted[before] + mean)]
         return mean / period, math.hypot(*errors) / period
 
     def common_error(self, fitted: Floats, scatter: float) -> float:
-        """Standard error [s] that all instants on a line through the edges have in common.
+        """Return the standard error [s] that all times on a line through the edges share.
 
         Parameters
         ----------
         fitted
-            Instants of the rising edges on the line [s].
+            Times of the rising edges on the line [s].
         scatter
-            Root mean square of the edges about it [s].
+            Root mean square distance of the edges from it [s].
         """
         return self._error(fitted, np.full(fitted.size, 1 / fitted.size), scatter, drifts=1)
 
     def _error(self, fitted: Floats, weights: Floats, scatter: float, drifts: int = _DRIFTS) -> float:
-        """Standard error [s] of a weighted sum of instants.
+        """Return the standard error [s] of a weighted sum of edge times.
 
-        An instant known to a sample is rounded to its middle: a sawtooth of the instant, which is not
-        independent from edge to edge. Its harmonics, of unknown phase, are added up as they are, damped by
-        the jitter that blurs them; the rest of the scatter is independent. Since the line itself is known to
-        about a sample only, `drifts` of up to one over the whole are averaged.
+        A time known to one sample is rounded to the middle of the interval. The rounding error is a sawtooth
+        in the time, so it is not independent from edge to edge. Its harmonics have unknown phase; their
+        powers are added, damped by the jitter. The rest of the scatter is independent. The line itself is
+        known to about one sample, so the result is averaged over `drifts` slopes that differ by up to one
+        sample.
         """
         step = self.resolution_s
         if not step:
@@ -164,43 +167,44 @@ class Edges:
 
 
 def find_edges(time: npt.ArrayLike, drive: npt.ArrayLike, *, hysteresis: float | None = None) -> Edges:
-    """Find the instants at which a drive signal passes the middle between its two levels.
+    """Return the times at which a drive signal crosses the middle between its two levels.
 
     Parameters
     ----------
     time
-        Instants of the samples [s], rising, shape (n,).
+        Times of the samples [s], rising, shape (n,).
     drive
         Signal or torque in any unit, shape (n,); finite.
     hysteresis
-        Width of the band about the middle, in the signal's unit, that it must cross as a whole to count;
-        by default half of the distance of the levels.
+        Width of the band about the middle that an edge must cross completely, in the signal's unit; by
+        default half the distance of the levels.
 
     Returns
     -------
     Edges
-        Instants by linear interpolation at the middle; where noise crosses it several times on one flank,
-        the mean of the first and the last. A crossing inside a gap of the sampling is left out.
+        Times by linear interpolation at the middle. If noise crosses the middle several times on one flank,
+        the mean of the first and the last crossing counts. A crossing inside a gap of the sampling is left
+        out.
 
     Raises
     ------
     SpecError
-        If lengths differ, a value is not finite, time does not rise, the band is not inside the levels, or
-        the signal has no two levels that stand out of its noise: a constant drive.
+        If lengths differ, a value is not finite, time does not rise, or the band is not inside the levels;
+        also for a constant drive, which has no two levels above its noise.
     """
     t, x = _checked(time, drive)
     return _found([(t, x)], _switch(x, hysteresis))
 
 
 def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges:
-    """Edges of all pieces of a recording; none lies in a gap between two.
+    """Return the edges of all pieces of a recording. No edge lies in a gap between pieces.
 
     Parameters
     ----------
     recording
-        As `pipeline.rig.recordings.read_recording` gives it, with a drive.
+        Recording from `pipeline.rig.recordings.read_recording`, with a drive.
     hysteresis
-        As for `find_edges`.
+        Width of the band about the middle; see `find_edges`.
 
     Raises
     ------
@@ -216,13 +220,13 @@ def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges
     time, drive = recording["time"].values, recording[DRIVE].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
     parts = [_checked(time[piece == k], drive[piece == k]) for k in np.unique(piece)]
-    # the levels are those of all pieces: a short one may lie within one of them
+    # the levels come from all pieces together: a short piece may stay at one level
     return _found(parts, _switch(np.concatenate([x for _, x in parts]), hysteresis))
 
 
 @dataclass(frozen=True)
 class _Switch:
-    """Middle and distance of the levels, the width of the band about the middle, the noise of a sample."""
+    """Middle and distance of the two levels, width of the band about the middle, noise of a sample."""
 
     middle: float
     span: float
@@ -231,7 +235,7 @@ class _Switch:
 
 
 def _switch(x: Floats, hysteresis: float | None) -> _Switch:
-    """Levels of a signal; refuses one that has not two."""
+    """Estimate the levels of a signal; raise unless it has two."""
     low, high, noise = _levels(x)
     span = high - low
     if span <= _LEAST_CONTRAST * noise or span <= 0:
@@ -248,7 +252,7 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
 
 
 def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
-    """Edges of stretches of samples, in their order."""
+    """Return the edges of stretches of samples, in their order."""
     instants, rises, sharp, slopes, steps = [], [], [], [], [0.0]
     for t, x in parts:
         above = x - switch.middle
@@ -266,7 +270,7 @@ def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
     at, up = np.array(instants, np.float64), np.array(rises, bool)
     if not sharp or np.mean(sharp) > 0.5:
         return Edges(at[up], at[~up], max(steps) if sharp else 0.0)
-    # of two noisy samples on a flank, at a random place between them: sqrt(2/3) of one's noise
+    # an edge interpolated at a random place between two noisy samples has sqrt(2/3) of the noise of one
     return Edges(at[up], at[~up], 0.0, math.sqrt(2 / 3) * switch.noise / float(np.median(slopes)))
 
 
@@ -285,7 +289,7 @@ def _checked(time: npt.ArrayLike, drive: npt.ArrayLike) -> tuple[Floats, Floats]
 
 
 def _levels(x: Floats) -> tuple[float, float, float]:
-    """Lower and upper level, and a sample's noise, from second differences, which flanks hardly touch."""
+    """Return lower level, upper level and noise; the noise is estimated from second differences."""
     ends = np.percentile(x, [2, 98])
     middle = ends.mean()
     if ends[0] == ends[1]:
@@ -296,21 +300,21 @@ def _levels(x: Floats) -> tuple[float, float, float]:
 
 
 def _crossing(t: Floats, above: Floats) -> float:
-    """Instant of the sign change; mean of the first and the last if there are several."""
+    """Return the time of the sign change; the mean of the first and the last if there are several."""
     at = np.flatnonzero((above[:-1] > 0) != (above[1:] > 0))[[0, -1]]
     share = above[at] / (above[at] - above[at + 1])
     return float((t[at] + share * (t[at + 1] - t[at])).mean())
 
 
 def _numbers(rising: Floats) -> Floats:
-    """Number of each edge, in periods from the first; one that is missing is counted."""
+    """Return the number of each edge, in periods from the first; missing edges are counted."""
     gaps = np.diff(rising)
     steps = np.maximum(np.rint(gaps / np.median(gaps)), 1.0)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _line(number: Floats, rising: Floats) -> tuple[float, float]:
-    """Intercept and slope by least squares, about the means: no cancellation far from time 0."""
+    """Return intercept and slope by least squares, centred so that nothing cancels far from time 0."""
     centred = number - number.mean()
     slope = float(centred @ (rising - rising.mean()) / (centred @ centred))
     return float(rising.mean() - slope * number.mean()), slope

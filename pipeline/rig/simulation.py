@@ -1,4 +1,4 @@
-"""The specification of a virtual rig: what a person writes in TOML, validated as a whole."""
+"""Parse and validate the specification of a virtual rig as a whole."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from pipeline.spec.tables import Table
 
 
 class SensorTable(Table):
-    """``[sensors.STATE]``."""
+    """A table ``[sensors.STATE]``: a sensor of one state."""
 
     kind: Literal["potentiometer", "encoder"] = Field(
         description="Potentiometer (wraps, 0 to 5 V) or encoder."
@@ -33,28 +33,29 @@ class SensorTable(Table):
     noise: float = Field(default=0.0, ge=0.0, description="Standard deviation [the state's unit].")
     bits: Annotated[int, Field(ge=1, le=32)] | None = Field(default=None, description="Resolution.")
     dead_band: float = Field(
-        default=0.0, ge=0.0, lt=math.pi, description="Part of a turn not measured [rad]."
+        default=0.0, ge=0.0, lt=math.pi, description="Part of a turn that is not measured [rad]."
     )
 
 
 class SweepTable(Table):
-    """``sweep``: steps of equally many periods at evenly spaced frequencies."""
+    """The table ``sweep``: steps of equally many periods at evenly spaced frequencies."""
 
     start_hz: float = Field(gt=0.0, description="First frequency [Hz].")
     stop_hz: float = Field(gt=0.0, description="Last frequency [Hz]; below the first to sweep downwards.")
     num: int = Field(ge=2, le=10_000, description="Number of frequencies.")
-    n_periods: int = Field(ge=1, description="Drive periods at each.")
+    n_periods: int = Field(ge=1, description="Drive periods at each frequency.")
 
 
 class DriveTable(Table):
-    """``[drive]``: what the drive does, and how it is recorded."""
+    """The table ``[drive]``: the steps of the drive, and how it is recorded."""
 
-    kind: Literal["torque", "signal"] = Field(default="signal", description="What is recorded.")
+    kind: Literal["torque", "signal"] = Field(default="signal", description="Recorded quantity.")
     noise: float = Field(default=0.0, ge=0.0, description="Standard deviation [N m, or V].")
     steps: Annotated[tuple[dict[str, float], ...], Field(strict=False, min_length=1)] | None = Field(
-        default=None, description="One table each: frequency_hz, n_periods, and parameters that differ."
+        default=None,
+        description="Steps, one table each: frequency_hz, n_periods, and parameters that differ.",
     )
-    sweep: SweepTable | None = Field(default=None, description="Instead of steps.")
+    sweep: SweepTable | None = Field(default=None, description="Evenly spaced steps, instead of steps.")
 
     @model_validator(mode="after")
     def _one_of_both(self) -> DriveTable:
@@ -63,7 +64,7 @@ class DriveTable(Table):
         return self
 
     def tables(self) -> list[dict[str, float]]:
-        """Return the steps, those of a sweep written out."""
+        """Return the steps; a sweep is expanded to steps."""
         if self.sweep is None:
             return [dict(table) for table in self.steps or ()]
         s = self.sweep
@@ -72,27 +73,27 @@ class DriveTable(Table):
 
 
 class RigTable(Table):
-    """What stands at the top of the file."""
+    """The keys at the top of the file."""
 
     model: str | dict[str, Any] = Field(
-        description="The model, as in a specification: a name, a file or a table."
+        description="Model, as in a specification: a name, a file or a table."
     )
-    preset: str | None = Field(default=None, description="Of the model's parameters; by default its first.")
+    preset: str | None = Field(default=None, description="Preset of the model; by default the first.")
     parameters: dict[str, float] = Field(default={}, description="Values that differ from the preset [SI].")
     initial_state: dict[str, float] = Field(
         default={}, description="States by name, angles and rates also with _deg; the others are 0."
     )
-    sampling_rate_hz: float = Field(gt=0.0, description="Of all channels [Hz].")
+    sampling_rate_hz: float = Field(gt=0.0, description="Sampling rate of all channels [Hz].")
     duration_s: float | None = Field(
-        default=None, gt=0.0, description="Length [s]; by default that of the drive's steps."
+        default=None, gt=0.0, description="Length [s]; by default the length of the drive's steps."
     )
-    seed: int = Field(default=0, ge=0, description="Of the noise.")
-    drive: DriveTable | Literal["none"] = Field(default="none", description="The drive.")
-    sensors: dict[str, SensorTable] = Field(default={}, description="By state.")
+    seed: int = Field(default=0, ge=0, description="Seed of the noise.")
+    drive: DriveTable | Literal["none"] = Field(default="none", description="Drive of the rig.")
+    sensors: dict[str, SensorTable] = Field(default={}, description="Sensors by state.")
 
 
 NUMBERS = ("sampling_rate_hz", "duration_s", "seed")
-"""Keys that stand for themselves."""
+"""Keys at the top that are single numbers."""
 
 
 @dataclass(frozen=True)
@@ -102,14 +103,17 @@ class Rig:
     Attributes
     ----------
     parameters : Parameters
+        Parameters of the model.
     initial_state : tuple of float
-        In the model's units.
+        Initial state in the model's units.
     times : ndarray
-        (n,) [s].
+        Times of the samples, (n,) [s].
     drive : tuple of Step, optional
+        Steps of the drive; None for none.
     sensors : mapping
-        By name of a state, and of the drive.
+        Sensors by name of a state, and of the drive.
     seed : int
+        Seed of the noise.
     """
 
     parameters: Parameters
@@ -132,7 +136,7 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
-    """Check the specification of a virtual rig given as plain data; a preset's file is seen from `folder`.
+    """Validate the tables of a virtual rig; a preset's file is relative to `folder`.
 
     Raises
     ------
@@ -226,7 +230,7 @@ def _parameters(data: AnyMapping[str, Any], folder: str | Path, problems: list[s
 
 
 def _start(given: AnyMapping[str, Any], model: Model, problems: list[str]) -> tuple[float, ...]:
-    """Initial state from values by name, angles and rates also in degrees."""
+    """Return the initial state from values by name; angles and rates may be in degrees."""
     values = dict.fromkeys(model.state_names, 0.0)
     for key, value in given.items():
         name = state_of_key(key, model)

@@ -1,7 +1,7 @@
-"""A virtual rig: a model, its drive and its sensors, recorded as a laboratory records a real one.
+"""Simulate a virtual rig: a model with its drive and sensors, recorded as in a laboratory.
 
-What it gives is simulated, and says so: the readings of sensors with noise, finite resolution and dead bands,
-which go through the same mapping, checks and files as measured ones.
+The readings have noise, finite resolution and dead bands. They go through the same mapping, checks and files
+as measured ones, and are marked as simulated.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from magpend_core.models.parameters import Parameters
 
 GROUP = "rig"
-"""Group of the channels."""
+"""Group of the channels in a file."""
 
 SUPPLY_V = 5.0
 TRACK_V = (0.25, 4.75)
 """Voltages at the ends of a potentiometer's track."""
 
 DEAD_V = 0.1
-"""Below this voltage the wiper is off the track, where a resistor pulls it to 0 V."""
+"""Voltage below which the wiper is off the track, where a resistor pulls it to 0 V."""
 
 TURN = 2.0 * math.pi
 
@@ -47,16 +47,16 @@ class Sensor:
     ----------
     kind : str
         ``"potentiometer"``: an angle as a voltage from 0 to 5 V, which wraps at half a turn from 0.
-        ``"encoder"``: the state as it is, without end.
+        ``"encoder"``: the state itself, without wraps.
     noise : float
         Standard deviation of white noise [the state's unit], before it is quantised.
     bits : int, optional
-        Resolution: levels of 5 V, or of a turn of an encoder (of 1 unit of a state that is no angle); without
-        it, what floating-point numbers resolve.
+        Resolution in bits: of 5 V for a potentiometer, of a turn for an encoder (of 1 unit if the state is no
+        angle). None for full floating-point resolution.
     dead_band : float
         Part of a turn in which a potentiometer does not measure, half a turn from 0 [rad].
     offset : float
-        By how much it reads too much [the state's unit]; the mapping does not know.
+        Error that is added to the state [the state's unit]; the mapping does not correct it.
     """
 
     kind: Literal["potentiometer", "encoder"] = "encoder"
@@ -68,12 +68,12 @@ class Sensor:
 
 @dataclass(frozen=True)
 class DriveSensor:
-    """How the drive is recorded.
+    """The recording of the drive.
 
     Attributes
     ----------
     kind : str
-        ``"torque"``: the model's forcing as it is; ``"signal"``: its sign, as -1 and 1 [V].
+        ``"torque"``: the model's forcing; ``"signal"``: its sign, as -1 and 1 [V].
     noise : float
         Standard deviation of white noise [unit of the kind].
     """
@@ -84,14 +84,16 @@ class DriveSensor:
 
 @dataclass(frozen=True)
 class Step:
-    """Drive periods of one frequency.
+    """Consecutive drive periods of one frequency.
 
     Attributes
     ----------
     frequency_hz : float
+        Drive frequency [Hz].
     n_periods : int
+        Number of drive periods.
     values : mapping
-        Parameters that are different in this step, by name, such as the duty cycle, or an amplitude of 0.
+        Parameters that differ in this step, by name, such as the duty cycle, or an amplitude of 0.
     """
 
     frequency_hz: float
@@ -100,12 +102,12 @@ class Step:
 
     @property
     def duration_s(self) -> float:
-        """Length [s]."""
+        """Length of the step [s]."""
         return self.n_periods / self.frequency_hz
 
 
 TOLERANCE = 1e-11
-"""Relative and absolute tolerance of the rig's motion."""
+"""Relative and absolute tolerance of the integration."""
 
 Sensors = AnyMapping[str, Sensor | DriveSensor]
 
@@ -126,27 +128,27 @@ def record(
     parameters
         The model and its parameters.
     drive
-        What the drive does from time 0 on, one step after the other; the state is carried on. None for a
-        drive that does nothing: set the parameter of its amplitude to 0.
+        Steps of the drive from time 0 on; the state is continuous between them. None for no drive: then set
+        the parameter of its amplitude to 0.
     initial_state
         The model's states at time 0.
     times
-        (n,) evenly spaced instants from 0 on [s]; the steps must cover them.
+        Evenly spaced times from 0 on, (n,) [s]; the steps must cover them.
     sensors
-        By name of a state, and of the drive under ``drive``; the others are not recorded.
+        Sensors by name of a state, and of the drive under ``drive``; other states are not recorded.
     seed
-        Of the noise.
+        Seed of the noise.
 
     Returns
     -------
     Dataset
-        As `pipeline.rig.recordings.read_recording` gives it, with the attributes ``simulated`` and
-        ``parameters``, the true ones.
+        Recording as from `pipeline.rig.recordings.read_recording`, with the attributes ``simulated`` and
+        ``parameters`` (the true ones).
 
     Raises
     ------
     SpecError
-        With all that is wrong with the arguments.
+        If arguments are wrong; the message lists all problems.
     ArithmeticError
         If the trajectory diverges or meets the step limit.
     """
@@ -163,7 +165,7 @@ def readings(
     sensors: Sensors,
     seed: int,
 ) -> tuple[Raw, Mapping]:
-    """Return what the sensors of `record` read, and the mapping that makes states of it.
+    """Return the readings of the sensors of `record`, and the mapping that converts them to states.
 
     Returns
     -------
@@ -174,7 +176,7 @@ def readings(
     Raises
     ------
     SpecError, ArithmeticError
-        As for `record`.
+        See `record`.
     """
     instants = np.asarray(times, dtype=np.float64)
     _check(parameters, drive, instants, sensors)
@@ -253,12 +255,12 @@ def _sensor_problems(path: str, sensor: Sensor, is_angle: bool) -> list[str]:
 def _states(
     parameters: Parameters, drive: Sequence[Step] | None, start: np.ndarray, times: np.ndarray
 ) -> np.ndarray:
-    """Integrate; (n, n_states), angles not wrapped."""
+    """Integrate the model; return states, (n, n_states), angles not wrapped."""
     from magpend_core.sampling import sample
     from magpend_core.status import Status
 
     drives = None if drive is None else [_intervals(parameters, drive, times[-1])]
-    # finer than any fit to it: what comes back is the sensors' noise, not the integration's
+    # tighter than any fit to the recording, so that its errors are the sensors' alone
     found = sample(
         parameters.model.system, parameters.pack()[None], start[None], [times], drives=drives, rtol=TOLERANCE,
         atol=TOLERANCE,
@@ -270,7 +272,7 @@ def _states(
 
 
 def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> Any:
-    """The drive's periods, one by one, with the parameters that change."""
+    """Return the drive's periods one by one, with the parameters that change."""
     from magpend_core.sampling import Drive
 
     names = tuple(dict.fromkeys(name for step in drive for name in step.values))
@@ -285,7 +287,7 @@ def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> A
 def _potentiometer(
     channel: str, angle: np.ndarray, unit: str, sensor: Sensor, rng: np.random.Generator
 ) -> tuple[np.ndarray, ChannelMap, str]:
-    """Voltage of the wiper, the mapping back, the unit."""
+    """Return the voltage of the wiper, the mapping that inverts it, and the unit."""
     low, high = TRACK_V
     middle, per_rad = 0.5 * (low + high), (high - low) / (TURN - sensor.dead_band)
     folded = np.mod(angle + math.pi, TURN) - math.pi
@@ -306,7 +308,7 @@ def _potentiometer(
 def _encoder(
     channel: str, state: np.ndarray, unit: str, sensor: Sensor, rng: np.random.Generator
 ) -> tuple[np.ndarray, ChannelMap, str]:
-    """Reading in the state's unit, or in counts; the mapping back, the unit."""
+    """Return readings in the state's unit or in counts, the mapping that inverts them, and the unit."""
     noisy = state + sensor.noise * rng.standard_normal(len(state))
     if sensor.bits is None:
         return noisy, ChannelMap(channel=channel, unit=unit), unit
@@ -322,7 +324,7 @@ def _drive_channel(
     rng: np.random.Generator,
     step_s: float,
 ) -> tuple[Channel, DriveMap]:
-    """What is recorded of the drive."""
+    """Return the channel of the drive, and its mapping."""
     from magpend_core.pointwise import drive_level
 
     level = np.zeros(len(times))
@@ -331,7 +333,7 @@ def _drive_channel(
         end = begin + step.duration_s
         inside = (times >= begin - 1e-12) & (times < end - 1e-12)
         own = parameters.replace(**dict(step.values))
-        # a sample on an edge belongs to what follows
+        # a sample on an edge belongs to the interval after it
         level[inside] = drive_level(times[inside] - begin + 1e-12, own, step.frequency_hz)
         begin = end
     if sensor.kind == "signal":

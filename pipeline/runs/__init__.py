@@ -1,1 +1,1 @@
-"""What one does with a run: run, status, verify, zoom."""
+"""Carry out commands on runs: run, status, verify, derive, draw, extend, zoom."""

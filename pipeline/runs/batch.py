@@ -1,4 +1,4 @@
-"""Batch scripts as text, and the words of each batch system: to send, ask after and cancel a job."""
+"""Write batch scripts, and name each batch system's commands to send, query and cancel a job."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from pipeline.spec.clusters import Cluster, bytes_of, clock, hours_and_minutes, 
 
 @dataclass(frozen=True)
 class Words:
-    """Commands of a batch system.
+    """The commands of a batch system.
 
     Attributes
     ----------
     send : tuple of str
-        Reads a script, by its name or from its standard input, and prints the job's number.
+        Command that reads a script, by its name or from its standard input, and prints the job's number.
     ask : tuple of str
-        With a job's number behind it, prints the job's state while there is one.
+        Command that prints the state of a job whose number is appended, while the job exists.
     follow, cancel : str
-        For people, with the job's number behind it.
+        Commands for users, to which the job's number is appended.
     over : str
-        Regular expression of states that a job does not leave.
+        Regular expression of final states.
     number : str
-        Regular expression of the job's number in what `send` prints.
+        Regular expression of the job's number in the output of `send`.
     """
 
     send: tuple[str, ...]
@@ -36,7 +36,7 @@ class Words:
     number: str = r"(?P<job>\d+)"
 
     def job(self, output: str) -> str | None:
-        """A job's number in what `send` printed."""
+        """Return the job's number in the output of `send`; None if there is none."""
         match = re.search(self.number, output)
         return match["job"] if match else None
 
@@ -52,25 +52,25 @@ WORDS = {
 
 
 def is_whole(cluster: Cluster) -> bool:
-    """Whether one job holds all: the coordinator and its workers."""
+    """Return whether one job holds the coordinator and all workers."""
     return cluster.max_jobs == 1
 
 
 def coordinator_script(cluster: Cluster, name: str, log: str, folder: str, command: Sequence[str]) -> str:
-    """Batch script of the job in which the coordinator lives.
+    """Return the batch script of the coordinator's job.
 
     Parameters
     ----------
     cluster
-        What a job is.
+        Description of a job.
     name
-        Of the job.
+        Name of the job.
     log
-        Path of what the job says, without what the batch system adds to it.
+        Path of the job's output, without the suffix that the batch system adds.
     folder
-        Where the command is given.
+        Working directory of the command.
     command
-        Its words.
+        Words of the command.
     """
     whole = is_whole(cluster)
     cores = cluster.cores if whole else 1
@@ -86,7 +86,7 @@ def coordinator_script(cluster: Cluster, name: str, log: str, folder: str, comma
         "set -eo pipefail",
         f"cd {shlex.quote(folder)}",
         *cluster.prologue,
-        # in the shell's place: the batch system's signals reach it, and its exit code is the job's
+        # exec: signals of the batch system reach the command, and its exit code is the job's
         f"exec {shlex.join(command)}",
     ]
     return "\n".join(lines) + "\n"
@@ -120,7 +120,7 @@ def _pbs(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s:
 
 
 def _sge(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s: int) -> list[str]:
-    # cores come with the parallel environment among the directives; memory has a name of each site's own
+    # cores: set by the parallel environment among the directives; memory: its resource differs by site
     return [
         f"#$ -N {name}",
         f"#$ -o {log}.out",
@@ -151,7 +151,7 @@ _MARKS = {"slurm": "#SBATCH", "pbs": "#PBS", "sge": "#$", "lsf": "#BSUB"}
 
 
 def _directives(cluster: Cluster) -> list[str]:
-    """Lines of one's own; a job of one core needs no parallel environment."""
+    """Return the user's directives; a job of one core needs no parallel environment."""
     return [line for line in cluster.directives if is_whole(cluster) or not line.strip().startswith("-pe")]
 
 

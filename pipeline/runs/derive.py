@@ -1,18 +1,17 @@
-"""Results of analyses, computed once and kept in a run's ``derived/``.
+"""Compute results of analyses once, and keep them in a run's ``derived/``.
 
-A result is named by what decides its numbers: the digest of the committed cells, the analysis' name, its
-options, and the version of its code (`code_version`). `derive` returns what is stored under that name and
-computes it otherwise. A result that is damaged, or was left half written, is computed again; one of an
-earlier cube or an earlier version of the code stays until `prune` is called, and is never read.
+A result's key holds everything that decides its numbers: the digest of the committed cells, the analysis'
+name, its options, and the version of its code (`code_version`). `derive` returns the stored result with that
+key, or computes it. A damaged or incomplete result is computed again. A result of an earlier cube or an
+earlier version of the code is never read; it stays until `prune` is called.
 
-Each is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``, readable by
-``xarray.open_zarr(path, consolidated=False)``: options as JSON in the attribute ``derived_options``, words
-(``state``, ``direction``) as codes with the attribute ``words``. Two processes may derive at once: both
-compute, one of the two equal results stays.
+Each result is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. ``xarray.open_zarr(path,
+consolidated=False)`` reads it. The attribute ``derived_options`` holds the options as JSON. Labels
+(``state``, ``direction``) are codes with the attribute ``words``. If two processes derive the same result at
+once, both compute it, and one of the equal results stays.
 
-What was shown of a set by a longer extension holds for every analysis from then on: options that ask for less
-are raised to the largest budget with which attractors are kept (`most_evidence`), so that no two results
-contradict each other.
+A longer extension of cells counts for every later analysis: options that ask for less are raised to the
+largest budget of the kept attractors (`most_evidence`). Two results therefore never contradict each other.
 
 To add an analysis see `pipeline.products.product`.
 """
@@ -62,26 +61,26 @@ def _silent(_: str) -> None:
 
 @dataclass(frozen=True, repr=False)
 class AnalysedRun(Run):
-    """A run as analyses see it: with the other analyses of the same cells.
+    """A run for analyses, which can use other analyses of the same cells.
 
     Attributes
     ----------
     echo : callable
-        Prints a line.
+        Function that prints a line.
     """
 
     echo: Echo = _silent
 
     @classmethod
     def of(cls, source: Source, echo: Echo | None = None) -> AnalysedRun:
-        """Return what stands in a run directory now, or the cells that an opened run speaks of."""
+        """Open a run directory with its present commits, or return an opened run's cells."""
         run = Run.open(source)
         if isinstance(run, AnalysedRun) and echo is None:
             return run
         return cls(**{f.name: getattr(run, f.name) for f in fields(Run)}, echo=echo or _silent)
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Another analysis of the same cells; see `derive`."""
+        """Return another analysis of the same cells; see `derive`."""
         return derive(self, name, options)
 
 
@@ -92,7 +91,7 @@ def derive(
     *,
     echo: Echo | None = None,
 ) -> xr.Dataset:
-    """Return what an analysis finds in a run, stored or computed.
+    """Return the result of an analysis of a run, stored or computed.
 
     Parameters
     ----------
@@ -101,19 +100,20 @@ def derive(
     name
         One of `pipeline.products.registry.ANALYSES`.
     options
-        Those that are not as by default.
+        Options that differ from the defaults.
     echo
-        Prints a line; says what is computed, and why.
+        Function that prints a line about each computation and its reason.
 
     Returns
     -------
     Dataset
-        In memory; ``encoding["source"]`` is its folder, absent if it could not be written.
+        Result in memory. ``encoding["source"]`` is its folder; it is absent if the result could not be
+        written.
 
     Raises
     ------
     SpecError
-        If the analysis or an option is unknown or out of bounds, or the run has not what it takes.
+        If the analysis or an option is unknown or out of bounds, or if the run does not suit the analysis.
     RefusedError
         If there is no run.
     DamagedError
@@ -143,7 +143,7 @@ def derive(
 
 
 def stored(source: Source, name: str) -> xr.Dataset | None:
-    """Return what is kept of an analysis of a run's cells as they are now; nothing is computed.
+    """Return the stored result of an analysis of a run's present cells; nothing is computed.
 
     Parameters
     ----------
@@ -155,13 +155,13 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
     Returns
     -------
     Dataset or None
-        In memory: of the sound results of these cells and this version of the code that with the fewest
-        options other than by default, the first by its name among equals; None if there is none.
+        Result in memory; None if there is none. Among several sound results of these cells and this version
+        of the code it is the one with the fewest options other than the defaults, then the first by name.
     """
     run = Run.open(source)
     folder = run.info.files.below(DERIVED)
     places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
-    if not places:  # then the version, which takes a moment, does not matter
+    if not places:  # saves the time to compute the code's version
         return None
     current = {"cube_digest": run.digest, "analysis_version": code_version(name), "derived_product": name}
     found = []
@@ -177,16 +177,16 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
 
 
 def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
-    """Number of options of a result that are other than by default."""
+    """Return the number of a result's options that differ from the defaults."""
     try:
         options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {})).plain()
-    except SpecError:  # the run has not what they take
+    except SpecError:  # the run does not suit the defaults
         options = {}
     return sum(options.get(key) != value for key, value in _options_of(attrs).items())
 
 
 def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that a kept result was computed with.
+    """Return the options of a kept result.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _refuse_recorded(run: Run, name: str) -> None:
-    """Refuse a run under a recorded drive: an analysis runs cells on, under a drive that goes on."""
+    """Refuse a run with a recorded drive: analyses integrate cells further, but the recording ends."""
     if run.spec.recorded is not None:
         raise SpecError([
             f"{run.name}: its drive is the recording {run.spec.recorded.file}, and {name} goes on where "
@@ -214,12 +214,12 @@ def _refuse_recorded(run: Run, name: str) -> None:
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
-    """Return options with the run's own names, completed from it, once it has what a product takes.
+    """Return options with the run's own names, completed from it; refuse a run that does not suit a product.
 
     Raises
     ------
     SpecError
-        If it has not, with the directory's name.
+        If the run does not suit the product; the message names the directory.
     """
     with refused(run.name):
         options = named(run, options)
@@ -231,9 +231,9 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Return options with the largest effort of extension among the kept attractors that they would find.
+    """Return options with the largest effort of extension among the kept attractors of the same search.
 
-    Options without one are returned as they are.
+    Options without an effort are returned unchanged.
     """
     if not isinstance(options, IdentifyOptions):
         return options
@@ -243,7 +243,7 @@ def most_evidence(run: Run, options: Options) -> Options:
 
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
-    """Other options and effort of each kept search for attractors of these cells by this code."""
+    """Return other options and effort of each kept search for attractors of these cells by this code."""
     try:
         kept_here = products_in(run.info.files.below(DERIVED))
     except NotADirectoryError:
@@ -263,13 +263,13 @@ def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
 
 
 def _aside(options: IdentifyOptions) -> dict[str, Any]:
-    """Options aside from the effort."""
+    """Return the options without those of the effort."""
     effort = ("extend", "budget", "n_sample")
     return {name: value for name, value in options.plain().items() if name not in effort}
 
 
 def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
-    """Whether a kept result rests on less evidence than is kept by now."""
+    """Return whether a kept result rests on less evidence than other kept results."""
     name, given = str(attrs.get("derived_product")), _options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
         return False
@@ -279,7 +279,7 @@ def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
 
 @contextlib.contextmanager
 def refused(directory: str | Path) -> Iterator[None]:
-    """Turn what an analysis or a figure refuses into a sentence with the directory's name."""
+    """Turn the error of an analysis or figure into one that names the directory."""
     try:
         yield
     except SpecError:
@@ -295,7 +295,7 @@ def refused(directory: str | Path) -> Iterator[None]:
 
 
 def _key(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
-    """Attributes that name a result."""
+    """Return the attributes that form a result's key."""
     plain = {name: value for name, value in options.plain().items() if name not in analysis.ignores}
     parts = {
         "derived_product": analysis.name,
@@ -330,10 +330,11 @@ def _placed(ds: xr.Dataset, place: Files) -> xr.Dataset:
 
 
 def stale(source: Source) -> list[str]:
-    """Places of results of an earlier cube or an earlier version of the code, damaged ones, and leftovers.
+    """Return the places of results that are outdated or damaged, and of leftovers.
 
-    A leftover is what a process that was killed had begun to write; one younger than an hour may
-    belong to a process at work and is not listed.
+    Outdated results belong to an earlier cube or an earlier version of the code. A leftover was begun by a
+    process that was killed. Leftovers younger than an hour may belong to a running process and are not
+    listed.
     """
     return [place.name for place in _stale(Run.open(source))]
 
@@ -356,7 +357,7 @@ def _stale(run: Run) -> list[Files]:
 
 
 def prune(source: Source) -> list[str]:
-    """Remove what `stale` lists; returns it."""
+    """Remove the results that `stale` lists; return their places."""
     found = _stale(Run.open(source))
     for place in found:
         remove_product(place)

@@ -1,4 +1,4 @@
-"""Figures of a run by name: what ``magpend plot`` draws."""
+"""Draw figures of a run by name, as ``magpend plot`` does."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def figure(
     name
         One of `pipeline.products.registry.FIGURES`.
     options, more
-        Those that are not as by default; ``out`` and ``format`` are for the command line.
+        Options that differ from the defaults; ``out`` and ``format`` are for the command line.
     echo
-        Prints a line.
+        Function that prints a line.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def figure(
     Raises
     ------
     SpecError
-        If the figure or an option is unknown or out of bounds, or the run has not what it takes.
+        If the figure or an option is unknown or out of bounds, or if the run does not suit the figure.
     """
     if name not in FIGURES:
         raise SpecError([unknown_name("figure", name, FIGURES)])
@@ -65,7 +65,7 @@ def ready(
 
 
 def drawn(run: AnalysedRun, name: str, options: FigureOptions) -> DataFigure:
-    """Draw a figure with options that are settled."""
+    """Draw a figure with settled options."""
     from pipeline.plots import draw_figure
 
     with refused(run.name):

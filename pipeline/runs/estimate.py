@@ -1,8 +1,8 @@
-"""What a run will take here: some of its own cells are integrated for a moment and the time is taken.
+"""Estimate the time of a run on this machine by integrating some of its own cells for a moment.
 
-The rule of thumb in `pipeline.layout.plan` knows how the time goes with the frequency and the tolerance.
-What it cannot know is measured: how fast this processor goes through this system's steps, and how long
-cells take to close where the run stops at that.
+The rule of thumb in `pipeline.layout.plan` gives the dependence of the time on frequency and tolerance. Two
+further quantities are measured: the speed of this processor for this system, and, if the run stops when
+orbits have closed, the number of periods until they do.
 """
 
 from __future__ import annotations
@@ -22,46 +22,46 @@ from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.parsing import Spec
 
 BRANCHES, MOST_BRANCHES, POINTS = 32, 256, 8
-"""Size of a sample: two groups of lanes or more, and of a continuation some points of each branch."""
+"""Size of a sample: branches (two groups of lanes or more), most branches, points of each branch."""
 
 SPEED_S = 0.25
-"""Time for each of the two stretches in which the speed is measured, by the rule of thumb [s]."""
+"""Time of each of the two stretches in which the speed is measured, by the rule of thumb [s]."""
 
 CLOSING_S = 0.8
-"""Most time for finding out when cells close, by the rule of thumb [s]."""
+"""Most time for measuring when cells close, by the rule of thumb [s]."""
 
 LEAST_PERIODS = 8
 NEVER_CLOSES = 1e-300
 
 
 START_S = 4.0
-"""Time until worker processes have started and have read what they need [s]."""
+"""Time until worker processes have started and read their input [s]."""
 
 DISPATCH_S = 0.02
-"""Time that handing out a task and taking its result takes, in all processes together [s]."""
+"""Time to hand out a task and to take its result, in all processes together [s]."""
 
 WRITTEN, WRITING_S = 20, 0.5
-"""Tasks that are written to see how long that takes, and the most time for it [s]."""
+"""Number of tasks that are written to time the writing, and the most time for it [s]."""
 
 MOST_WRITTEN_BYTES, MOST_WRITTEN_CELLS = 20_000_000, 1_000_000
-"""Size of a task and of a run beyond which writing is taken by the rule."""
+"""Size of a task [bytes] and of a run [cells] above which a rule gives the time of writing."""
 
 FILE_S = 0.004
-"""Time for writing a file by the rule [s]."""
+"""Time to write a file, by the rule [s]."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a run takes.
+    """The estimated time of a run.
 
     Attributes
     ----------
     core_seconds : float
         Time of all cells on one core [s].
     how : str
-        What it rests on.
+        Phrase on how it was measured.
     compiled_s : float
-        Time that was taken by compiling [s].
+        Time spent on compiling [s].
     """
 
     core_seconds: float
@@ -70,16 +70,16 @@ class Estimate:
 
 
 def estimate(spec: Spec, plan: Plan) -> Estimate:
-    """Measure what a run takes on one core of this machine; a second or two, and compiling before.
+    """Measure the time of a run on one core of this machine.
 
-    The time of products (exponents) is taken from their number of periods, in units of the measured time
-    of one.
+    This takes a second or two, after compiling. The time of products (exponents) is their number of periods
+    times the measured time of one.
     """
     from pipeline.compute.task import warm_up
 
     compiled_s = warm_up(spec)
     most, products = periods_per_cell(spec)
-    # what the engine watches on the way is measured with it
+    # products that the engine computes while integrating are measured with it
     watched = {name: o for name, o in spec.products.items() if CELL_PRODUCTS[name].integrate(o)}
     spec = replace(spec, products=watched)
     products -= periods_per_cell(spec)[1]
@@ -95,7 +95,7 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
 
 
 def writing_seconds(spec: Spec, plan: Plan) -> float:
-    """Measure what writing a task takes, in a folder for temporary files; the run's disk may be slower.
+    """Measure the time to write a task, in a temporary folder; the run's disk may be slower.
 
     Returns
     -------
@@ -128,16 +128,16 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
 
 
 def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
-    """Time that a run takes by the clock [s].
+    """Return the elapsed time of a run [s].
 
     Parameters
     ----------
     core_seconds
         Time on one core, with writing [s].
     n_tasks
-        Tasks that are left.
+        Number of tasks that are left.
     workers
-        Processes; 0 stands for this one.
+        Number of processes; 0 stands for this process.
     """
     if not workers:
         return core_seconds
@@ -145,10 +145,10 @@ def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
 
 
 def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *, pairs: bool) -> Inputs:
-    """Inputs of cells drawn from all over the run.
+    """Return the inputs of cells drawn from the whole run.
 
-    With `pairs` the points of a continuation's branch are neighbours two by two: where the second one
-    starts is where it would start in the run.
+    With `pairs`, the points of a continuation's branch come in neighbouring pairs, so that the second point
+    of a pair starts where it would start in the run.
     """
     cells = CellMap(spec)
     n_points = 1 if plan.path is None else plan.shape[plan.path]
@@ -171,7 +171,7 @@ def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *
 
 
 def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarray:
-    """Indices of points along a path, one or two from each part of it."""
+    """Return indices of points along a path, one or two from each part of it."""
     n_parts = min(POINTS, n_points // 2 if pairs and n_points > 1 else n_points)
     edges = np.linspace(0, n_points, n_parts + 1)
     first = np.array([rng.integers(math.ceil(a), math.ceil(b)) for a, b in itertools.pairwise(edges)])
@@ -182,15 +182,15 @@ def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarr
 
 
 def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
-    """Measured time over that of the rule of thumb; periods per cell and seconds that it was measured in.
+    """Return the ratio of measured time to the rule of thumb, periods per cell, and seconds of measuring.
 
-    Two stretches: from the initial states, and from where the first one ended, which stands for the rest
-    of the cell.
+    Two stretches are measured: one from the initial states, and one from the end of the first, which
+    represents the rest of the cell.
     """
     by_rule = float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).sum())
     n_periods = int(min(max(SPEED_S / by_rule, LEAST_PERIODS), most))
     ends, first, seconds = _stretch(spec, inputs, n_periods)
-    if seconds > 4 * SPEED_S:  # far slower than the rule says: one stretch has to do
+    if seconds > 4 * SPEED_S:  # far slower than the rule: one stretch must suffice
         return first, n_periods, seconds
     _, first, first_s = _stretch(spec, inputs, n_periods)
     _, later, later_s = _stretch(spec, replace(inputs, initial_states=ends), n_periods)
@@ -199,13 +199,13 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
 
 
 def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, float, float]:
-    """Integrate the sample for some periods; last states, time over that of the rule, and the time [s].
+    """Integrate the sample for some periods; return last states, ratio to the rule, and time [s].
 
-    The time is the processor's, so that other programs do not count.
+    The time is processor time, so that other programs do not count.
     """
     from pipeline.compute.task import integrate
 
-    # a tolerance that nothing meets, rather than not to stop: that would be another kernel to compile
+    # a tolerance that no cell meets, since an integration without the test would need another kernel
     integration = spec.integration.model_copy(
         update={"n_transient": n_periods - 1, "n_keep": 1, "closure_tolerance": NEVER_CLOSES}
     )
@@ -219,9 +219,9 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
 
 
 def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> float:
-    """Mean periods of a cell in a run that stops when orbits have closed.
+    """Return the mean periods of a cell in a run that stops when orbits have closed.
 
-    A first sample says about how many cells there is time for.
+    A first sample gives the number of cells for which there is time.
     """
     from pipeline.compute.task import integrate
 
@@ -248,9 +248,10 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
 
 
 def mean_with_tail(periods: np.ndarray, cap: float, most: float) -> float:
-    """Mean number of periods if those that reached `cap` had gone on, at most to `most`.
+    """Return the mean number of periods if cells that reached `cap` had continued, at most to `most`.
 
-    They are taken to end at the rate at which cells ended in the second half of what was seen.
+    These cells are assumed to end at the rate at which cells ended in the second half of the observed
+    periods.
     """
     open_half, still_open = int((periods > cap / 2).sum()), int((periods >= cap).sum())
     if not still_open or most <= cap:

@@ -1,8 +1,8 @@
-"""A run grows: a wider one takes every cell that is computed already, and integrates the rest.
+"""Extend a run to a wider specification: reuse all computed cells, and integrate the rest.
 
-A cell's numbers depend on what it is integrated from alone, bit for bit. So the run of a wider specification
-has the same bytes whether it begins from nothing, or takes the cells that other runs hold; only the latter
-is quicker. It is a run like any other, with a digest of its own, written by the same protocol.
+A cell's numbers depend on its inputs alone, bit for bit. A wider run therefore has the same bytes whether it
+begins from nothing or reuses the cells of other runs, which is faster. It is an ordinary run with its own
+digest, written by the same protocol.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from pipeline.store.runfile import is_run
 
 @dataclass(frozen=True)
 class Extension:
-    """What an extension takes, and what is left to integrate.
+    """The plan of an extension: the wider run, and the cells that it reuses.
 
     Attributes
     ----------
     spec, text, plan, identity
         The wider run.
     runs : tuple of Run
-        Those that it takes cells from.
+        Runs whose cells are reused.
     counts : tuple of int
-        Cells that it takes from each.
+        Number of reused cells of each.
     notes : tuple of str
-        What is worth knowing of them: runs that are not complete, or that have nothing to give.
+        Remarks on runs that are incomplete or have no suitable cells.
     """
 
     spec: Spec
@@ -61,7 +61,7 @@ class Extension:
 
     @property
     def reused(self) -> int:
-        """Cells that are taken."""
+        """Number of reused cells."""
         return sum(self.counts)
 
     @property
@@ -71,19 +71,19 @@ class Extension:
 
     @property
     def share(self) -> float:
-        """Part of the drive periods of a fresh run that is left."""
+        """Remaining work as a fraction of a fresh run's drive periods."""
         counts = zip(self.runs, self.counts, strict=True)
         left = self.plan.n_cells - self.reused + sum(count * self._more(run) for run, count in counts)
         return left / self.plan.n_cells
 
     def _more(self, run: Run) -> float:
-        """Part of a cell's periods by which the cells of a run have to go on."""
+        """Return the fraction of a cell's periods by which the cells of a run must be integrated further."""
         integration = self.spec.integration
         n_more = integration.n_keep - run.spec.integration.n_keep
         return n_more / (integration.n_transient + integration.n_keep)
 
     def lines(self) -> Iterator[str]:
-        """Say what is taken from where."""
+        """Yield lines on the reused and the remaining cells."""
         yield from self.notes
         n = self.plan.n_cells
         for run, count in zip(self.runs, self.counts, strict=True):
@@ -96,12 +96,12 @@ class Extension:
 def plan_extension(
     sources: Sequence[str | Path], spec: str | Path | None = None, widening: Widening | None = None
 ) -> Extension:
-    """Say what a wider run would take from others; changes nothing.
+    """Plan a wider run that reuses cells of others; nothing is changed.
 
     Parameters
     ----------
     sources
-        Run directories, complete or not. The first is the one that is widened.
+        Run directories, complete or not. The first one is widened.
     spec
         The wider specification: a TOML file, or the name of a shipped workflow.
     widening
@@ -112,7 +112,7 @@ def plan_extension(
     SpecError
         If there is no wider specification, or it is not valid.
     RefusedError
-        If nothing can be taken, with the reasons.
+        If no cell can be reused; the message lists the reasons.
     """
     runs = [Run.open(source) for source in sources]
     wide, text = _wide(runs[0], spec, widening or Widening())
@@ -131,7 +131,7 @@ def plan_extension(
 
 
 def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
-    """The wider specification and its text."""
+    """Return the wider specification and its text."""
     if spec is None and not widening:
         raise SpecError([
             "extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM."
@@ -153,7 +153,7 @@ def _printable(text: str) -> str:
 
 
 def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tuple[list[Run], list[str]]:
-    """Those runs whose cells can be the wider run's, and notes on the others."""
+    """Return the runs whose cells can be reused, and notes on the others."""
     from pipeline.compute.reuse import obstacles
 
     fitting, notes = [], []
@@ -173,7 +173,7 @@ def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tu
 
 
 def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
-    """Cells of the wider run that each run has, each cell counted once."""
+    """Return the number of the wider run's cells that each run has, each cell counted once."""
     from pipeline.compute.reuse import Pool
 
     pool, cells = Pool(wide, runs), CellMap(wide)
@@ -185,7 +185,7 @@ def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
 
 
 def _strangers(run: Run, wide: Spec) -> list[str]:
-    """Why a run that fits has no cell of the wider one."""
+    """Explain why a compatible run contributes no cells."""
     if not run.commits:
         return [f"{run.name}: nothing of it is committed"]
     return [f"{run.name}: {line}" for line in apart(run.spec, wide)]
@@ -219,24 +219,24 @@ def extend(
     dashboard: bool = False,
     echo: Echo = print,
 ) -> State:
-    """Widen a run, with every cell that is computed already.
+    """Widen a run, reusing every cell that is computed already.
 
-    The files of the result have the bytes of a run of the wider specification that began from nothing.
-    Killed at any moment, the same call goes on. The runs that cells are taken from are only read, and what
-    is damaged in them is integrated instead.
+    The result has the same bytes as a run of the wider specification from nothing. If it is killed at any
+    moment, the same call continues. The runs whose cells are reused are only read; damaged cells are
+    integrated again.
 
     Parameters
     ----------
     source
         Run directory, complete or not.
     spec
-        The wider specification: a TOML file, or the name of a shipped workflow. By default that of the run,
-        with the changes that follow.
+        The wider specification: a TOML file, or the name of a shipped workflow. By default the run's own,
+        with the following changes.
     out
-        Directory of the wider run. By default it takes the place of `source` when it is complete, and the old
-        one is renamed to ``SOURCE.before``.
+        Directory of the wider run. By default the complete wider run replaces `source`, and the old one is
+        renamed to ``SOURCE.before``.
     also
-        Further run directories that hold cells, such as another half that was computed elsewhere.
+        Other run directories with cells to reuse, such as another half that was computed elsewhere.
     axes
         New ranges by ``frequency_hz``, parameter, or state of a grid:
         ``{"frequency_hz": {"start": 2.0, "stop": 3.0, "num": 201}}``.
@@ -245,21 +245,21 @@ def extend(
     keep
         Kept sections.
     products
-        Products to compute besides, with their options: ``{"lyapunov": {}}``.
+        Additional products, with their options: ``{"lyapunov": {}}``.
     workers, scheduler, cluster, dashboard, echo
-        As for `pipeline.runs.run.run`.
+        See `pipeline.runs.run.run`.
 
     Returns
     -------
     State
-        Of the wider run.
+        State of the wider run.
 
     Raises
     ------
     SpecError, RefusedError
-        Before anything is created: if nothing can be taken, with the reasons, or if cells would be lost.
+        If no cell can be reused, or if cells would be lost; before anything is created.
     Exception
-        As `pipeline.runs.run.run`.
+        See `pipeline.runs.run.run`.
     """
     from pipeline.compute.clients import Where
 
@@ -286,7 +286,7 @@ def extend(
 
 
 def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> State:
-    """Make the wider run in a directory of its own, or go on with it."""
+    """Compute the wider run in its own directory, or continue it."""
     for line in extension.lines():
         echo(line)
     sources = [(run.info.files.place, run.info.digest) for run in extension.runs]
@@ -296,7 +296,7 @@ def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> Sta
 
 
 def _record(extension: Extension, files: Files) -> None:
-    """Write down where cells come from; no part of the result."""
+    """Write which runs the cells come from; this file is not part of the result."""
     taken: dict[int, int] = {}
     with contextlib.suppress(FileNotFoundError):
         for line in files.read(TIMINGS).decode().splitlines():
@@ -318,20 +318,20 @@ def _record(extension: Extension, files: Files) -> None:
 
 
 def _folder(files: Files) -> Path:
-    """The folder of a run, which a wider one can take the place of."""
+    """Return the folder of a run; refuse a run in an object store, which cannot be replaced."""
     if files.local is None:
         raise RefusedError(f"{files.name}: is no folder of this machine, which can be renamed; give --out.")
     return files.local
 
 
 def _beside(directory: Path) -> Path:
-    """Where the wider run is made that will take a directory's place."""
+    """Return the folder in which the wider run is built before it replaces another."""
     real = directory.resolve()
     return real.with_name(f"{real.name}.extending")
 
 
 def _aside(directory: Path) -> Path:
-    """A free name for the old run."""
+    """Return a free name for the old run."""
     real = directory.resolve()
     names = (real.with_name(f"{real.name}.before{i}") for i in ("", *(f".{n}" for n in range(2, 10_000))))
     return next(name for name in names if not name.exists())
@@ -348,7 +348,7 @@ def _as_it_is(run: Run, echo: Echo) -> State:
 
 
 def _refuse_loss(run: Run, wide: Spec) -> None:
-    """Refuse to put a run in the place of one that holds more than it does."""
+    """Refuse to replace a run by one that lacks some of its cells or products."""
     cells, finder, lost = CellMap(run.spec), Finder(wide), 0
     for index in run.commits:
         block = run.plan.task(index)
@@ -364,7 +364,7 @@ def _refuse_loss(run: Run, wide: Spec) -> None:
 
 
 def _exchange(directory: Path, built: Path, echo: Echo) -> None:
-    """Put a finished run in a directory's place; at no moment is either of the two gone."""
+    """Replace a directory by a finished run; at every moment both exist under some name."""
     real, aside = directory.resolve(), _aside(directory)
     real.rename(aside)
     sync_folder(real.parent)

@@ -1,4 +1,4 @@
-"""Animations of a run or of a start: what ``magpend animate`` draws."""
+"""Make animations of a run or of a start, as ``magpend animate`` does."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from pipeline.plots.animation import Animation
 
 CLOCK_HZ, DEFAULT_HZ = 1.0, 2.2
-"""Frequency of a start's periods: without a drive, and of the drive if none is given."""
+"""Frequency of a start's periods for a model without a drive, and default drive frequency."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """A motion from a start.
+    """A motion from a given initial state.
 
     Attributes
     ----------
     state : mapping
-        By name, see `pipeline.compute.simulate.start_of`; what is missing is 0.
+        Initial values by name, see `pipeline.compute.simulate.start_of`; missing ones are 0.
     transient : int
-        Periods that pass before the film begins.
+        Periods before the film begins.
     model, frequency_hz, preset, overrides
-        What is integrated, unless a run says so.
+        Model and parameters, if no run gives them.
     """
 
     state: Mapping[str, float] = field(default_factory=dict)
@@ -55,32 +55,33 @@ def animation(
     echo: Echo | None = None,
     **more: Any,
 ) -> Animation:
-    """Make a film of motions: the model's drawing as it moves, and phase portraits.
+    """Make an animation of motions: the model's moving drawing, and phase portraits.
 
     Parameters
     ----------
     source
         Run directory, or an opened run; None for a start without one.
     options, more
-        Those of `pipeline.products.animation.AnimationOptions` that are not as by default.
+        Options of `pipeline.products.animation.AnimationOptions` that differ from the defaults.
     attractors
-        Letters of attractors of the run; by default, without `cells` and `start`, all at the point.
+        Letters of attractors of the run. By default, without `cells` and `start`, all attractors at the
+        parameter point.
     cells
-        Numbers of cells of the run, see `pipeline.runs.moving.of_cells`.
+        Indices of cells of the run, see `pipeline.runs.moving.of_cells`.
     start
         A start instead: at the run's parameter point, or of a model.
     echo
-        Prints a line.
+        Function that prints a line.
 
     Returns
     -------
     Animation
-        `pipeline.plots.films.save_animation` writes it; its frames are drawn then.
+        Animation that `pipeline.plots.films.save_animation` draws and writes.
 
     Raises
     ------
     SpecError
-        If the run has not what is asked for, or a value is out of bounds; before anything is integrated.
+        If the run lacks a requested object, or a value is out of bounds; before anything is integrated.
     ArithmeticError
         If a trajectory diverges.
     """
@@ -132,7 +133,7 @@ def _of_run(
 
 
 def _alone(start: Start) -> instants.Moving:
-    """A start without a run."""
+    """Return the motion of a start without a run."""
     import numpy as np
 
     from pipeline.compute.simulate import start_of

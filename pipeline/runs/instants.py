@@ -1,4 +1,4 @@
-"""A film's instants, and motions integrated over them: what `pipeline.plots.animation` draws."""
+"""Lay out the times of an animation, and integrate its motions over them."""
 
 from __future__ import annotations
 
@@ -22,34 +22,35 @@ if TYPE_CHECKING:
 
 RTOL = 1e-9
 PERIOD_IN_FILM_S = 2.0
-"""What a period takes in the film if no speed is given: slow enough to follow, fast enough to wait for."""
+"""Time of a period in the film if no speed is given: slow enough to follow, fast enough to wait for."""
 
 MOST_CHANGE, MOST_CHANGE_OF_SPEED = 2.0, 1.1
 """Largest factor by which the speed is changed so that whole periods are shown: chosen here, or given."""
 
 SAMPLES_PER_PERIOD = 240
-"""Lines look smooth; frames fall on samples."""
+"""Samples per period, so many that lines look smooth."""
 
 MOST_SAMPLES = 2_000_000
 
 
 @dataclass(frozen=True)
 class Moving:
-    """One motion of a film.
+    """A motion of an animation.
 
     Attributes
     ----------
     name, colour : str
-        For its title and its lines.
+        Title of its frame, and colour of its lines.
     parameters : Parameters
+        Parameters of its model.
     frequency_hz : float
-        Of the drive; of a flow anything positive.
+        Drive frequency [Hz]; any positive number for a flow.
     start : ndarray
-        State at time 0, which is the instant of a section.
+        State at time 0, the time of a section.
     section : ndarray
         Section points (k, n_states) to be shown; k may be 0.
     period_s : float
-        After which it repeats; NaN if it does not.
+        Period [s]; NaN if the motion does not repeat, 0 if it rests.
     """
 
     name: str
@@ -63,17 +64,18 @@ class Moving:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Instants of a film.
+    """The times of an animation.
 
     Attributes
     ----------
     speed : float
-        Seconds of the model in a second of film.
+        Seconds of the model per second of film.
     duration : float
-        What the film shows [s].
+        Time of the model that the film shows [s].
     n_frames : int
+        Number of frames.
     substeps : int
-        Samples from frame to frame.
+        Number of samples from frame to frame.
     repeats : bool
         Whether the frame after the last would be the first.
     """
@@ -86,7 +88,7 @@ class Schedule:
 
     @property
     def times(self) -> np.ndarray:
-        """Instants of all samples [s], those of the frames and the end of the last among them."""
+        """Times of all samples [s], from the first frame to the end of the last."""
         n = self.n_frames * self.substeps
         return np.asarray(np.arange(n + 1) * (self.duration / n))
 
@@ -100,7 +102,7 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
     Raises
     ------
     SpecError
-        If the film has too many frames, or shows too much time.
+        If the film has too many frames or shows too much time.
     """
     cycle = min((_cycle(m) for m in moving), default=1.0)
     n_frames = max(2, round(options.seconds * options.fps))
@@ -132,20 +134,20 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
 
 
 def _cycle(one: Moving) -> float:
-    """Time that the eye takes for a period [s]: of the drive, or of a flow's own loop."""
+    """Return the time of a visible period [s]: the drive's, or that of a flow's own orbit."""
     if not one.parameters.model.autonomous:
         return 1.0 / one.frequency_hz
     return one.period_s if one.period_s > 0.0 else 2.0
 
 
 def _nice(value: float) -> float:
-    """Nearest of 1, 2, 5, 10, ... by ratio."""
+    """Return the nearest of 1, 2, 5, 10, ... by ratio."""
     power = 10.0 ** math.floor(math.log10(value))
     return min((factor * power for factor in (1.0, 2.0, 5.0, 10.0)), key=lambda v: abs(math.log(v / value)))
 
 
 def _common(periods: Sequence[float], cycle: float) -> float | None:
-    """Least time after which all repeat [s]; None if there is none, 0 if all rest."""
+    """Return the least common period of all motions [s]; None if there is none, 0 if all rest."""
     if any(math.isnan(p) for p in periods):
         return None
     if not periods:
@@ -160,21 +162,21 @@ def _common(periods: Sequence[float], cycle: float) -> float | None:
 
 
 def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
-    """Integrate motions over the instants of a film.
+    """Integrate motions over the times of an animation.
 
     Parameters
     ----------
     moving
-        Of one model; at least one.
+        Motions of one model, at least one.
     plan
-        The instants.
+        Times of the animation.
 
     Returns
     -------
     Dataset
-        ``orbit`` (motion, sample, state), angles not wrapped; ``section`` (motion, point, state), NaN where
-        one has fewer; of a model with a drawing ``points`` (motion, sample, place, axis) and ``fixed``
-        (motion, fixed_place, axis); ``name``, ``colour``, ``period`` [s, NaN if it does not repeat] and
+        ``orbit`` (motion, sample, state), angles not wrapped; ``section`` (motion, point, state), filled with
+        NaN; for a model with a drawing ``points`` (motion, sample, place, axis) and ``fixed`` (motion,
+        fixed_place, axis); ``name``, ``colour``, ``period`` [s, NaN if it does not repeat] and
         ``drive_frequency`` [Hz] by motion; ``time`` [s] by sample. The attributes hold the film's
         ``n_frames``, ``substeps``, ``speed`` and ``repeats``, and model and parameters.
 
@@ -218,7 +220,7 @@ def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
 
 
 def _told(moving: Sequence[Moving]) -> dict[str, Any]:
-    """Attributes that tell what was integrated; parameters that differ between the motions, by motion."""
+    """Return attributes that describe the integrated motions; differing parameters are given by motion."""
     first = moving[0].parameters
     lines = [f"{name} = {value!r}" for name, value in first.as_dict().items()]
     told = {
@@ -230,7 +232,7 @@ def _told(moving: Sequence[Moving]) -> dict[str, Any]:
 
 
 def _drawn(ds: xr.Dataset, moving: Sequence[Moving], orbits: np.ndarray) -> xr.Dataset:
-    """With the places of the points of the model's drawing."""
+    """Add the places of the points of the model's drawing."""
     drawing = _model(moving).drawing
     if drawing is None:
         return ds

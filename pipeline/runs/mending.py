@@ -1,4 +1,4 @@
-"""What a run finds in its directory before it goes on: compared with its records, and set right."""
+"""Compare a run directory with its commit records before the run continues, and repair it."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _NAMED = 10
 
 
 def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) -> Records:
-    """Return the records whose chunks are what was written, byte for byte; the others are withdrawn.
+    """Return the records whose chunks are intact, byte for byte; withdraw the others.
 
-    Equal sizes and times prove nothing, so every committed file is read, unless the environment has
-    ``MAGPEND_VERIFY=0``: then sizes alone are compared. What no record vouches for is removed. For the holder
-    of the lock.
+    Equal sizes and times prove nothing, so every committed file is read. With ``MAGPEND_VERIFY=0`` in the
+    environment only sizes are compared. Files without a record are removed. Only the holder of the lock may
+    call this.
 
     Parameters
     ----------
     info, plan
-        The run.
+        The run and its plan.
     echo
-        Prints a line; names what is computed again, and why.
+        Function that prints a line about each task that is computed again, with the reason.
     alone
-        Whether no other process can be writing here; else what no record vouches for stays, since another
-        may be about to commit it.
+        Whether no other process can be writing here. Otherwise files without a record stay, since another
+        process may be about to commit them.
     """
     started = time.perf_counter()
     contents = checks_chunks()

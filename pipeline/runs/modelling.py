@@ -1,4 +1,4 @@
-"""A model looked at before any run: what ``magpend model`` does."""
+"""Describe and check a model before any run, as ``magpend model`` does."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
 
 TEMPLATE = Path(__file__).parents[1] / "spec" / "template.toml"
 NEAR_ZERO = (0.0, 0.1, -0.2, 0.3)
-"""Starts in units of the states' scales, where no specification gives any."""
+"""Initial states in units of the states' scales, if no specification gives any."""
 
 
 def examine(name: str) -> tuple[Model, Description]:
-    """Describe a model, at the starts of a specification or near 0.
+    """Describe a model at the starts of a specification, or near 0.
 
     Parameters
     ----------
     name
-        Of a model that ships; a file of one, or of a specification; or ``package.module:NAME``, which is
-        imported.
+        Name of a model that ships; path of a model's file or of a specification; or ``package.module:NAME``,
+        which is imported.
 
     Raises
     ------
     SpecError
-        If there is none, or it cannot be understood, or has no value where it starts.
+        If there is no such model, or it is not valid, or its equations have no value at the starts.
     """
     from magpend_core.models.showing import describe
 
@@ -55,7 +55,7 @@ def examine(name: str) -> tuple[Model, Description]:
 
 
 def _specification(name: str) -> Spec | None:
-    """The specification that a file is; None for a model's own."""
+    """Return the specification in a file; None for a model's own file."""
     if not is_model_file(name) or read_toml(name).get("kind") not in KINDS:
         return None
     return load_spec(find_spec(name))
@@ -65,7 +65,7 @@ def _near_zero(model: Model) -> tuple[Parameters, float, np.ndarray]:
     parameters = model.load()
     states = np.outer(NEAR_ZERO, np.asarray(model.scales))
     good = []
-    for row in states:  # 0 is often where nothing moves, and sometimes where nothing has a value
+    for row in states:  # the state 0 is often an equilibrium, and sometimes a pole of the equations
         try:
             check_states(model, row[None], [{**parameters, FREQUENCY: 1.0}])
             good.append(row)
@@ -88,7 +88,7 @@ def _first_cells(spec: Spec) -> tuple[Parameters, float, np.ndarray]:
 
 
 def write_template(path: Path | None) -> str:
-    """Return the template of a specification with a model of one's own; write it if a path is given.
+    """Return the template of a specification with an own model; write it if a path is given.
 
     Raises
     ------

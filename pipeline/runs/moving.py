@@ -1,7 +1,7 @@
-"""The motions of a film: attractors and cells of a run, or a start.
+"""Collect the motions of an animation: attractors and cells of a run, or a start.
 
-A motion begins at a section: of an attractor, of a cell, or where a start is given. It is integrated anew,
-as closely as portraits are, and never read off stored sections, between which there is nothing.
+A motion begins at a section point of an attractor or a cell, or at a given start. It is integrated again with
+the tolerance of portraits, since a cube stores no states between sections.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ MOST_MOTIONS = 8
 def of_attractors(
     run: AnalysedRun, options: AnimationOptions, letters: Sequence[str] = ()
 ) -> tuple[list[Moving], list[str]]:
-    """Return the attractors of a parameter point of a run as motions, and what is to be said of them.
+    """Return the attractors at a parameter point of a run as motions, with notes.
 
     Parameters
     ----------
     run
-        The run; its attractors are found first if that was not done.
+        The run; its attractors are computed if they are not kept.
     options
-        With the axes in the run's own names.
+        Options with the axes in the run's own names.
     letters
-        Which, by letter; by default the attractors with the largest shares, or other sets where there is
-        none.
+        Letters of the attractors; by default those with the largest basin fractions, or other sets if there
+        are no attractors.
 
     Raises
     ------
     SpecError
-        If the point is not one of the run, or an attractor is not there.
+        If the run does not have the point, or an attractor does not exist there.
     """
     from pipeline.analysis.selection import choose
     from pipeline.analysis.selection import start_dims as dims_of_starts
@@ -83,7 +83,7 @@ def of_attractors(
 
 
 def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[int], list[str]]:
-    """Numbers of the attractors that are shown, and what is to be said of others."""
+    """Return the ids of the attractors that are shown, and notes on the others."""
     there = [int(i) for i in here["attractor"].values]
     if not there:
         raise SpecError(
@@ -114,7 +114,7 @@ def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[i
 
 
 def _at_point(ds: xr.Dataset, here: xr.Dataset) -> tuple[Parameters, float]:
-    """Parameters at a point of a dataset, and the frequency there."""
+    """Return the parameters and the frequency at a point of a dataset."""
     values = {str(k): float(v) for k, v in here.coords.items() if not v.ndim and v.dtype.kind == "f"}
     base = parameters_of(ds)
     base = base.replace(**{k: v for k, v in values.items() if k in base})
@@ -122,7 +122,7 @@ def _at_point(ds: xr.Dataset, here: xr.Dataset) -> tuple[Parameters, float]:
 
 
 def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
-    """Period of a set [s]: of what rests any, of a set that does not close none."""
+    """Return the period of a set [s]: 0 for an equilibrium, NaN for a set that does not close."""
     kind, periods = int(one["kind"]), int(one["orbit_period"])
     if kind == EQUILIBRIUM:
         return 0.0
@@ -134,14 +134,14 @@ def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
 
 
 def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
-    """Return cells of a run as motions, from the first section that each has kept.
+    """Return cells of a run as motions, each from its first kept section.
 
     Parameters
     ----------
     run
         The run.
     numbers
-        Places of the cells in the cube, counted through all its dims in order, the last fastest.
+        Flat indices of the cells in the cube, with the last dim fastest.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
 
 
 def _where(one: xr.Dataset) -> str:
-    """Values that tell a cell from others."""
+    """Return the values that identify a cell."""
     said = []
     for key, value in one.coords.items():
         if value.ndim or str(key) in ("seed",):
@@ -214,18 +214,18 @@ def _refuse_recorded(run: AnalysedRun) -> None:
 def of_start(
     parameters: Parameters, frequency_hz: float, state: Sequence[float], n_transient: int = 0
 ) -> Moving:
-    """Return the motion from a start, some periods later if wanted.
+    """Return the motion from a start, after some periods if wanted.
 
     Parameters
     ----------
     parameters
-        Of any model.
+        Parameters of any model.
     frequency_hz
-        Of the drive; without one, of the clock in whose periods `n_transient` counts.
+        Drive frequency [Hz]; without a drive, the frequency of the periods that `n_transient` counts.
     state
-        At time 0, the instant of a section.
+        State at time 0, the time of a section.
     n_transient
-        Periods that pass before the film begins.
+        Periods before the film begins.
 
     Raises
     ------
@@ -248,12 +248,12 @@ def of_start(
 
 
 def point_of_run(run: AnalysedRun, options: AnimationOptions) -> tuple[Parameters, float, list[str]]:
-    """Return the parameters and the frequency of a parameter point of a run, and what is to be said of it.
+    """Return the parameters and the frequency at a parameter point of a run, with notes.
 
     Raises
     ------
     SpecError
-        If more than one point is left, or the point is not one of the run.
+        If several points are left, or the run does not have the point.
     """
     from pipeline.analysis.selection import select_points
     from pipeline.plots.door import values_of

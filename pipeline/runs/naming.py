@@ -1,4 +1,4 @@
-"""One name for each axis, parameter and state, whichever of its spellings a person uses."""
+"""Translate all spellings of axes, parameters and states to the names in the cube and the model."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ DEGREES = "_deg"
 
 
 def named(run: Run, options: Options) -> Options:
-    """Return options in which axes, parameters and the state have the names that the cube and the model use.
+    """Return options with axes, parameters and state in the names of the cube and the model.
 
-    ``at`` takes ``frequency`` or ``frequency_hz``, a parameter, and for a grid of initial states its axis
-    ``x_0``, the state ``x`` or, of an angle, ``x_deg``. ``parameter`` and ``second`` take either name of the
-    frequency; an empty ``parameter`` is what the run sweeps. An empty ``state`` is the model's first that
-    differs from section to section.
+    ``at`` accepts ``frequency`` or ``frequency_hz``, a parameter, and for a grid of initial states its axis
+    ``x_0``, the state ``x`` or, for an angle, ``x_deg``. ``parameter`` and ``second`` accept both names of
+    the frequency. An empty ``parameter`` stands for the swept one, an empty ``state`` for the first state
+    that varies between sections.
 
     Raises
     ------
     SpecError
-        Naming all that do not exist, with the nearest that do; or if what is left open is not clear.
+        If names do not exist (the message lists the nearest ones), or if an empty option is ambiguous.
     """
     fields, problems = type(options).model_fields, []
     changes: dict[str, Any] = {}
@@ -59,7 +59,7 @@ def named(run: Run, options: Options) -> Options:
 
 
 def _swept(run: Run) -> str:
-    """Return the parameter that a run sweeps; the drive's frequency if it sweeps none.
+    """Return the parameter that a run sweeps; the drive frequency if it sweeps none.
 
     Raises
     ------
@@ -88,16 +88,17 @@ def _unknown(what: str, given: str, name: str, known: Iterable[str]) -> list[str
 
 
 def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> tuple[str, float]:
-    """Return the axis of a cube that a name means, and a value in the axis' unit.
+    """Return the axis of a cube that a name refers to, and the value in the axis' unit.
 
     Parameters
     ----------
     cube
-        As `pipeline.open_run` gives it.
+        Cube from `pipeline.open_run`.
     name
         Any spelling of the axis, see `named`.
     value
-        In degrees if the name ends in ``_deg``, or with `degrees` if the axis is an angle or its rate.
+        Value on the axis, in degrees if the name ends in ``_deg``, or with `degrees` if the axis is an angle
+        or its rate.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What became of the cells of a run: how many, where, and the command that looks closer."""
+"""Summarise a run's cells by status: how many, where, and the command for a closer look."""
 
 from __future__ import annotations
 
@@ -17,24 +17,26 @@ if TYPE_CHECKING:
     import xarray as xr
 
 WORTH_A_WARNING = 0.01
-"""Share of cells that diverged or failed from which a run ends with a warning."""
+"""Fraction of diverged and failed cells above which a run ends with a warning."""
 
 Range = tuple[str, float, float, str]
-"""Axis, its least and largest value, its unit."""
+"""Axis, its smallest and largest value, its unit."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Cells of a run that have one status.
+    """The cells of a run with one status.
 
     Attributes
     ----------
     status : Status
+        Status of the cells.
     n_cells : int
+        Number of cells.
     share : float
-        Of all cells of the run.
+        Fraction of all cells of the run.
     where : tuple of Range
-        Of each swept parameter the range of values that such cells have, unless they have all of them.
+        Ranges of swept parameters in which these cells lie, without parameters whose whole range they cover.
     """
 
     status: Status
@@ -44,12 +46,12 @@ class Outcome:
 
     @property
     def word(self) -> str:
-        """The status in words."""
+        """Status in words."""
         return self.status.name.lower().replace("_", " ")
 
     @property
     def place(self) -> str:
-        """Where the cells are, such as ``frequency = 2.4 to 2.5 Hz``; empty if they are everywhere."""
+        """Place of the cells, such as ``frequency = 2.4 to 2.5 Hz``; empty if they are everywhere."""
         return ", ".join(
             f"{name} = {low:.6g}" + (f" to {high:.6g}" if high > low else "") + (f" {unit}" if unit else "")
             for name, low, high, unit in self.where
@@ -57,13 +59,13 @@ class Outcome:
 
     @property
     def line(self) -> str:
-        """One line of a summary."""
+        """Line of a summary."""
         text = f"  {self.word:15s} {self.n_cells:>10d} {100 * self.share:>6.1f} %"
         return text + (f"  {self.place}" if self.where else "")
 
 
 def outcomes_of(run: Run) -> list[Outcome]:
-    """Return what became of a run's cells, by status; reads ``status`` of every cell."""
+    """Return the outcomes of a run's cells by status; this reads ``status`` of every cell."""
     status = run.cube()["status"].load()
     codes = np.flatnonzero(np.bincount(status.values.ravel().astype(np.int64)))
     return [_outcome(status, Status(int(code))) for code in codes]
@@ -83,7 +85,7 @@ def _outcome(status: xr.DataArray, code: Status) -> Outcome:
 
 
 def summary(run: Run) -> list[str]:
-    """Return the lines with which ``magpend run`` ends: cells by status, where they are, what to do next."""
+    """Return the last lines of ``magpend run``: cells by status, their places, commands to go on."""
     found = outcomes_of(run)
     lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found)]
     lines.append(f"plot it with: {figure_command(run.plan, run.name)}")
@@ -96,12 +98,12 @@ def summary(run: Run) -> list[str]:
 
 
 def lost_cells(found: Iterable[Outcome]) -> list[Outcome]:
-    """Return those of the outcomes that are no motion to look at: cells that diverged or failed."""
+    """Return the outcomes of cells that diverged or failed."""
     return [o for o in found if o.status in (DIVERGED, *FAILED)]
 
 
 def warning(run: Run) -> str:
-    """Return a warning if more cells were lost than `WORTH_A_WARNING`; else an empty text."""
+    """Return a warning if more cells diverged or failed than `WORTH_A_WARNING`; else an empty text."""
     found = outcomes_of(run)
     lost, computed = lost_cells(found), sum(o.n_cells for o in found if o.status != PENDING)
     n_lost = sum(o.n_cells for o in lost)
@@ -118,7 +120,7 @@ def warning(run: Run) -> str:
 
 
 def _zoom(lost: list[Outcome], run: Run) -> str:
-    """Command that makes a specification of the range of lost cells; empty if it is no range."""
+    """Return the command that makes a specification for the range of lost cells; empty without a range."""
     whole = dict(zip(run.plan.dims, run.plan.shape, strict=True))
     spans: dict[str, tuple[float, float]] = {}
     for dim in (d for d, n in whole.items() if n > 1):

@@ -1,4 +1,4 @@
-"""What a run would do: ``magpend run --dry-run``, and the figure that shows it best."""
+"""Describe a run before it starts, as ``magpend run --dry-run`` does, and choose its first figure."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from pipeline.store.run import Run
 from pipeline.store.setup import check
 
 MANY_SECTIONS = 500
-"""Kept sections from which the section of a single parameter point is worth a look."""
+"""Fewest kept sections for which the section of a single parameter point is drawn."""
 
 
 def first_figure(plan: Plan) -> str:
-    """Name of the figure of ``magpend plot`` that shows a run as a whole: exponents where it has them."""
+    """Return the name of the figure that shows a run as a whole; exponents if the run has them."""
     n_swept, n_grid = _long(plan)
-    if plan.is_recorded:  # what rests on attractors is not drawn of a run that cannot go on
+    if plan.is_recorded:  # its cells cannot be integrated further, so it has no attractors to draw
         return "bifurcation" if n_swept else "section"
     if any(v.name == "lyapunov" for v in plan.variables):
         return "lyapunov" if n_swept else "convergence"
@@ -43,29 +43,29 @@ def first_figure(plan: Plan) -> str:
 
 
 def figure_command(plan: Plan, directory: str | Path) -> str:
-    """Return the command that draws `first_figure` of a run."""
+    """Return the command that draws the `first_figure` of a run."""
     name = first_figure(plan)
     as_map = name == "lyapunov" and _long(plan)[0] >= 2
     return f"magpend plot {name} {directory}" + (" --map" if as_map else "")
 
 
 def _long(plan: Plan) -> tuple[int, int]:
-    """Numbers of swept parameters and of axes of a grid of initial states with more than one value."""
+    """Return the numbers of swept parameters and of grid axes with more than one value."""
     long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
     return sum(not is_start_dim(d) for d in long), sum(is_grid_dim(d) for d in long)
 
 
 def shown(run: Run) -> tuple[str, dict[str, Any], str]:
-    """Say what ``magpend run --plot`` draws of a run: never more than the run has.
+    """Return the figure that ``magpend run --plot`` draws: its name, options, and what is left out.
 
     Returns
     -------
     name : str
-        Of the figure.
+        Name of the figure.
     options : dict
-        Its options.
+        Options of the figure.
     left_out : str
-        One sentence on what the run has beside it, with the command that draws it; else empty.
+        Sentence on the parts of the run that are not drawn, with the command that draws them; else empty.
     """
     plan, cube = run.plan, run.cube()
     name = first_figure(plan)
@@ -92,14 +92,14 @@ def shown(run: Run) -> tuple[str, dict[str, Any], str]:
 def describe_plan(
     spec: str | Path, out: str | Path | None, *, workers: int | None = None, smoke: bool = False
 ) -> Iterator[str]:
-    """Yield the lines of a dry run; creates nothing but compiled code in the compile cache.
+    """Yield the lines of a dry run; only the compile cache is written.
 
     The time is measured on some of the run's own cells, after the lines that cost nothing.
 
     Raises
     ------
     SpecError, RefusedError
-        As `run` would.
+        See `pipeline.runs.run.run`.
     """
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
@@ -123,7 +123,7 @@ def describe_plan(
 
 
 def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | None) -> str:
-    """What a share of a run's cells, in some tasks, will take, as measured on a few of its cells."""
+    """Return a line on the time of a fraction of a run's cells, in some tasks, measured on a few cells."""
     from pipeline.compute.execute import default_workers
 
     if not share:

@@ -1,4 +1,4 @@
-"""Show how a run goes: a bar on a terminal, plain lines elsewhere."""
+"""Show the progress of a run: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WORK = "computing cells"
 
 
 def duration(seconds: float) -> str:
-    """Return a short text such as ``3 min 20 s``."""
+    """Format a time, such as ``3 min 20 s``."""
     if seconds < 90:
         return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -25,7 +25,7 @@ def duration(seconds: float) -> str:
 
 
 def size(n_bytes: float) -> str:
-    """Return a short text such as ``6.3 MB``."""
+    """Format a number of bytes, such as ``6.3 MB``."""
     for unit in ("bytes", "kB", "MB", "GB"):
         if n_bytes < 1000:
             return f"{n_bytes:.0f} {unit}" if unit == "bytes" else f"{n_bytes:.1f} {unit}"
@@ -34,22 +34,22 @@ def size(n_bytes: float) -> str:
 
 
 class Progress:
-    """Counts cells; use as a context manager. Reports them to whoever listens, else shows them itself.
+    """A context manager that counts cells and reports them to a listener, or shows them itself.
 
     Parameters
     ----------
     total
-        Cells of the run.
+        Number of cells of the run.
     done
-        Cells that were committed before.
+        Number of cells that were committed before.
     terminal
-        Draw a bar instead of printing lines.
+        Whether to draw a bar instead of printing lines.
     echo
-        Prints a line.
+        Function that prints a line.
     clock
-        Seconds that only ever grow.
+        Function that returns a monotonic time [s].
     expected_s
-        Time that the missing cells will take, by the rule of thumb [s].
+        Expected time of the missing cells, by the rule of thumb [s].
     """
 
     def __init__(
@@ -92,12 +92,12 @@ class Progress:
             self._echo(self.line())
 
     def rate(self) -> float:
-        """Cells per second in this session."""
+        """Return the cells per second in this session."""
         elapsed = self._clock() - self._started
         return (self._done - self._before) / elapsed if elapsed > 0 else 0.0
 
     def line(self) -> str:
-        """Return the plain line."""
+        """Return a line of plain text on the progress."""
         rate = self.rate()
         left = (
             f", {duration((self._total - self._done) / rate)} left"

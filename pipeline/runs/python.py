@@ -1,4 +1,4 @@
-"""What `import magpend` gives beyond the commands: runs that are opened, and tidy tables."""
+"""Define the parts of `import magpend` beyond the commands: opened runs and pandas tables."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ def run(
     echo: Callable[[str], None] = print,
     **options: Any,
 ) -> Run:
-    """Run a specification, or what is missing of it, and open the run.
+    """Run a specification, or complete its run, and open the run.
 
     Parameters
     ----------
     spec
         Path of a TOML file, the name of a shipped workflow, TOML text, or a table (a dict).
     out
-        Run directory; by default ``runs/<name>``. A text or table has its model's name and a digest, so that
-        the same one goes on where it was.
+        Run directory; by default ``runs/<name>``. For a text or a table the name is its model's with a
+        digest, so that the same specification continues its run.
     smoke
-        Take the small size of the specification's ``[smoke]`` table.
+        Whether to apply the specification's ``[smoke]`` table.
     echo
-        Prints a line.
+        Function that prints a line.
     options
         ``workers``, ``scheduler``, ``cluster`` and ``dashboard``, see `pipeline.runs.run.run`.
 
     Returns
     -------
     Run
-        For `attractors` and the other analyses, for `figure`; ``run.cube()`` is the Dataset.
+        The run, for `attractors` and the other analyses, and for `figure`; ``run.cube()`` is the Dataset.
 
     Raises
     ------
     SpecError
-        If the specification is wrong, before anything is computed; all problems at once.
+        If the specification is wrong; before anything is computed, with all problems.
     Exception
-        As `pipeline.runs.run.run`.
+        See `pipeline.runs.run.run`.
 
     Examples
     --------
@@ -64,22 +64,23 @@ def run(
 
 
 def table(found: xr.Dataset) -> pd.DataFrame:
-    """Return the result of an analysis as a tidy table, as ``magpend analyse NAME --csv`` writes it.
+    """Return the result of an analysis as a pandas table, as ``magpend analyse NAME --csv`` writes it.
 
     Parameters
     ----------
     found
-        What `attractors`, `basins`, `branches`, ... returned.
+        Result of `attractors`, `basins`, `branches`, ...
 
     Returns
     -------
     DataFrame
-        Of `attractors` a row for each attractor at each parameter point; numbers in SI units, unrounded.
+        For `attractors`, a row for each attractor at each parameter point. Numbers are in SI units,
+        unrounded.
 
     Raises
     ------
     ValueError
-        If it is not the result of an analysis.
+        If `found` is not the result of an analysis with a table.
     """
     import pandas as pd
 

@@ -1,4 +1,4 @@
-"""Glue: a specification's file to a finished run directory."""
+"""Run a specification: from its file to a finished run directory."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ __all__ = ["InterruptedRunError", "carry_out", "identity_here", "run"]
 
 Echo = Callable[[str], None]
 Sources = Sequence[tuple[str, str]]
-"""Directories and digests of runs that hold cells of the one at hand."""
+"""Directories and digests of runs whose cells are reused."""
 
 
 def run(
@@ -51,46 +51,47 @@ def run(
     smoke: bool = False,
     echo: Echo = print,
 ) -> State:
-    """Run a specification, or what is missing of it.
+    """Run a specification, or complete its run.
 
-    Where ``run.json``, metadata or coordinates of the directory are damaged, they are rebuilt from the
-    specification, and committed cells that still fit their records stay.
+    Damaged ``run.json``, metadata or coordinates are rebuilt from the specification. Committed cells that fit
+    their records stay.
 
     Parameters
     ----------
     spec
         Path of a TOML file, or the name of a shipped workflow; or a specification as TOML text or as a table,
-        whose files are looked for in the current folder.
+        with files relative to the current folder.
     out
-        Run directory; by default ``runs/<name>``, where a text or table has its model's name and a digest.
+        Run directory; by default ``runs/<name>``. For a text or a table the name is its model's with a
+        digest.
     workers
         See `execute.run_tasks`.
     scheduler, cluster, dashboard
         See `clients.Where`.
     smoke
-        Take the small size of the specification's ``[smoke]`` table.
+        Whether to apply the specification's ``[smoke]`` table.
     echo
-        Prints a line.
+        Function that prints a line.
 
     Returns
     -------
     State
-        Of the finished run.
+        State of the finished run.
 
     Raises
     ------
     SpecError, RefusedError, LockedError
-        Before anything is created or changed.
+        If the specification is wrong, or the directory cannot be used; before anything is created or changed.
     addresses.SchedulerError
-        If a scheduler or its workers cannot be used, or are lost; what was committed stays.
+        If a scheduler or its workers cannot be used, or are lost. Committed tasks stay.
     UnreadableError
-        If a file of the directory is there and cannot be read; nothing is removed.
+        If a file of the directory exists and cannot be read; nothing is removed.
     execute.TaskFailedError
         If tasks failed twice. All others are committed.
     IncompleteError
         If all tasks returned and not all are committed.
     InterruptedRunError
-        After Ctrl-C, SIGTERM or SIGHUP. What was committed stays.
+        After Ctrl-C, SIGTERM or SIGHUP. Committed tasks stay.
     """
     from pipeline.compute.clients import Where
 
@@ -115,25 +116,25 @@ def carry_out(
     echo: Echo,
     sources: Sources = (),
 ) -> None:
-    """Run a specification, or what is missing of it, in a run directory.
+    """Run a specification in a run directory, or complete its run.
 
     Parameters
     ----------
     spec, text
-        It, and the TOML text that it was read from.
+        The specification, and the TOML text that it was read from.
     files
-        Those of the run directory.
+        Files of the run directory.
     workers, echo
-        As for `run`.
+        See `run`.
     where
-        Where tasks are computed.
+        Scheduler that computes the tasks.
     sources
-        Runs from which cells that they hold are taken, see `pipeline.runs.extend`.
+        Runs whose cells are reused, see `pipeline.runs.extend`.
 
     Raises
     ------
     Exception
-        As `run`.
+        See `run`.
     """
     from pipeline.compute import clients
 
@@ -150,12 +151,12 @@ def carry_out(
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """What makes a run this one, with the numerical core that is installed here.
+    """Return the identity of a run with the numerical core installed here.
 
     Raises
     ------
     SpecError
-        If it is too large to be laid out, see `limits.check_plan`.
+        If the run is too large, see `limits.check_plan`.
     """
     from magpend_core import kernel_version
 
@@ -216,7 +217,7 @@ def _complete(
 
 
 def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
-    """Believe the commit records, not the workers; remove what those left that were stopped at their work."""
+    """Check by the commit records that all tasks are committed, and remove files of stopped workers."""
     commits, problems = damaged_records(info, plan, contents=False)
     absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:

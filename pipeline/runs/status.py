@@ -1,4 +1,4 @@
-"""How far a run is: ``magpend status``."""
+"""Report the progress of a run: ``magpend status``."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from pipeline.store.run import Run
 
 @dataclass(frozen=True)
 class State:
-    """How far a run is.
+    """The progress of a run.
 
     Attributes
     ----------
     files : Files
-        Of the run directory.
+        Files of the run directory.
     title : str
+        Title of the run.
     plan : Plan
+        Plan of the run.
     done : frozenset of int
         Committed tasks.
     cells : dict
-        Committed cells by status name.
+        Number of committed cells by status name.
     """
 
     files: Files
@@ -35,12 +37,12 @@ class State:
 
     @property
     def name(self) -> str:
-        """What people call the directory."""
+        """Path or URL of the run directory."""
         return self.files.name
 
     @property
     def n_committed(self) -> int:
-        """Committed cells."""
+        """Number of committed cells."""
         return sum(self.cells.values())
 
     @property
@@ -50,12 +52,12 @@ class State:
 
 
 def state(source: str | Path | Files | Run) -> State:
-    """Say how far a run is, from its commit records alone.
+    """Return the progress of a run from its commit records.
 
     Raises
     ------
     RefusedError, DamagedError, UnreadableError
-        As `Run.open`.
+        See `Run.open`.
     """
     run = Run.open(source)
     return State(run.info.files, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())

@@ -1,7 +1,7 @@
-"""Signals that end a command: Ctrl-C, SIGTERM, and SIGHUP from a terminal that closes.
+"""Handle signals that end a command: Ctrl-C, SIGTERM, and SIGHUP from a terminal that closes.
 
-The first ends it in order: what is being computed is given up, workers end, files and folders of the
-moment are removed. The second ends it at once. Before a command has begun, the first does.
+The first signal ends a command in order: current tasks are given up, workers end, temporary files and folders
+are removed. The second signal ends it at once. Before a command has begun, the first signal ends it at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ NUMBERS = tuple(getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if h
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal, treated like Ctrl-C.
+    """An exception for a signal, handled like Ctrl-C.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptedRunError(Exception):
-    """The run was stopped by a signal; what was committed stays.
+    """An error for a run that a signal stopped. Committed tasks stay.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class InterruptedRunError(Exception):
 
 
 class _Listener:
-    """What the command line does on a signal."""
+    """The signal handler of the command line."""
 
     first: int | None = None
     is_in_order = False
@@ -61,7 +61,7 @@ _listener = _Listener()
 
 
 def listen() -> None:
-    """Take over the signals for a command line; what a parent process ignores stays ignored."""
+    """Install the signal handlers of the command line; signals that the parent ignores stay ignored."""
     for number in NUMBERS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _listener)
@@ -69,24 +69,24 @@ def listen() -> None:
 
 @contextlib.contextmanager
 def in_order() -> Iterator[None]:
-    """Let the first signal raise `Stopped` inside."""
+    """Let the first signal raise `Stopped` inside this context."""
     _listener.is_in_order = True
     try:
         yield
     finally:
         _listener.is_in_order = False
-        if _listener.first is not None:  # what is left is to say so: once, and with the first one's code
+        if _listener.first is not None:  # ignore further signals while the message is printed
             for number in NUMBERS:
                 signal.signal(number, signal.SIG_IGN)
 
 
 def first_signal() -> int | None:
-    """Which signal came first, if one came."""
+    """Return the first signal that came; None if none came."""
     return _listener.first
 
 
 def end_if_stopped(code: int) -> None:
-    """End this process if a signal came, once people have been told; nothing is left that could take long."""
+    """End this process if a signal came, after the message is printed."""
     if _listener.first is not None:
         logging.shutdown()
         for stream in (sys.stdout, sys.stderr):
@@ -96,9 +96,9 @@ def end_if_stopped(code: int) -> None:
 
 
 def leave(number: int) -> NoReturn:
-    """End this process now, and what it started."""
+    """End this process and its workers at once."""
     local: Any = sys.modules.get("pipeline.compute.local")
-    if hasattr(local, "abandon"):  # not while it is being imported
+    if hasattr(local, "abandon"):  # absent while the module is being imported
         local.abandon()
     shown = "\x1b[?25h" if sys.stderr.isatty() else ""
     how = "stopped" if _listener.first is None else "stopped at once; what is committed stays"
@@ -109,12 +109,12 @@ def leave(number: int) -> NoReturn:
 
 @contextlib.contextmanager
 def stoppable(directory: str | Path) -> Iterator[None]:
-    """Turn Ctrl-C, SIGTERM and SIGHUP into `InterruptedRunError`, after all that is inside has been closed.
+    """Turn Ctrl-C, SIGTERM and SIGHUP into `InterruptedRunError`, after everything inside is closed.
 
     Parameters
     ----------
     directory
-        Where what has been done is kept, for the message.
+        Directory that keeps the results, for the message.
     """
     try:
         with _raising():
@@ -127,13 +127,13 @@ def stoppable(directory: str | Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _raising() -> Iterator[None]:
-    """Let signals that would kill this process raise `Stopped`, where nobody else has taken them over."""
+    """Let signals with their default action raise `Stopped`; other handlers stay."""
 
     def stop(number: int, frame: Any) -> None:
         raise Stopped(number)
 
     taken = []
-    with contextlib.suppress(ValueError):  # not the main thread: signals are somebody else's
+    with contextlib.suppress(ValueError):  # outside the main thread handlers cannot be installed
         for number in NUMBERS:
             if signal.getsignal(number) is signal.SIG_DFL:
                 signal.signal(number, stop)

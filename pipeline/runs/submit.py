@@ -32,31 +32,31 @@ CLUSTER_FILE = "MAGPEND_CLUSTER"
 SCRIPT, SENT = "job.sh", "job.json"
 _ANSWER_S = 60.0
 _AWKWARD = re.compile(r"[^\w./+,:=@-]")
-"""What batch systems do not take, or read as something else, in the path of a log."""
+"""Characters that batch systems refuse or misread in the path of a log."""
 
 
 class SubmitError(Exception):
-    """The batch system did not take a job; the message has its words."""
+    """An error for a job that the batch system did not accept; the message quotes its answer."""
 
 
 @dataclass(frozen=True)
 class Submission:
-    """A run as a job.
+    """A run as a batch job.
 
     Attributes
     ----------
     name : str
         The run directory, as it was given.
     folder : Path
-        Of its jobs: script, number, and what is said in them.
+        Folder of its jobs: script, job number, and logs.
     cluster : Cluster
-        What a job is.
+        Description of a job.
     script : str
         The batch script.
     complete : bool
         Whether there is nothing left to compute.
     job : str, optional
-        Its number, once it is sent.
+        Job number, after sending.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Submission:
     job: str | None = None
 
     def lines(self) -> list[str]:
-        """How to follow, cancel and go on."""
+        """Return lines on how to follow, cancel and continue the job."""
         words = WORDS[self.cluster.kind]
         return [
             f"sent: job {self.job}",
@@ -81,19 +81,19 @@ class Submission:
 def prepare(
     spec: str | Path, out: str | Path | None, cluster_file: str | Path | None, *, smoke: bool = False
 ) -> Submission:
-    """Write the script of a run's job, as text; nothing is created or sent.
+    """Make the batch script of a run's job; nothing is created or sent.
 
     Parameters
     ----------
     spec, out, smoke
         See `run.run`.
     cluster_file
-        With the ``[cluster]`` table; by default what ``MAGPEND_CLUSTER`` says.
+        File with the ``[cluster]`` table; by default ``MAGPEND_CLUSTER`` in the environment.
 
     Raises
     ------
     SpecError
-        If one of the files is not in order, or a path is nothing for a batch system.
+        If one of the files is not valid, or a batch system would not accept a path.
     RefusedError, DamagedError, UnreadableError
         If the run cannot be done in the directory.
     """
@@ -124,7 +124,7 @@ def prepare(
 
 
 def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) -> list[str]:
-    """``magpend run``, as the job gives it."""
+    """Return the command ``magpend run`` for the job."""
     where = ["--scheduler", "local", "--workers", str(cluster.cores)]
     if not is_whole(cluster):
         where = ["--scheduler", cluster.kind, "--cluster", str(file.absolute())]
@@ -141,11 +141,11 @@ def send(submission: Submission) -> Submission:
     Raises
     ------
     LockedError
-        If a job of this run waits or runs already.
+        If a job of this run is waiting or running already.
     SpecError
         If there is no such batch system here.
     SubmitError
-        If it does not take the job.
+        If the batch system does not accept the job.
     """
     kind = submission.cluster.kind
     words = WORDS[kind]
@@ -176,13 +176,13 @@ def send(submission: Submission) -> Submission:
 
 
 def _refuse_second(submission: Submission) -> None:
-    """Two jobs of a run would wait for each other's lock."""
+    """Refuse a second job of a run: it would only wait for the first one's lock."""
     try:
         sent = json.loads((submission.folder / SENT).read_text("utf-8"))
         kind, job = sent["kind"], sent["job"]
         words = WORDS[kind]
     except (OSError, ValueError, TypeError, KeyError):
-        return  # none was sent, or the note of it is gone: the run's lock keeps two from computing
+        return  # no job was sent, or its note is lost; then the run's lock prevents a second computation
     if not (isinstance(job, str) and words.job(f"<{job}>")) or not shutil.which(words.ask[0]):
         return
     done = _ask([*words.ask, job])

@@ -1,4 +1,4 @@
-"""What ``magpend verify`` does and says."""
+"""Verify a run directory and repair it: ``magpend verify``."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from pipeline.store.setup import rebuild_skeleton
 
 
 def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
-    """Compare every committed file with its commit record, and the set-up's with ``run.json``.
+    """Compare every committed file with its commit record, and the set-up's files with ``run.json``.
 
     Parameters
     ----------
     directory
         Run directory.
     repair
-        Rebuild damaged metadata and coordinates, withdraw the records of damaged tasks, which are pending
-        from then on, and remove damaged products.
+        Whether to repair: rebuild damaged metadata and coordinates, withdraw the records of damaged tasks,
+        which then are pending, and remove damaged products.
 
     Raises
     ------
     RefusedError
         If there is no run in `directory`.
     DamagedError
-        If ``run.json`` is not what was written.
+        If ``run.json`` has changed since it was written.
     UnreadableError
-        If a file is there and cannot be read; nothing is changed.
+        If a file exists and cannot be read; nothing is changed.
     LockedError
-        With `repair`, if a run is writing there.
+        With `repair`, if a run is writing to the directory.
     """
     info = read_run(directory)
     spec = kept_spec(info.spec)
@@ -55,7 +55,7 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
 
 
 def describe(found: Verification, directory: str | Path, *, repaired: bool) -> list[str]:
-    """Return the lines to print."""
+    """Return the lines about a verification."""
     lines = [f"{directory}: {found.n_committed} of {found.n_tasks} tasks committed and intact"]
     odd = [f"{key}: {ODD}" for key in found.odd]
     lines += [

@@ -1,4 +1,4 @@
-"""Versions of analyses: digests of what their code means, so that editing one makes no other stale."""
+"""Compute versions of analyses: digests of their code, so that editing one makes no other stale."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _COUNTED = ("pipeline.analysis", "pipeline.layout.vocabulary")
 
 @cache
 def code_version(name: str) -> str:
-    """Digest of the code that an analysis' numbers depend on.
+    """Return a digest of the code that an analysis' numbers depend on.
 
-    That is the numerical core, the modules of `pipeline.analysis` that its function imports, directly or
+    It covers the numerical core, the modules of `pipeline.analysis` that the analysis imports, directly or
     not, and those of the analyses that it builds on. Comments, docstrings and the wording of errors do not
     count.
     """
@@ -31,7 +31,7 @@ def code_version(name: str) -> str:
 
 
 def modules_of(name: str) -> set[str]:
-    """Names of the modules of `pipeline.analysis` that an analysis' function imports, directly or not."""
+    """Return the modules of `pipeline.analysis` that an analysis imports, directly or not."""
     analysis = ANALYSES[name]
     found: set[str] = set()
     left = [analysis.compute.partition(":")[0]]
@@ -47,7 +47,7 @@ def modules_of(name: str) -> set[str]:
 
 @cache
 def _imports(module: str) -> tuple[str, ...]:
-    """What a module imports of the code that counts, anywhere in it."""
+    """Return the modules that count among the imports of a module, anywhere in it."""
     names: list[str] = []
     for node in ast.walk(ast.parse(_file(module).read_bytes())):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:

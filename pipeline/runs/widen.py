@@ -1,4 +1,4 @@
-"""A wider specification from a run's own: longer axes, more starts, more kept sections, more products."""
+"""Make a wider specification from a run's own: longer axes, more starts, sections or products."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.spec.tables import FREQUENCY
 
 @dataclass(frozen=True)
 class Widening:
-    """What differs from the old specification; everything else stays as it was.
+    """Changes to a specification; everything else stays unchanged.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class Widening:
     keep : int or None
         Kept sections.
     products : dict
-        Options by name of products to compute besides, as the tables of ``[products]``.
+        Options of additional products by name, as in the tables of ``[products]``.
     """
 
     axes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -39,12 +39,12 @@ class Widening:
 
 
 def widened(spec: Spec, widening: Widening) -> Spec:
-    """Return the changed specification.
+    """Return the widened specification.
 
     Raises
     ------
     SpecError
-        If a change does not fit, or the result is no valid specification.
+        If a change does not fit, or the result is not a valid specification.
     """
     problems = _problems(spec, widening)
     if problems:

@@ -1,4 +1,4 @@
-"""Find what is to be run: a file, or a workflow that ships."""
+"""Find and read specifications: files, shipped workflows, texts and tables."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from pipeline.spec.problems import SpecError, unknown_name
 
 
 def find_spec(name: str | Path) -> Path:
-    """Return the path of a specification: a file, or the bare name of one that ships.
+    """Return the path of a specification, given as a path or as the name of a shipped workflow.
 
     Raises
     ------
     SpecError
-        If there is neither.
+        If neither a file nor a workflow has the name.
     """
     path = Path(name)
     if path.exists() or path.suffix or len(path.parts) > 1:
@@ -33,22 +33,23 @@ def find_spec(name: str | Path) -> Path:
 
 
 def read_given(spec: str | Path | Mapping[str, Any], *, smoke: bool = False) -> tuple[Spec, str, Path]:
-    """Read a specification: a file, a workflow that ships, a TOML text or a table.
+    """Read a specification: a file, a shipped workflow, a TOML text or a table.
 
     Parameters
     ----------
     spec
-        As `pipeline.runs.run.run` takes it.
+        Specification as `pipeline.runs.run.run` takes it.
     smoke
-        Take the small size of its ``[smoke]`` table.
+        Whether to apply its ``[smoke]`` table.
 
     Returns
     -------
     spec : Spec
+        The specification.
     text : str
-        As TOML.
+        Its TOML text.
     directory : Path
-        Where its run goes unless told otherwise.
+        Default directory of its run.
 
     Raises
     ------
@@ -65,12 +66,12 @@ def read_given(spec: str | Path | Mapping[str, Any], *, smoke: bool = False) -> 
 
 
 def shipped_workflows() -> dict[str, Path]:
-    """Paths of the workflows that ship with magpend, by name: what ``magpend run`` takes."""
+    """Return the paths of the workflows that ship, by name, for ``magpend run``."""
     return {name: path for name, path in _shipped().items() if not _identifies(path)}
 
 
 def shipped_identifications() -> dict[str, Path]:
-    """Paths of the identifications that ship with magpend, by name: what ``magpend identify`` takes."""
+    """Return the paths of the identifications that ship, by name, for ``magpend identify``."""
     return {name: path for name, path in _shipped().items() if _identifies(path)}
 
 
@@ -87,5 +88,5 @@ def _shipped() -> dict[str, Path]:
 
 
 def default_directory(spec_path: Path, smoke: bool) -> Path:
-    """Where a run goes unless told otherwise."""
+    """Return the default directory of a run."""
     return Path("runs") / (spec_path.stem + ("-smoke" if smoke else ""))

@@ -1,4 +1,4 @@
-"""A new specification from an old one: narrower ranges, pinned parameters, everything else as it was."""
+"""Make a new specification from an old one, with narrower ranges and fixed parameters."""
 
 from __future__ import annotations
 
@@ -21,18 +21,19 @@ from pipeline.store.local import refuse_place
 MARK = "(zoom)"
 _ORDER = ("parameters", "axes", "initial_conditions", "continuation", "integration", "products", "execution")
 _ROUNDING = 1e-9
-"""Relative amount by which a range may pass the old one's end without a note: degrees are converted."""
+"""Relative amount by which a range may exceed the old one without a note, for conversion of degrees."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A specification and where it comes from.
+    """A specification and its origin.
 
     Attributes
     ----------
     spec : Spec
+        The specification.
     origin : str
-        For the comment at the head of the new file.
+        Phrase for the comment at the head of the new file.
     """
 
     spec: Spec
@@ -41,19 +42,18 @@ class Source:
 
 @dataclass(frozen=True)
 class Changes:
-    """What differs from the old specification.
+    """The changes of a specification.
 
     Attributes
     ----------
     ranges : dict
-        Lowest and highest value by key: of states (with ``_deg`` in degrees), ``frequency_hz`` or
-        parameters.
+        Lowest and highest value by key: a state (with ``_deg`` in degrees), ``frequency_hz`` or a parameter.
     pins : dict
-        One value by such a key.
+        One value by key, as in `ranges`.
     num : int or None
-        Points of every new range.
+        Number of points of every new range.
     nums : dict
-        Points by the key's state, frequency or parameter; they go before `num`.
+        Number of points by state, frequency or parameter; takes precedence over `num`.
     samples : int or None
         Number of random initial conditions.
     """
@@ -71,7 +71,7 @@ def read_source(path: str | Path) -> Source:
     Raises
     ------
     SpecError, store.RefusedError
-        If there is none, or it is not valid.
+        If there is no specification, or it is not valid.
     """
     from pipeline.runs.workflows import find_spec
     from pipeline.store.files import is_url, local_path
@@ -86,16 +86,15 @@ def read_source(path: str | Path) -> Source:
 
 
 def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
-    """Return the changed specification, and notes on ranges that reach beyond the old ones.
+    """Return the changed specification, and notes on ranges that exceed the old ones.
 
-    A range keeps the number of points that it had; a state or parameter that had one value can be given
-    a range with a number of points. Ranges are evenly spaced, whatever the old ones were. A ``[smoke]``
-    table is not taken over.
+    A range keeps its number of points. A state or parameter with one value can get a range with a given
+    number of points. New ranges are evenly spaced. A ``[smoke]`` table is not copied.
 
     Raises
     ------
     SpecError
-        If nothing changes, a change does not fit, or the result is no valid specification.
+        If nothing changes, a change does not fit, or the result is not a valid specification.
     """
     problems = _check(spec, changes)
     if problems:
@@ -118,12 +117,12 @@ def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
 
 
 def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
-    """Write the specification that `changes` make of `source`; returns the notes of `zoom`.
+    """Write the changed specification to a file; return the notes of `zoom`.
 
     Raises
     ------
     SpecError
-        As `zoom`; also if `out` exists or cannot be written to. Nothing is written then.
+        See `zoom`; also if `out` exists or cannot be written to. Nothing is written then.
     """
     if out.suffix != ".toml":
         raise SpecError([f"{out}: the suffix must be .toml."])
@@ -146,12 +145,12 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
 
 
 def _state(spec: Spec, key: str) -> str | None:
-    """Name of the state that a key sets, None if it is a parameter's."""
+    """Return the name of the state that a key sets; None for a parameter."""
     return state_of_key(key, spec.model)
 
 
 def _check(spec: Spec, changes: Changes) -> list[str]:
-    """Problems with the changes themselves."""
+    """Return problems with the changes themselves."""
     keys = [*changes.ranges, *changes.pins]
     if not keys:
         return [
@@ -194,14 +193,14 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
 
 
 def _points(spec: Spec, key: str, changes: Changes) -> int:
-    """Points of a new range: as asked for, else as before, else 0."""
+    """Return the number of points of a new range: the requested or the old number, else 0."""
     asked = changes.nums.get(_state(spec, key) or key, changes.num)
     old = _old_range(spec, key)
     return asked if asked is not None else (len(old.array()) if old is not None else 0)
 
 
 def _old(spec: Spec, key: str) -> tuple[Any, float]:
-    """What the old specification has for the key, and the factor to the key's unit."""
+    """Return the old value or range of a key, and the factor to the key's unit."""
     state = _state(spec, key)
     if state is None:
         return spec.axes.get(key), 1.0
@@ -219,7 +218,7 @@ def _old_range(spec: Spec, key: str) -> Range | None:
 
 
 def _extent(spec: Spec, key: str) -> tuple[float, float] | None:
-    """Old lowest and highest value in the key's unit; None if there was no range."""
+    """Return the old lowest and highest value in the key's unit; None if there was no range."""
     value, factor = _old(spec, key)
     if isinstance(value, Range):
         array = value.array()
@@ -232,7 +231,7 @@ def _slack(extent: tuple[float, float]) -> float:
 
 
 def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
-    """Set a state's or parameter's value or range in plain data, and take its old one out."""
+    """Set a state's or parameter's value or range in plain data, and remove its old one."""
     state = _state(spec, key)
     if state is not None:
         data["initial_conditions"].pop(state, None)
@@ -252,9 +251,9 @@ def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
 
 
 def to_toml(spec: Spec) -> str:
-    """Return a specification as a TOML text that reads back as the same.
+    """Return a specification as TOML text that reads back as the same specification.
 
-    A model as text goes last, with a table for each of its own; of a Python object it is the place.
+    A model as text comes last, with its own tables. A Python object is written as its import path.
     """
     data = spec.as_dict()
     model = model_toml(data.pop("model"))
@@ -263,7 +262,7 @@ def to_toml(spec: Spec) -> str:
     lines += [model.rstrip("\n")] if is_line else []
     names = [name for name in data if isinstance(data[name], dict)]
     for name in sorted(names, key=lambda n: _ORDER.index(n) if n in _ORDER else len(_ORDER)):
-        # an empty table says nothing
+        # an empty table is left out
         table = {key: value for key, value in data[name].items() if value != {}}
         if table:
             lines += ["", f"[{name}]", *(f"{toml_key(k)} = {toml_value(v)}" for k, v in table.items())]

@@ -1,1 +1,1 @@
-"""What a person writes: tables, starts, parsing, and what is wrong with them."""
+"""Read specifications: tables, starts, parsing, and sentences about their problems."""

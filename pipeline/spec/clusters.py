@@ -1,4 +1,4 @@
-"""The ``[cluster]`` table: what a job of a batch system is, in a TOML file of its own."""
+"""Read the ``[cluster]`` table, which describes a job of a batch system, from its own TOML file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.spec.problems import SpecError, problems_of, unknown_key
 from pipeline.spec.tables import Table
 
 QUEUES = ("slurm", "pbs", "sge", "lsf")
-"""Batch systems that workers can be asked of."""
+"""Batch systems that can start workers."""
 
 _TIME = re.compile(r"(\d{1,4}):([0-5]\d):([0-5]\d)")
 _MEMORY = re.compile(r"(\d+(?:\.\d+)?) ?([kMGT]i?)B")
@@ -24,7 +24,7 @@ Lines = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 def seconds_of(time: str) -> int:
-    """Seconds of a time such as ``04:00:00``; raises `ValueError` if it is none."""
+    """Return the seconds of a time such as ``04:00:00``; raise `ValueError` for any other text."""
     match = _TIME.fullmatch(time)
     if match is None or not any(map(int, match.groups())):
         raise ValueError(f"{time!r}: must be hours, minutes and seconds above zero, such as '04:00:00'.")
@@ -33,7 +33,7 @@ def seconds_of(time: str) -> int:
 
 
 def bytes_of(memory: str) -> int:
-    """Bytes of a size such as ``16 GB``; raises `ValueError` if it is none."""
+    """Return the bytes of a size such as ``16 GB``; raise `ValueError` for any other text."""
     match = _MEMORY.fullmatch(memory)
     if match is None or not float(match[1]):
         raise ValueError(f"{memory!r}: must be a number and kB, MB, GB or TB, such as '16 GB'.")
@@ -41,41 +41,41 @@ def bytes_of(memory: str) -> int:
 
 
 def clock(seconds: int) -> str:
-    """Write seconds as `seconds_of` reads them."""
+    """Format seconds as ``HH:MM:SS``, which `seconds_of` reads."""
     return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 
 def hours_and_minutes(seconds: int) -> str:
-    """Write seconds as LSF has times: whole minutes, at least one."""
+    """Format seconds for LSF: whole minutes, at least one."""
     minutes = max(1, seconds // 60)
     return f"{minutes // 60:02d}:{minutes % 60:02d}"
 
 
 class Cluster(Table):
-    """What a job is that holds workers, and how many of them there may be."""
+    """The ``[cluster]`` table: a job that holds workers, and the number of jobs."""
 
-    kind: Literal["slurm", "pbs", "sge", "lsf"] = Field(description="The batch system.")
-    queue: str | None = Field(None, description="Queue, or partition.")
-    account: str | None = Field(None, description="Account, or project, that pays.")
-    cores: int = Field(ge=1, le=4096, description="Cores of a job: one worker process for each.")
+    kind: Literal["slurm", "pbs", "sge", "lsf"] = Field(description="Batch system.")
+    queue: str | None = Field(None, description="Queue or partition.")
+    account: str | None = Field(None, description="Account or project that is charged.")
+    cores: int = Field(ge=1, le=4096, description="Cores of a job; each runs one worker process.")
     memory: str = Field(description="Memory of a job, such as '16 GB'.")
     walltime: str = Field(description="Time after which the batch system ends a job, such as '04:00:00'.")
     lifetime: str | None = Field(
         None,
-        description="Time after which workers leave by themselves; by default a tenth before the walltime.",
+        description="Time after which workers leave; by default shortly before the walltime.",
     )
     lifetime_stagger: str | None = Field(
-        None, description="They leave up to so much earlier or later, so that not all do at once."
+        None, description="Spread of the times at which workers leave, so that they do not leave at once."
     )
-    min_jobs: int = Field(1, ge=1, le=10_000, description="Jobs that are kept, whatever there is to do.")
-    max_jobs: int = Field(1, ge=1, le=10_000, description="Jobs at most.")
+    min_jobs: int = Field(1, ge=1, le=10_000, description="Jobs that are always kept.")
+    max_jobs: int = Field(1, ge=1, le=10_000, description="Most jobs at a time.")
     coordinator_memory: str = Field(
-        "4 GB", description="Memory of the job that sends tasks to the others, where there are several."
+        "4 GB", description="Memory of the coordinator, the job that sends tasks to several other jobs."
     )
     coordinator_walltime: str | None = Field(
-        None, description="Its time; by default the walltime of the others."
+        None, description="Time of the coordinator's job; by default the walltime of the others."
     )
-    wait: str = Field("24:00:00", description="How long to wait for the first worker.")
+    wait: str = Field("24:00:00", description="Longest time to wait for the first worker.")
     prologue: Lines = Field(
         (), description="Shell lines before the workers start, such as 'module load python'."
     )
@@ -83,8 +83,10 @@ class Cluster(Table):
         (), description="More lines for the batch system, such as '--constraint=avx512'."
     )
     interface: str | None = Field(None, description="Network interface, such as 'ib0'.")
-    scratch: str | None = Field(None, description="Folder of a node's own disk, such as '$TMPDIR'.")
-    python: str | None = Field(None, description="Python on the nodes; by default the one that runs here.")
+    scratch: str | None = Field(None, description="Folder on a node's local disk, such as '$TMPDIR'.")
+    python: str | None = Field(
+        None, description="Python on the nodes; by default the Python that runs this command."
+    )
 
     @field_validator("walltime", "lifetime", "lifetime_stagger", "coordinator_walltime", "wait")
     @classmethod
@@ -140,7 +142,7 @@ class Cluster(Table):
 
     @property
     def margin_s(self) -> int:
-        """Time between the latest leave of a worker and the end of its job, where it is chosen here [s]."""
+        """Default time between the last worker's leave and the end of its job [s]."""
         tenth = self.walltime_s // 10
         return max(1, min(max(tenth, _LEAST_MARGIN_S), _MOST_MARGIN_S, self.walltime_s // 2))
 
@@ -153,19 +155,19 @@ class Cluster(Table):
 
     @property
     def stagger_s(self) -> int:
-        """How far the leaves of workers are spread [s]."""
+        """Spread of the times at which workers leave [s]."""
         if self.lifetime_stagger is not None:
             return seconds_of(self.lifetime_stagger)
         return self.margin_s // 3
 
     @property
     def memory_bytes(self) -> int:
-        """Memory of a job."""
+        """Memory of a job [bytes]."""
         return bytes_of(self.memory)
 
     @property
     def wait_s(self) -> int:
-        """How long to wait for the first worker [s]."""
+        """Longest time to wait for the first worker [s]."""
         return seconds_of(self.wait)
 
 
@@ -175,7 +177,7 @@ def load_cluster(path: str | Path) -> Cluster:
     Raises
     ------
     SpecError
-        Naming all that is wrong with it.
+        If the file is not valid; the message lists all problems.
     """
     tables = read_toml(path)
     if not isinstance(tables.get("cluster"), dict):

@@ -1,12 +1,12 @@
-"""Drive files: a recorded drive as a small table of numbers, for runs and simulations.
+"""Read drive files: a recorded drive as a small table of numbers, for runs and simulations.
 
-A CSV file with one of two headers; lines that begin with ``#`` are remarks.
+A drive file is CSV with one of two headers. Lines that begin with ``#`` are comments.
 
 ``rising_s,falling_s``
-    Measured edges: a row per period with the instants at which it begins and at which it falls; the last row
-    has the end of the last period, and no falling edge. Shape and amplitude are the model's own.
+    Measured edges: one row per period, with the times of its rising and its falling edge. The last row holds
+    the end of the last period and no falling edge. The model gives the drive's shape and amplitude.
 ``time_s,drive``
-    Torque, or whatever the model's forcing is, in the model's unit; values are joined by lines.
+    The torque, or another forcing, in the model's unit. Values are interpolated linearly.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 EDGES, TORQUE = "edges", "torque"
 HEADERS = {EDGES: ("rising_s", "falling_s"), TORQUE: ("time_s", "drive")}
 DUTY = "duty_cycle"
-"""Parameter that measured edges change from period to period."""
+"""Parameter whose value measured edges set anew in each period."""
 
 MOST_BYTES = 20_000_000
 MOST_PROBLEMS = 5
 _COINCIDENT_S = 1e-9
 _BAND = 0.5
-"""Share of the torque's span that it must cross to count as an edge."""
+"""Fraction of the torque's range that an edge must cross to count."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedDrive:
-    """A recorded drive, and where its sections lie.
+    """A recorded drive with the times of its sections.
 
     Attributes
     ----------
@@ -48,11 +48,12 @@ class RecordedDrive:
     file : str
         Name of its file, for messages.
     sha256 : str
-        Of the file.
+        Digest of the file.
     first, second : ndarray
-        The file's columns: rising and falling edges [s], one of the latter less; or times [s] and torque.
+        Columns of the file: rising and falling edges [s], with one falling edge less; or times [s] and
+        torque.
     sections_s : ndarray
-        Instants of the sections after the start [s, the file's clock].
+        Times of the sections after the start [s, the file's clock].
     """
 
     kind: str
@@ -64,22 +65,22 @@ class RecordedDrive:
 
     @property
     def start_s(self) -> float:
-        """Where it begins, and with it a trajectory [s, the file's clock]."""
+        """Time at which the drive and a trajectory begin [s, the file's clock]."""
         return float(self.first[0])
 
     @property
     def end_s(self) -> float:
-        """Where it ends [s, the file's clock]."""
+        """Time at which the drive ends [s, the file's clock]."""
         return float(self.first[-1])
 
     @property
     def n_periods(self) -> int:
-        """Sections that it has."""
+        """Number of sections."""
         return len(self.sections_s)
 
     @property
     def frequency_hz(self) -> float:
-        """Mean frequency of the sections [Hz]; one over its length if there are not two of them."""
+        """Mean frequency of the sections [Hz]; with fewer than two marks, one over the drive's length."""
         marks = self.first if self.kind == EDGES else self.sections_s
         if len(marks) < 2:
             return 1.0 / (self.end_s - self.start_s)
@@ -87,7 +88,7 @@ class RecordedDrive:
 
     @cached_property
     def _times(self) -> np.ndarray:
-        """Ends of the intervals of a torque: its samples, and the sections between them."""
+        """Ends of a torque's intervals: its samples, and the sections between them [s]."""
         between = np.searchsorted(self.first, self.sections_s)
         gap = np.minimum(
             np.abs(self.first[np.minimum(between, len(self.first) - 1)] - self.sections_s),
@@ -97,7 +98,7 @@ class RecordedDrive:
 
     @cached_property
     def intervals(self) -> Drive:
-        """The drive as the engine takes it; imports the compiler."""
+        """The drive as the engine takes it; this imports the compiler."""
         from magpend_core.sampling import Drive
 
         if self.kind == EDGES:
@@ -106,12 +107,12 @@ class RecordedDrive:
 
     @property
     def n_intervals(self) -> int:
-        """Intervals in which it is integrated."""
+        """Number of intervals in which the drive is integrated."""
         return len(self.first if self.kind == EDGES else self._times) - 1
 
     @cached_property
     def section_ends(self) -> np.ndarray:
-        """For each section the number of the interval at whose end it lies."""
+        """For each section, the index of the interval at whose end it lies."""
         if self.kind == EDGES:
             return np.arange(self.n_periods)
         return np.asarray(np.searchsorted(self._times, self.sections_s - _COINCIDENT_S) - 1)
@@ -123,7 +124,7 @@ def read_drive(path: str | Path) -> tuple[str, str]:
     Raises
     ------
     SpecError
-        If it cannot be read, is not text or too large.
+        If it cannot be read, is not text, or is too large.
     """
     try:
         content = Path(path).read_bytes()
@@ -150,24 +151,24 @@ def load_drive(path: str | Path, *, section_hz: float | None = None) -> Recorded
 
 @lru_cache(maxsize=8)
 def parse_drive(text: str, file: str, sha256: str, section_hz: float | None = None) -> RecordedDrive:
-    """Read the text of a drive file.
+    """Parse the text of a drive file.
 
     Parameters
     ----------
     text
-        See the text of this module.
+        Text of the file; the docstring of this module describes it.
     file
-        Its name, for messages.
+        Name of the file, for messages.
     sha256
-        Its digest.
+        Digest of the file.
     section_hz
-        Sections per second, from the start on, under a torque; by default see `rising_edges`.
+        Sections per second of a torque, from its start on. By default sections lie at its `rising_edges`.
 
     Raises
     ------
     SpecError
-        With all problems: another header, fields that are no finite numbers, times that do not rise, edges
-        out of order, too few of them.
+        With all problems: a wrong header, fields that are not finite numbers, times that do not rise, edges
+        out of order, too few edges.
     """
     kind, rows = _rows(text, file)
     first, second = _columns(kind, rows, file)
@@ -189,19 +190,19 @@ def parse_drive(text: str, file: str, sha256: str, section_hz: float | None = No
 
 
 def rising_edges(time: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Instants at which a line through points rises through the middle of its levels [s].
+    """Return the times at which a sampled signal rises through the middle of its two levels [s].
 
     Parameters
     ----------
     time, level
-        The points, shape (n,); time rises.
+        Samples, shape (n,), joined by straight lines; time rises.
 
     Returns
     -------
     ndarray
-        Empty for a constant. The levels are those below and above which it is for 2 % of the time; it must
-        cross half of their distance about the middle to count, and where it wavers in between, the mean of
-        its first and its last crossing is taken.
+        Shape (n_edges,); empty for a constant signal. The levels are the 2nd and 98th percentiles over time.
+        An edge counts if it crosses the middle half of the distance between them. If the signal crosses the
+        middle several times on an edge, the mean of the first and the last crossing is returned.
     """
     even = np.interp(np.linspace(time[0], time[-1], max(20_000, 2 * len(time))), time, level)
     low, high = np.percentile(even, [2, 98])
@@ -221,7 +222,7 @@ def rising_edges(time: np.ndarray, level: np.ndarray) -> np.ndarray:
 
 
 def _rows(text: str, file: str) -> tuple[str, list[tuple[int, list[str]]]]:
-    """Kind of a table, and its rows with the numbers of their lines."""
+    """Return the kind of a table, and its rows with their line numbers."""
     lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), 1)]
     lines = [(i, line) for i, line in lines if line and not line.startswith("#")]
     header = tuple(word.strip().lstrip("\ufeff") for word in lines[0][1].split(",")) if lines else ()
@@ -235,7 +236,7 @@ def _rows(text: str, file: str) -> tuple[str, list[tuple[int, list[str]]]]:
 
 
 def _columns(kind: str, rows: list[tuple[int, list[str]]], file: str) -> tuple[np.ndarray, np.ndarray]:
-    """Both columns as numbers; the last falling edge may be left out."""
+    """Return both columns as numbers; the last falling edge may be missing."""
     first, second = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
     problems = []
     for k, (line, fields) in enumerate(rows):

@@ -1,4 +1,4 @@
-"""Specifications as files: TOML in, plain tables out."""
+"""Read TOML files and texts as plain tables, and merge tables."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pipeline.spec.problems import SpecError
 
 MOST_BYTES = 1_000_000
 MOST_ELEMENTS = 100_000
-"""Elements of an array."""
+"""Most elements of an array."""
 MOST_DEPTH = 32
 MOST_KEY = 200
-"""Characters of a key."""
+"""Most characters of a key."""
 WHOLE_NUMBERS = range(-(2**63), 2**63)
 
 
@@ -24,7 +24,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     Raises
     ------
     SpecError
-        If it cannot be read, or holds what no specification can (see `odd_data`).
+        If the file cannot be read, or holds data that no specification can have (see `odd_data`).
     """
     try:
         with open(path, "rb") as file:
@@ -35,12 +35,12 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def toml_tables(content: bytes, name: str) -> dict[str, Any]:
-    """Return the tables of a TOML text, which messages call `name`.
+    """Return the tables of a TOML text; messages call the text `name`.
 
     Raises
     ------
     SpecError
-        As for `read_toml`.
+        If the text is not TOML, or holds data that no specification can have.
     """
     try:
         if len(content) > MOST_BYTES:
@@ -60,7 +60,7 @@ def toml_tables(content: bytes, name: str) -> dict[str, Any]:
 
 
 def _unreadable(error: Exception) -> str:
-    """Say why a file is no specification."""
+    """Explain why a file is no specification."""
     if isinstance(error, OSError):
         return f"cannot be read ({error.strerror or error})."
     if isinstance(error, UnicodeDecodeError):
@@ -76,9 +76,9 @@ def _unreadable(error: Exception) -> str:
 
 
 def odd_data(data: Any) -> list[str]:
-    """Say what no specification can hold: data too deep, whole numbers beyond 64 bits, endless keys.
+    """Return problems of data that no specification can have: too deep, too long, or too large numbers.
 
-    Everything behind this may walk the data by recursion, turn whole numbers into floats and repeat keys.
+    Later code may then recurse into the data, convert whole numbers to floats and repeat keys in messages.
     """
     todo: list[tuple[str, Any, int]] = [("", data, 0)]
     while todo:

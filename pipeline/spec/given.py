@@ -1,4 +1,4 @@
-"""Models and specifications as they are given in Python: names, paths, TOML text, tables."""
+"""Accept models and specifications as users give them in Python: names, paths, TOML text, tables."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from pipeline.spec.toml import toml_key, toml_value
 
 
 def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -> Model:
-    """Return a model, wherever it is written down; warn of what nothing in its text uses.
+    """Return a model by its name, path, text or table; warn of unused parts of its text.
 
     Parameters
     ----------
     reference
-        Name of a model that ships; path of a model's file or of a specification; either of them as TOML text;
-        a table with the keys of ``[model]``. A model is returned as it is.
+        Name of a model that ships; path of a model's file or of a specification; TOML text of either; or a
+        table with the keys of ``[model]``. A `Model` is returned unchanged.
 
     Raises
     ------
     ModelError, SpecError
-        If there is none, with the nearest names; if it is wrong, with all its problems.
+        If there is no such model (the message lists the nearest names), or if it is wrong (the message lists
+        all problems).
     """
     model = _found(reference)
     if model is not reference:
@@ -38,7 +39,7 @@ def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -
 
 
 def _found(reference: str | Path | Mapping[str, Any] | Model) -> Model:
-    """Return the model without a remark."""
+    """Return the model without warnings."""
     if isinstance(reference, str) and not reference.lstrip().startswith("{") and is_toml_text(reference):
         return _model_in(toml_tables(reference.encode(), "the text"), Path())
     if isinstance(reference, Path) or (isinstance(reference, str) and is_model_file(reference)):
@@ -49,24 +50,24 @@ def _found(reference: str | Path | Mapping[str, Any] | Model) -> Model:
 
 
 def _model_in(tables: Mapping[str, Any], folder: Path) -> Model:
-    """Return the model of a specification, or that whose table stands alone."""
+    """Return the model of a specification's tables, or of a model's own table."""
     if "equations" in tables:
         return find_model({"name": "model", **tables}, folder)
     return find_model(tables["model"], folder) if "model" in tables else named_model()
 
 
 def is_toml_text(given: Any) -> bool:
-    """Whether something is TOML text, and neither a path nor a name."""
+    """Return whether a value is TOML text, and not a path or a name."""
     return isinstance(given, str) and ("\n" in given or "=" in given)
 
 
 def toml_of(table: Mapping[str, Any]) -> str:
-    """Return a table as TOML text, a line for each key."""
+    """Return a table as TOML text, one line per key."""
     return "".join(f"{toml_key(key)} = {toml_value(value)}\n" for key, value in _plain(table).items())
 
 
 def _plain(given: Any) -> Any:
-    """Return tables and lists of plain numbers and words: numpy's numbers and arrays as Python's."""
+    """Convert numpy numbers and arrays in tables and lists to Python's."""
     if isinstance(given, Mapping):
         return {str(key): _plain(value) for key, value in given.items()}
     if isinstance(given, list | tuple):

@@ -1,4 +1,4 @@
-"""Which Runge-Kutta method a run can take."""
+"""Check which Runge-Kutta methods a run can use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipeline.spec.tables import Integration
 def method_problems(
     integration: Integration | None, products: Mapping[str, Options], is_recorded: bool
 ) -> list[str]:
-    """Problems with `integration.method`: what looks into a step knows the method of order 5 alone."""
+    """Return problems with `integration.method`: only the method of order 5 can interpolate in a step."""
     if integration is None or integration.method == "dopri5":
         return []
     inside = [f"products.{n} looks" for n, o in products.items() if CELL_PRODUCTS[n].integrate(o)]

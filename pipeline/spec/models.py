@@ -1,7 +1,7 @@
-"""The model of a specification: one that ships, a text, a file of one, or a Python object.
+"""Find the model of a specification: one that ships, a text, a file, or a Python object.
 
-What a run keeps is never a file or an object's place alone: the text stands in ``run.json``, and of a Python
-object a description. Reading what a run keeps reads no other file and imports nothing.
+A run never keeps only the path of a file or of an object. It keeps a model's text in ``run.json``, and a
+description of a Python object. Reading a run's model reads no other file and imports nothing.
 """
 
 from __future__ import annotations
@@ -24,26 +24,27 @@ A_MODEL = (
     "names it, with kind, parameters and initial_conditions. magpend model show FILE.toml looks at it."
 )
 KEPT = None
-"""In the place of a folder: nothing is read or imported, as the data are what a run keeps."""
+"""Value of `folder` for data that a run keeps: no file is read, nothing is imported."""
 
 
 def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model") -> Model:
-    """Return the model that a person or a run names.
+    """Return the model that a specification or a run names.
 
     Parameters
     ----------
     reference
-        A name; a table, the model as text; a file of one, ``FILE.toml``; or ``package.module:NAME``, a Python
-        object, which is imported: its module's code is executed.
+        A name; a table (the model as text); a model's file, ``FILE.toml``; or a Python object,
+        ``package.module:NAME``, which is imported: its module's code is executed.
     folder
-        From where files count, and where modules are found besides; `KEPT` for neither.
+        Folder that paths of files are relative to, and in which modules are also found; `KEPT` to read and
+        import nothing.
     at
         Key path, for the messages.
 
     Raises
     ------
     SpecError
-        With all problems at once, each with its place.
+        If there is a problem; the message lists all problems with their key paths.
     """
     try:
         if isinstance(reference, Mapping | Model):
@@ -64,7 +65,7 @@ def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model
 
 
 def _placed(problem: str, at: str, reference: Any) -> str:
-    """A problem with its key path; those of a text have it already."""
+    """Prefix a problem with its key path unless it has one."""
     if not isinstance(reference, Mapping) or KEY in reference:
         return f"{at}: {problem}"
     head = "model."
@@ -74,7 +75,7 @@ def _placed(problem: str, at: str, reference: Any) -> str:
 def add_model(
     reference: Any, folder: str | Path | None, problems: list[str], at: str = "model"
 ) -> Model | None:
-    """Return the model as `find_model` does; None after adding what is wrong."""
+    """Return the model as `find_model` does; on a problem, add it to `problems` and return None."""
     try:
         return find_model(reference, folder, at)
     except SpecError as error:
@@ -85,14 +86,14 @@ def add_model(
 def stand_in(reference: Any, folder: str | Path | None, *, forced: bool) -> Model | None:
     """Return a model with the states and parameters of a text whose equations are wrong.
 
-    So that what is said of states and parameters elsewhere is checked, too; None if these are wrong as well.
+    With it the other tables are checked, too. None if the states or parameters are also wrong.
 
     Parameters
     ----------
     reference, folder
-        As for `find_model`, which has refused them.
+        Arguments that `find_model` has refused.
     forced
-        Whether it is to have a drive.
+        Whether the model should have a drive.
     """
     if is_model_file(reference) and folder is not None:
         try:
@@ -117,19 +118,19 @@ def stand_in(reference: Any, folder: str | Path | None, *, forced: bool) -> Mode
 
 
 def is_model_file(reference: Any) -> bool:
-    """Whether a model is named by its file."""
+    """Return whether a reference is the path of a model's file."""
     return isinstance(reference, str) and reference.endswith(SUFFIX)
 
 
 def read_model_file(path: str | Path) -> dict[str, Any]:
-    """Return the table of a model's file: its keys stand at the top, or below ``[model]``.
+    """Return the table of a model's file; its keys stand at the top, or below ``[model]``.
 
-    Without ``name`` a model has that of the file.
+    Without the key ``name`` the model is named after the file.
 
     Raises
     ------
     SpecError
-        If it cannot be read or is not TOML.
+        If the file cannot be read or is not TOML.
     """
     tables = read_toml(path)
     inner = tables.get("model")
@@ -154,15 +155,15 @@ def _of_file(name: str, folder: str | Path | None, at: str) -> Model:
 
 
 def kept_reference(model: Model) -> str | dict[str, Any]:
-    """Return what is kept of a model, as tables take it: its name, or its text."""
+    """Return the part of a model that a run keeps, as tables take it: its name or its text."""
     reference = model.reference
     return reference if isinstance(reference, str) else dict(reference)
 
 
 def with_model_table(data: Mapping[str, Any], folder: str | Path) -> Mapping[str, Any]:
-    """Put the table of a model's file in the place of its name, so that keys of it can be replaced.
+    """Replace the path of a model's file by its table, so that single keys can be replaced.
 
-    A file that cannot be read stays a name; who reads the specification says why.
+    The path of a file that cannot be read stays; the parser of the specification reports the problem.
     """
     if not is_model_file(data.get("model")):
         return data
@@ -173,9 +174,10 @@ def with_model_table(data: Mapping[str, Any], folder: str | Path) -> Mapping[str
 
 
 def model_toml(reference: str | Mapping[str, Any]) -> str:
-    """Return what names a model in a TOML file: a line, or for a text its tables, which go last.
+    """Return a model's reference as TOML: one line for a name, tables for a text.
 
-    Of a Python object it is its place, which is imported when the file is read.
+    For a Python object this is its import path, which is imported when the file is read. Tables must come
+    last in a file.
     """
     if isinstance(reference, str):
         return f"model = {toml_value(reference)}\n"

@@ -1,8 +1,8 @@
-"""The specification of a run: what a person writes in TOML, validated as a whole.
+"""Parse and validate the specification of a run as a whole.
 
-Two kinds: a *sweep*, in which every cell is independent, and a *continuation*, in which branches
-walk a parameter path, each step starting where the last one ended. Units stand in the keys;
-angles in degrees are converted once, in `pipeline.layout.cells`.
+There are two kinds: a *sweep*, in which every cell is independent, and a *continuation*, in which branches
+follow a parameter path and each point starts where the previous one ended. Keys carry units. Angles in
+degrees are converted once, in `pipeline.layout.cells`.
 """
 
 from __future__ import annotations
@@ -66,14 +66,14 @@ class Spec:
 
     @cached_property
     def recorded(self) -> RecordedDrive | None:
-        """The recording that is the drive; None for the model's own at a frequency."""
+        """The recording that drives the model; None for the model's own drive."""
         return recorded(self.drive, [])
 
     @property
     def frequency_hz(self) -> float | None:
-        """Drive frequency [Hz], the mean one of a recording; None if it is an axis.
+        """Drive frequency [Hz], for a recording its mean frequency; None if it is swept.
 
-        With a section by crossing, one over the longest wait for a return: what the engine takes for it.
+        With a section by crossing it is one over the longest time between crossings, as in the engine.
         """
         if self.section is not None:
             return self.section.crossing.frequency_hz
@@ -81,18 +81,18 @@ class Spec:
 
     @property
     def refine(self) -> int | None:
-        """Stride of a refined grid; None for a full one and for other starts."""
+        """Stride of a refined grid; None for a full grid and for other starts."""
         starts = self.initial_conditions
         return starts.refine if isinstance(starts, GridStarts) else None
 
     @cached_property
     def model(self) -> Model:
-        """What is integrated, through its section if it has one; `reference` is its `Model.reference`."""
+        """Model that is integrated, with its section by crossing if there is one."""
         return seen_through(load_model(self.reference), self.section)
 
     @cached_property
     def values(self) -> Parameters:
-        """Values of the parameters off the axes."""
+        """Values of the parameters that are not swept."""
         return self.model.load(self.parameters.chosen, **self.parameters.overrides)
 
     def as_dict(self) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
     path
         A TOML file.
     smoke
-        Apply the file's ``[smoke]`` table, which makes the run one of seconds.
+        Whether to apply the file's ``[smoke]`` table, with which the run takes seconds.
 
     Raises
     ------
@@ -144,12 +144,12 @@ def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
 
 
 def spec_of_tables(data: dict[str, Any], folder: Path, *, smoke: bool = False) -> Spec:
-    """Validate what a file or a text holds, its ``[smoke]`` table included; see `load_spec`."""
+    """Validate the tables of a file or a text, ``[smoke]`` included; see `load_spec`."""
     return parse_spec(_with_smoke(data, smoke, folder), folder)
 
 
 def kept_spec(data: Mapping[str, Any]) -> Spec:
-    """Read what a run keeps, which `Spec.as_dict` gave: no other file is read, and nothing is imported.
+    """Parse the specification that a run keeps; no other file is read, nothing is imported.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def kept_spec(data: Mapping[str, Any]) -> Spec:
 
 
 def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, Any]:
-    """Split off ``[smoke]``, check it in either case, and merge it if asked."""
+    """Remove ``[smoke]``, check it in any case, and merge it into the tables if asked."""
     plain = {key: value for key, value in data.items() if key != "smoke"}
     if "smoke" not in data:
         if smoke:
@@ -180,7 +180,7 @@ def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, An
 
 
 def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> None:
-    """Raise the plain problems together with those that the smoke table brings."""
+    """Raise the problems of the specification together with those that only ``[smoke]`` causes."""
     try:
         parse_spec(plain, folder)
         own: list[str] = []
@@ -190,19 +190,19 @@ def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> N
 
 
 def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec:
-    """Validate plain data.
+    """Validate the tables of a specification.
 
-    Every table is validated by itself, so that one with errors does not hide those of the others;
-    then whatever can be checked between the valid ones is. The file of a preset is read here, and its
-    content takes the place of its name, and so are those of a drive and of a model: what a run keeps needs
-    the files no more. A model that is a Python object is imported, unless `folder` is None.
+    Every table is validated on its own, so that errors in one do not hide errors in others. Then the valid
+    tables are checked against each other. Files of presets, drives and models are read here, and their
+    content replaces their names: a run does not need the files any more. A model that is a Python object is
+    imported, unless `folder` is None.
 
     Parameters
     ----------
     data
-        Tables as TOML or `Spec.as_dict` has them.
+        Tables from TOML or from `Spec.as_dict`.
     folder
-        From where paths of files count; None for what a run keeps, see `kept_spec`.
+        Folder that paths of files are relative to; None for data that a run keeps, see `kept_spec`.
 
     Raises
     ------
@@ -223,7 +223,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     tables = {name: _table(data, name, table, problems) for name, table in _TABLES.items()}
     axes = _axes(data, problems)
     walk = _walk(kind, data, tables["continuation"], axes, problems)
-    if model is None:  # what is left is said in the model's own words
+    if model is None:  # the remaining checks need the model's states and parameters
         model = stand_in(data.get("model"), folder, forced="section" not in data)
     if model is None:
         raise SpecError(problems)
@@ -251,7 +251,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
 def _with_preset(
     data: Mapping[str, Any], folder: str | Path | None, problems: list[str]
 ) -> Mapping[str, Any]:
-    """Put the content of a preset's file in the place of its name; without it, if it cannot be read."""
+    """Replace the name of a preset's file by its content; drop the name if the file cannot be read."""
     table = data.get("parameters")
     name = table.get("preset") if isinstance(table, dict) else None
     if table is None or not isinstance(name, str) or not is_file(name):
@@ -269,7 +269,7 @@ def _with_preset(
 
 
 def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dict[str, Options]:
-    """Return the valid products that are asked for, with what follows from the model filled in."""
+    """Return the valid products of the specification, with options that follow from the model filled in."""
     if not _is_table(data, "products", problems):
         return {}
     found: dict[str, Options] = {}
@@ -286,18 +286,18 @@ def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dic
             found[name] = product.settle(options, model)
         except ValueError as error:
             problems.append(f"{path}.{error}")
-    # one order, whatever that of the file: the cube's layout follows from it
+    # a fixed order, independent of the file's: the cube's layout follows from it
     return {name: found[name] for name in CELL_PRODUCTS if name in found}
 
 
 def _declared(data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Names of all axes, valid or not."""
+    """Return the names of all axes, valid or not."""
     axes = data.get("axes", {})
     return tuple(axes) if isinstance(axes, dict) else ()
 
 
 def _valid_keys(model: type[ParametersTable], table: Any) -> ParametersTable:
-    """Return what is valid of a table, so that its errors do not hide others."""
+    """Return the valid keys of a table, so that its errors do not hide others."""
     valid: dict[str, Any] = {}
     for key, value in table.items() if isinstance(table, dict) else ():
         if _validate(model, {key: value}, "", []) is not None:
@@ -346,7 +346,7 @@ def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: lis
 
 
 def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
-    """Return the valid axes in the order of the file; what is not valid leaves problems."""
+    """Return the valid axes in the order of the file; add the problems of others."""
     if not _is_table(data, "axes", problems):
         return {}
     axes = {n: _validate(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
@@ -400,7 +400,7 @@ def _walk(
 def _parameter_problems(
     table: ParametersTable, model: Model, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
 ) -> list[str]:
-    """Problems with names and values of parameters, on axes and off."""
+    """Return the problems with names and values of parameters, swept or not."""
     problems = _frequency_problems(table, declared, axes, complete)
     swept = {name: axis.array() for name, axis in axes.items() if name != FREQUENCY}
     try:

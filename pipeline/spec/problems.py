@@ -1,4 +1,4 @@
-"""Turn what is wrong with a specification into sentences: key path, value, bound, remedy."""
+"""Turn problems of a specification into sentences: key path, value, bound, remedy."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pydantic import BaseModel, ValidationError
 M = TypeVar("M", bound=BaseModel)
 
 _TAG = "("
-"""First character of the union tags in pydantic's locations, which are no part of the key path."""
+"""First character of the union tags in pydantic's locations, which do not belong to the key path."""
 
 
 class SpecError(ValueError):
-    """A specification cannot be run.
+    """An error for a specification that cannot be run.
 
     Attributes
     ----------
@@ -29,11 +29,11 @@ class SpecError(ValueError):
 
 
 SHOWN = 120
-"""Characters of a value that a sentence repeats."""
+"""Most characters of a value that a message repeats."""
 
 
 def shown(value: Any) -> str:
-    """Spell a value for a sentence: its begin and its end, if it is long."""
+    """Format a value for a message; a long one is cut in the middle."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # a whole number of thousands of digits; a list in itself
@@ -42,7 +42,7 @@ def shown(value: Any) -> str:
 
 
 def unknown_key(path: str, key: str, known: Iterable[str]) -> str:
-    """Sentence for a key that does not exist, with the nearest known ones."""
+    """Return the message for an unknown key, with the nearest known keys."""
     names = list(known)
     near = difflib.get_close_matches(key, names, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known keys: {', '.join(names)}."
@@ -50,14 +50,14 @@ def unknown_key(path: str, key: str, known: Iterable[str]) -> str:
 
 
 def unknown_choice(path: str, value: Any, choices: Sequence[str]) -> str:
-    """Sentence for a value that is none of the choices, with the nearest one."""
+    """Return the message for a value that is none of the choices, with the nearest one."""
     near = difflib.get_close_matches(value, choices, n=1, cutoff=0.5) if isinstance(value, str) else []
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return f"{path} = {shown(value)}: must be {' or '.join(repr(c) for c in choices)}.{hint}"
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> str:
-    """Sentence for a name that nothing has, with the nearest known ones."""
+    """Return the message for an unknown name, with the nearest known names."""
     names = list(known)
     near = difflib.get_close_matches(name, names, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(names)}."
@@ -65,21 +65,21 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> str:
 
 
 def validated(model: type[M], values: Mapping[str, Any], prefix: str = "") -> M:
-    """Return a table of options, checked.
+    """Validate a table of options and return it.
 
     Parameters
     ----------
     model
-        What is to be validated.
+        Class of the table.
     values
-        By name, as people or programs give them: a whole number may stand as ``64.0``, a list for a tuple.
+        Values by name. A whole number may be given as ``64.0``, and a tuple as a list.
     prefix
         Dotted path of the table, for the messages.
 
     Raises
     ------
     SpecError
-        Naming all that is wrong.
+        If values are not valid; the message lists all problems.
     """
     try:
         return model.model_validate({name: _exact(model, name, value) for name, value in values.items()})
@@ -88,7 +88,7 @@ def validated(model: type[M], values: Mapping[str, Any], prefix: str = "") -> M:
 
 
 def _exact(model: type[BaseModel], name: str, value: Any) -> Any:
-    """Spell a value as strict validation takes it."""
+    """Convert a value to the type that strict validation takes."""
     kind = model.model_fields[name].annotation if name in model.model_fields else None
     if kind is int and isinstance(value, float) and value.is_integer():
         return int(value)
@@ -98,14 +98,14 @@ def _exact(model: type[BaseModel], name: str, value: Any) -> Any:
 
 
 def problems_of(error: ValidationError, model: type[BaseModel], prefix: str) -> list[str]:
-    """Sentences for all that pydantic found wrong.
+    """Return a sentence for each problem that pydantic found.
 
     Parameters
     ----------
     error
-        What pydantic raised.
+        Error from pydantic.
     model
-        The model it was validating; names the known keys.
+        Model that was validated; it gives the known keys.
     prefix
         Dotted path of the validated table.
     """
@@ -162,7 +162,7 @@ def _sentence(item: dict[str, Any], model: type[BaseModel], prefix: str) -> str:
 
 
 def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
-    """Keys of the table in which an unknown key lies: the model's own, or those of a nested model."""
+    """Return the keys of the table in which an unknown key lies, nested or not."""
     if len([part for part in location if not str(part).startswith(_TAG)]) == 1:
         return list(model.model_fields)
     nested = getattr(model, "nested_model", None)

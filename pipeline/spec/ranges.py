@@ -1,4 +1,4 @@
-"""What is wrong with ranges of parameters and starts together: too many cells, values that exclude others."""
+"""Check ranges of parameters and starts together: the number of cells, and bounds between parameters."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from pipeline.spec.tables import Range
 
 MAX_CELLS = 10**15
 MOST_RELATED = 12
-"""Axes of parameters that a model relates to each other: all corners of their box are looked at."""
+"""Most swept parameters that a model may relate to each other: all corners of their box are checked."""
 
 
 def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
-    """Say that nobody could count the cells, so that nothing behind this overflows."""
+    """Return a problem if there are too many cells to count, so that later code does not overflow."""
     sizes = {f"axes.{name}": axis.n for name, axis in axes.items()}
     if isinstance(starts, GridStarts):
         sizes |= {f"initial_conditions.{name}": axis.n for name, axis in starts.ranges.items()}
@@ -31,10 +31,10 @@ def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
 
 
 def corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]:
-    """Problems between parameters: bounds are intervals, so the corners of the box decide.
+    """Return problems between parameters at the corners of the box of swept values.
 
-    Only along the axes that the model looks at when it relates parameters: it is asked once, and again where
-    an answer made it look at others.
+    Bounds are intervals, so the corners decide. Only the axes of parameters that the model's relations read
+    are varied. They are found by asking the model, again whenever its answer has read further parameters.
     """
     ends = {name: (float(v.min()), float(v.max())) for name, v in swept.items()}
     asked = _Asked(base)
@@ -52,7 +52,7 @@ def corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]
 
 
 class _Asked(Mapping[str, float]):
-    """Values that note which of them are asked for."""
+    """Parameter values that note which of them were read."""
 
     def __init__(self, values: Mapping[str, float]) -> None:
         self.values_now, self.names = dict(values), set[str]()

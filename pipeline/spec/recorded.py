@@ -1,4 +1,4 @@
-"""``[drive]`` of a specification: the table, and what makes no sense beside it."""
+"""Define the table ``[drive]`` of a specification, and check it against the other tables."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 
 
 class DriveTable(Table):
-    """``[drive]``: the drive is a recording, instead of the model's own at a frequency."""
+    """The table ``[drive]``: a recording in place of the model's own drive."""
 
-    file: str = Field(min_length=1, description="Drive file (CSV), seen from the specification.")
+    file: str = Field(min_length=1, description="Drive file (CSV), relative to the specification.")
     section_hz: Annotated[float, Field(gt=0)] | None = Field(
         None,
-        description="Sections per second under a torque; by default they lie at its rising edges.",
+        description="Sections per second of a torque; by default sections lie at its rising edges.",
     )
     sha256: str | None = Field(None, description="Digest of the file; filled in when the file is read.")
     text: str | None = Field(None, description="The file's text; filled in when the file is read.")
 
 
 def with_drive(data: Mapping[str, Any], folder: str | Path, problems: list[str]) -> Mapping[str, Any]:
-    """Put the content of a drive's file beside its name, if it is not there yet."""
+    """Add the content of a drive's file beside its name, unless it is there already."""
     table = data.get("drive")
     if not isinstance(table, dict) or not isinstance(table.get("file"), str) or "text" in table:
         return data
@@ -43,15 +43,15 @@ def with_drive(data: Mapping[str, Any], folder: str | Path, problems: list[str])
 
 
 def is_whole(table: Any) -> bool:
-    """Whether the text of a ``[drive]`` as plain data, if there is one, has the digest beside it."""
+    """Return whether the text of a ``[drive]`` table has the digest beside it; True without a table."""
     if not isinstance(table, Mapping):
         return True
     return hashlib.sha256(str(table.get("text", "")).encode()).hexdigest() == table.get("sha256")
 
 
 def recorded(table: DriveTable | None, problems: list[str]) -> RecordedDrive | None:
-    """Return the recorded drive of a table; None if there is none, or one with problems."""
-    if table is None or table.text is None:  # a file that cannot be read has said so
+    """Return the recorded drive of a table; None if there is none or if it has problems."""
+    if table is None or table.text is None:  # an unreadable file is reported already
         return None
     if hashlib.sha256(table.text.encode()).hexdigest() != table.sha256:
         problems.append(
@@ -67,7 +67,7 @@ def recorded(table: DriveTable | None, problems: list[str]) -> RecordedDrive | N
 
 
 def model_problems(drive: RecordedDrive, model: Model) -> list[str]:
-    """Say why a model cannot follow a recorded drive."""
+    """Explain why a model cannot follow a recorded drive."""
     from magpend_core.engine.absent import no_forcing
 
     if model.system.forcing is no_forcing:
@@ -83,18 +83,18 @@ def model_problems(drive: RecordedDrive, model: Model) -> list[str]:
 def run_problems(
     drive: RecordedDrive | None, model: Model, data: Mapping[str, Any], integration: Any, starts: Any
 ) -> list[str]:
-    """Say what of a specification makes no sense under a recorded drive.
+    """Return the problems of a specification with a recorded drive.
 
     Parameters
     ----------
     drive
-        The recording; None for none, and no problems.
+        The recording; None if there is none, and then no problems.
     model
-        What is integrated.
+        Model that is integrated.
     data
-        Tables of the specification, of which kind, axes, parameters and products are looked at.
+        Tables of the specification; kind, axes, parameters and products are checked.
     integration, starts
-        Its valid tables, or None.
+        Valid tables of the specification, or None.
     """
     if drive is None:
         return []
@@ -131,7 +131,7 @@ def run_problems(
 
 
 def _idle_problems(drive: RecordedDrive, model: Model, axes: Any) -> list[str]:
-    """Axes along which nothing changes: parameters of the drive whose place a torque takes."""
+    """Return problems with axes that have no effect: drive parameters that a torque replaces."""
     if drive.kind != TORQUE or not isinstance(axes, Mapping) or not set(axes) - {FREQUENCY, DUTY}:
         return []
     from magpend_core.engine.driven import drive_parameters
@@ -146,7 +146,7 @@ def _idle_problems(drive: RecordedDrive, model: Model, axes: Any) -> list[str]:
 
 
 def _replaced_problems(drive: RecordedDrive, table: str, data: Mapping[str, Any]) -> list[str]:
-    """Values of what the recording says itself."""
+    """Return problems with values that the recording itself determines."""
     found: Any = data
     for key in table.split("."):
         found = found.get(key, {}) if isinstance(found, Mapping) else {}

@@ -1,4 +1,4 @@
-"""``[section]`` of a specification: sections by crossing, for models without a drive."""
+"""Define the table ``[section]`` of a specification: sections by crossing, for models without a drive."""
 
 from __future__ import annotations
 
@@ -17,12 +17,16 @@ if TYPE_CHECKING:
 
 
 class SectionTable(Table):
-    """``[section]``: where a flow without a drive is looked at, instead of once per period of a drive."""
+    """The table ``[section]``: the crossing at which a flow without a drive has its sections."""
 
-    of: str = Field(min_length=1, description="State that passes the level.")
-    value: float = Field(0.0, description="The level, in the state's unit; of an angle modulo 2 pi.")
+    of: str = Field(min_length=1, description="State that crosses the level.")
+    value: float = Field(0.0, description="Level in the state's unit; for an angle, modulo 2 pi.")
     direction: Literal["up", "down"] = Field("up", description="Whether the state rises or falls there.")
-    longest: float = Field(100.0, gt=0, description="Longest time that is waited for the next crossing [s].")
+    longest: float = Field(
+        100.0,
+        gt=0,
+        description="Longest time between crossings [s]; a cell that takes longer does not return.",
+    )
 
     @property
     def crossing(self) -> Crossing:
@@ -31,25 +35,25 @@ class SectionTable(Table):
 
 
 def seen_through(model: Model, section: SectionTable | None) -> Model:
-    """Return the model through its section, if there is one."""
+    """Return the model with its section by crossing, if there is one."""
     return model if section is None else sectioned(model, section.crossing)
 
 
 def section_of(
     table: SectionTable | None, model: Model, data: Mapping[str, Any], problems: list[str]
 ) -> SectionTable | None:
-    """Return the section of a specification, or None; adds what is wrong between it and the rest.
+    """Return the section of a specification, or None; add problems between it and other tables.
 
     Parameters
     ----------
     table
-        ``[section]``; None if there is none, or one with problems.
+        Valid table ``[section]``, or None.
     model
-        Of the specification.
+        Model of the specification.
     data
-        Its tables, of which axes, parameters and drive are looked at.
+        Tables of the specification; axes, parameters and drive are checked.
     problems
-        Sentences are added.
+        List to which problems are added.
     """
     if "section" not in data:
         if model.autonomous:
@@ -90,7 +94,7 @@ def _found(table: SectionTable, model: Model, problems: list[str]) -> SectionTab
 
 
 def _missing(model: Model, data: Mapping[str, Any]) -> list[str]:
-    """Say what an autonomous model needs, if it is not there."""
+    """Return a problem if an autonomous model has neither a section nor a frequency."""
     if FREQUENCY in _keys(data, "parameters") or FREQUENCY in _keys(data, "axes") or "drive" in data:
         return []
     return [

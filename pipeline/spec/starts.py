@@ -1,7 +1,7 @@
-"""Initial conditions: grids, lists and random samples of a model's own states.
+"""Define initial conditions: grids, lists and random samples of a model's own states.
 
-Keys are the names of the states; angles and their rates can be given in degrees, with ``_deg`` behind the
-name. The models of the tables are made for each model of a system, and checked by pydantic.
+Keys are the names of the states. Angles and their rates can be given in degrees, with ``_deg`` after the
+name. The pydantic model of each table is created for each `Model`.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from pipeline.spec.tables import MAX_POINTS, Integration, Range, Table
 
 STRIDES = (2, 4, 8, 16, 32, 64)
 IN_DEGREES = ("rad", "rad/s")
-"""Units that degrees stand for."""
+"""Units of states that can also be given in degrees."""
 MAX_TILE_BYTES = 256_000_000
-"""Largest sections of the smallest tile that a refined grid can be cut into [bytes]."""
+"""Most bytes of sections in the smallest tile of a refined grid."""
 
 
 def _number_or_range(value: Any) -> str:
@@ -57,12 +57,12 @@ Rows = Annotated[
 
 
 def degrees_key(state: str) -> str:
-    """Key of a state's value in degrees."""
+    """Return the key of a state's value in degrees."""
     return f"{state}_deg"
 
 
 def state_keys(model: Model) -> tuple[str, ...]:
-    """All keys that set a state: its name, and that in degrees where it is an angle or an angle's rate."""
+    """Return all keys that set a state: names, and names in degrees for angles and their rates."""
     return tuple(
         key
         for s in model.states
@@ -71,14 +71,14 @@ def state_keys(model: Model) -> tuple[str, ...]:
 
 
 def state_of_key(key: str, model: Model) -> str | None:
-    """Name of the state that a key sets, None if it sets none."""
+    """Return the name of the state that a key sets; None if it sets none."""
     if key not in state_keys(model):
         return None
     return key if key in model.state_names else key.removesuffix(degrees_key(""))
 
 
 class _PerState(Table):
-    """Values by state; the fields are added by `starts_model`."""
+    """A table of values by state; `starts_model` adds the fields."""
 
     system: ClassVar[Model]
 
@@ -90,7 +90,7 @@ class _PerState(Table):
         return self
 
     def of(self, key: str) -> Any:
-        """What is given for a key; None if it is not there."""
+        """Return the value of a key; None if it is not given."""
         return getattr(self, key, None)
 
 
@@ -101,7 +101,7 @@ def _power_of_two(stride: int) -> int:
 
 
 class GridStarts(_PerState):
-    """``[initial_conditions] kind = "grid"``: ranges span the grid, numbers are fixed, the rest is 0.
+    """The table ``[initial_conditions]`` of a grid: ranges span it, numbers are fixed, the rest is 0.
 
     With `refine` a sweep computes every `refine`-th cell first; see `pipeline.compute.refinement`.
     """
@@ -110,19 +110,19 @@ class GridStarts(_PerState):
 
     kind: Literal["grid"]
     refine: Annotated[int, AfterValidator(_power_of_two)] | None = Field(
-        None, description=f"Compute every so many-th cell first: one of {', '.join(map(str, STRIDES))}."
+        None, description=f"Stride of the cells that are computed first: {', '.join(map(str, STRIDES))}."
     )
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """What spans the grid, by key."""
+        """Ranges that span the grid, by key."""
         return {key: value for key, value in self if isinstance(value, Range)}
 
 
 class ListStarts(Table):
-    """``[initial_conditions] kind = "list"``: rows of states in the model's order.
+    """The table ``[initial_conditions]`` of a list: rows of states in the model's order.
 
-    Rows may end before the rates of states, which are 0 then.
+    Rows may leave out the rates at the end of the state; the rates are then 0.
     """
 
     system: ClassVar[Model]
@@ -151,7 +151,7 @@ class ListStarts(Table):
 
 
 def positions(model: Model) -> tuple[str, ...]:
-    """Return the leading states up to the first that is a rate; a list's rows may end there."""
+    """Return the states before the first rate. Rows of a list may end there."""
     rates = {s.rate for s in model.states if s.rate}
     names = model.state_names
     first = next((i for i, name in enumerate(names) if name in rates), len(names))
@@ -159,7 +159,7 @@ def positions(model: Model) -> tuple[str, ...]:
 
 
 class RandomStarts(_PerState):
-    """``[initial_conditions] kind = "random"``: seeded uniform samples of a box ``[low, high]`` per state."""
+    """The table ``[initial_conditions]`` of uniform samples from a box ``[low, high]`` per state."""
 
     kind: Literal["random"]
     n: int = Field(ge=1, le=MAX_POINTS, description="Number of samples.")
@@ -182,14 +182,14 @@ STARTS: dict[str, type[Starts]] = {"grid": GridStarts, "list": ListStarts, "rand
 
 @lru_cache(maxsize=64)
 def starts_model(kind: str, model: Model) -> type[Starts]:
-    """Return the table of initial conditions for a model's states.
+    """Return the table class of initial conditions for a model's states.
 
     Parameters
     ----------
     kind
         ``"grid"``, ``"list"`` or ``"random"``.
     model
-        Whose states they are.
+        Model that has the states.
     """
     base = STARTS[kind]
     annotation: Any = {"grid": Extent | None, "random": Interval | None}.get(kind)
@@ -202,7 +202,7 @@ def starts_model(kind: str, model: Model) -> type[Starts]:
 def refine_problems(
     kind: str, starts: Starts | None, integration: Integration | None, model: Model
 ) -> list[str]:
-    """Sentences on a grid's `refine` that does not fit its ranges, the kind or what is kept."""
+    """Return problems with a grid's `refine`: with its ranges, the kind of run, or the kept sections."""
     if not isinstance(starts, GridStarts) or starts.refine is None:
         return []
     stride, key = starts.refine, f"initial_conditions.refine = {starts.refine}"

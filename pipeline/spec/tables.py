@@ -1,4 +1,4 @@
-"""Tables of a specification that are the same for every model."""
+"""Define the tables of a specification that are the same for every model."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_val
 from magpend_core.models.presets import Preset
 
 FREQUENCY = "frequency_hz"
-"""The drive's frequency among the parameters."""
+"""Name of the drive frequency among the parameters."""
 
 MAX_POINTS = 10_000_000
 EXACT = 2**53
-"""Whole numbers up to here are float64 themselves."""
+"""Largest bound up to which all whole numbers are exact in float64."""
 
 
 class Table(BaseModel):
@@ -28,16 +28,16 @@ class Table(BaseModel):
 
 
 class Range(Table):
-    """Values in rising order: ``start, stop, num``, or ``start, stop, step``, or ``values``."""
+    """Rising values: ``start, stop, num``, or ``start, stop, step``, or ``values``."""
 
     start: float | None = Field(None, description="First value.")
-    stop: float | None = Field(None, description="Last value; with step, not passed.")
+    stop: float | None = Field(None, description="Last value; with step, an upper bound.")
     num: Annotated[int, Field(ge=2, le=MAX_POINTS)] | None = Field(
         None, description="Number of evenly spaced values, both ends included."
     )
     step: Annotated[float, Field(gt=0)] | None = Field(None, description="Spacing, instead of num.")
     values: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] | None = Field(
-        None, description="All values, instead of the others."
+        None, description="All values, instead of the other keys."
     )
 
     @model_validator(mode="after")
@@ -64,14 +64,14 @@ class Range(Table):
 
     @property
     def n(self) -> int:
-        """Number of values, without making them."""
+        """Number of values, computed without making them."""
         if self.values is not None or self.num is not None:
             return self.num or len(self.values or ())
         start, stop, step = (Fraction(repr(x)) for x in (self.start, self.stop, self.step))
         return (stop - start) // step + 1
 
     def array(self) -> np.ndarray:
-        """Return the values: the float64 nearest to each decimal number, as one would write it by hand."""
+        """Return the values: the float64 nearest to each exact decimal number."""
         if self.values is not None:
             return np.array(self.values, dtype=np.float64)
         start, stop = Fraction(repr(self.start)), Fraction(repr(self.stop))
@@ -80,7 +80,7 @@ class Range(Table):
         else:
             step = Fraction(repr(self.step))
             num = (stop - start) // step + 1
-        # quotients of whole numbers are rounded once, by Python and, where these are exact, by numpy
+        # one division rounds once: in numpy if all whole numbers are exact in float64, else in Python
         below = math.lcm(start.denominator, step.denominator)
         first, each = (int(part * below) for part in (start, step))
         if max(abs(first), abs(first + (num - 1) * each), below) <= EXACT:
@@ -89,7 +89,7 @@ class Range(Table):
 
 
 class PresetTable(Table):
-    """What the file of a preset holds, so that a specification with it needs the file no more."""
+    """The content of a preset's file, so that a specification does not need the file any more."""
 
     name: str
     model: str
@@ -108,7 +108,7 @@ def _name_or_table(value: Any) -> str:
 
 
 class ParametersTable(Table):
-    """``[parameters]``: the preset, what differs from it, and the frequency unless it is an axis."""
+    """The table ``[parameters]``: the preset, overrides, and the frequency unless it is swept."""
 
     nested_model: ClassVar[type[BaseModel] | None] = PresetTable
     preset: (
@@ -119,10 +119,10 @@ class ParametersTable(Table):
         | None
     ) = Field(
         None,
-        description="Preset of the model, by default its first; or a file of one, FILE.toml, seen from the "
-        "specification.",
+        description="Preset of the model, by default the first; or a preset's file, FILE.toml, relative to "
+        "the specification.",
     )
-    overrides: dict[str, float] = Field({}, description="Values by parameter name, SI units.")
+    overrides: dict[str, float] = Field({}, description="Values by parameter name, in SI units.")
     frequency_hz: Annotated[float, Field(gt=0)] | None = Field(
         None, description="Drive frequency [Hz], unless it is an axis."
     )
@@ -134,27 +134,30 @@ class ParametersTable(Table):
 
 
 class Continuation(Table):
-    """``[continuation]``: which axis the branches walk, and which way."""
+    """The table ``[continuation]``: the axis that branches follow, and the direction."""
 
-    path: str = Field(FREQUENCY, description="Axis along which the branches walk.")
-    direction: Literal["up", "down", "both"] = Field("up", description="Which way they walk.")
+    path: str = Field(FREQUENCY, description="Axis that the branches follow: the continuation parameter.")
+    direction: Literal["up", "down", "both"] = Field(
+        "up", description="Direction in which the branches follow it."
+    )
 
     @property
     def directions(self) -> tuple[str, ...]:
-        """The directions walked, one or two."""
+        """Directions of the continuation, one or two."""
         return ("up", "down") if self.direction == "both" else (self.direction,)
 
 
 class Integration(Table):
-    """``[integration]``: tolerances, and what is discarded and kept of each cell."""
+    """The table ``[integration]``: tolerances, transient, and kept sections of each cell."""
 
     rtol: float = Field(1e-8, ge=1e-13, lt=1, description="Relative tolerance of a step.")
     atol: float = Field(1e-8, gt=0, lt=1, description="Absolute tolerance of a step, in the states' units.")
     method: Literal["dopri5", "dop853"] = Field(
-        "dopri5", description="Runge-Kutta method: of order 5, or of order 8 for smooth equations."
+        "dopri5",
+        description="Runge-Kutta method: dopri5 of order 5, or dop853 of order 8 for smooth equations.",
     )
     n_transient: int = Field(
-        300, ge=0, le=100_000_000, description="Drive periods, or returns, before sections are kept."
+        300, ge=0, le=100_000_000, description="Drive periods or returns before sections are kept."
     )
     n_keep: int = Field(60, ge=1, le=1_000_000, description="Sections kept, one per drive period or return.")
     max_steps_per_period: int = Field(
@@ -167,17 +170,17 @@ class Integration(Table):
         1e-6, gt=0, lt=1, description="Scaled distance to a closed orbit below which a cell counts as closed."
     )
     max_orbit_period: int = Field(
-        16, ge=1, le=32_000, description="Longest period that is looked for [drive periods or returns]."
+        16, ge=1, le=32_000, description="Longest orbit period that is detected [drive periods or returns]."
     )
 
 
 class Execution(Table):
-    """``[execution]``: sizes of tasks. They decide the layout of the store, never the numbers."""
+    """The table ``[execution]``: sizes of tasks. They decide the layout of the store, not the numbers."""
 
     trajectories_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
-        None, description="Cells or branches that a task takes; by default as fits its chunks and its time."
+        None, description="Cells or branches of a task; by default chosen by chunk size and time."
     )
     points_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
         None,
-        description="Points of the path that a walk's task takes; by default as fits its time.",
+        description="Points of the continuation that a task covers; by default chosen by time.",
     )

@@ -1,4 +1,4 @@
-"""Plain data as TOML: what specifications hold, spelled so that it reads back as the same."""
+"""Write plain data as TOML that reads back as the same data."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any
 
 
 def toml_key(key: str) -> str:
-    """Spell a key, in quotes where it must be."""
+    """Format a key, quoted if necessary."""
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
 
 
 def toml_value(value: Any) -> str:
-    """Spell a number, text, truth value, list, or a table within a line."""
+    """Format a number, text, truth value, list or inline table."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        # JSON escapes what TOML must have escaped, but for DEL
+        # JSON escapes every character that TOML requires, except DEL
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{toml_key(k)} = {toml_value(v)}" for k, v in value.items()) + " }"
@@ -31,7 +31,7 @@ def toml_value(value: Any) -> str:
 
 
 def table_lines(head: str, table: Mapping[str, Any]) -> list[str]:
-    """Lines of a table, and of the tables in it, each below a head of its own."""
+    """Return the lines of a table and of the tables in it, each below its own header."""
     plain = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
     lines = [f"[{head}]", *(f"{toml_key(key)} = {toml_value(value)}" for key, value in plain.items())]
     for key, inner in table.items():

@@ -1,1 +1,1 @@
-"""The run directory: the only room that knows zarr."""
+"""Keep runs in their directories. No other room knows zarr."""

@@ -1,4 +1,4 @@
-"""How magpend writes a zarr array: little-endian, lz4, crc32c last, one file per chunk."""
+"""Create magpend's zarr arrays: little-endian, lz4, crc32c last, one file per chunk."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def create_array(
     group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...],
     dtype: str, fill: float | int | str, attrs: Mapping[str, Any],
 ) -> Any:  # fmt: skip
-    """Create an array whose chunks carry checksums; `dtype` ``string`` holds texts of any length."""
+    """Create an array whose chunks carry checksums; the `dtype` ``string`` holds texts of any length."""
     serializer: Any = "auto"
     if dtype != "string":
         serializer = BytesCodec(endian="little" if np.dtype(dtype).itemsize > 1 else None)

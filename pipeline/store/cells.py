@@ -1,4 +1,4 @@
-"""Cells of one committed task, compared with its record: for whoever goes on from them."""
+"""Read cells of one committed task, compared with its record, for tasks that build on them."""
 
 from __future__ import annotations
 
@@ -19,27 +19,32 @@ from pipeline.store.view import committed_view
 def read_cells(
     info: RunInfo, plan: Plan, index: int, region: tuple[slice, ...], names: Iterable[str]
 ) -> dict[str, np.ndarray]:
-    """Read variables of some cells of a task, as they were committed.
+    """Read variables of some cells of a committed task.
 
     Parameters
     ----------
     info, plan
-        The run.
+        The run and its plan.
     index
-        The task.
+        Index of the task.
     region
-        Some of its cells.
+        Slices of the cell dims; they lie in the task's block.
     names
         Variables of the cube.
+
+    Returns
+    -------
+    dict
+        By variable, an array in the shape of `region` followed by the variable's own dims.
 
     Raises
     ------
     IncompleteError
         If the task is not committed here.
     UnreadableError
-        If its record is there and cannot be read.
+        If its record exists and cannot be read.
     DamagedError
-        If what is read is not what was written.
+        If the content of a chunk has changed since it was written.
     """
     commit = read_commit(info, plan, index)
     if commit is None:
@@ -56,7 +61,7 @@ def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarr
     Raises
     ------
     DamagedError
-        If what is read is not what was written.
+        If the content of a chunk has changed since it was written.
     KeyError
         If the task is not committed.
     """

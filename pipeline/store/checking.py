@@ -1,4 +1,4 @@
-"""Comparing what is stored with what was written: every byte, or every size."""
+"""Compare the stored files with their records: every byte, or every size."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TASKS_PER_REPORT = 50
 
 @dataclass(frozen=True)
 class Verification:
-    """What `verify` found.
+    """The result of `verify`.
 
     Attributes
     ----------
@@ -32,11 +32,11 @@ class Verification:
     skeleton : list of str
         Problems of metadata and coordinates.
     leftovers : list of str
-        Files that nothing vouches for; harmless, swept by the next run.
+        Files without a valid commit record. They are harmless; the next run removes them.
     derived : dict
-        Problem by name of products that are not what was written.
+        Problem by product name: products whose content has changed.
     rebuilt : list of str
-        Problems of the skeleton that have been mended.
+        Problems of the skeleton that have been repaired.
     odd : list of str
         Folders at the places of files, and files at the places of folders.
     """
@@ -52,7 +52,7 @@ class Verification:
 
     @property
     def sound(self) -> bool:
-        """Whether all that is committed is intact, and all products are."""
+        """Whether all committed tasks and all products are intact."""
         return not (self.damaged or self.skeleton or self.derived or self.odd)
 
 
@@ -62,7 +62,7 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
     Raises
     ------
     UnreadableError
-        If a file is there and cannot be read.
+        If a file exists and cannot be read.
     """
     info.files.refuse_links(CUBE)
     records, damaged = damaged_records(info, plan, contents=True)
@@ -81,12 +81,12 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
 
 
 def odd_keys(files: Files, skeleton: Iterable[str]) -> list[str]:
-    """Return folders at the places of files, and files at the places of folders.
+    """Return folders found where files should be, and files found where folders should be.
 
     Parameters
     ----------
     files
-        Of the run directory.
+        Files of the run directory.
     skeleton
         Keys of the set-up's files, below the cube.
     """
@@ -95,19 +95,21 @@ def odd_keys(files: Files, skeleton: Iterable[str]) -> list[str]:
 
 
 def name_of(index: int) -> str:
-    """Name of a task's record; it may lie in a pack."""
+    """Return the file name of a task's record. The record itself may lie in a pack."""
     return marker_key(index).removeprefix(f"{COMMITS}/")
 
 
 def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Records, dict[str, str]]:
-    """Return the whole records; and by name what is wrong with others, or with what records vouch for.
+    """Return the valid records, and the problems of damaged ones by file name.
+
+    A record is damaged, too, if a file that it lists is missing or has changed.
 
     Parameters
     ----------
     info, plan
-        The run.
+        The run and its plan.
     contents
-        Whether to compare contents; else sizes alone.
+        Whether to compare the contents of files. Otherwise only their sizes are compared.
     """
     records, rejected = scan(info, plan)
     damaged = {name: f"{COMMITS}/{name}: {problem}" for name, problem in rejected.items()}
@@ -116,7 +118,7 @@ def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Recor
 
 
 def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
-    """What is not what was written, by task."""
+    """Return the problems of changed files by task."""
     cube, found = info.files.below(CUBE), {}
     for n, index in enumerate(records):
         if n % _TASKS_PER_REPORT == 0:
@@ -128,7 +130,7 @@ def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
 
 
 def damaged_products(info: RunInfo) -> dict[str, str]:
-    """Products in ``derived`` that are not what was written, by name."""
+    """Return the problems of damaged products in ``derived``, by product name."""
     found: dict[str, str] = {}
     for files in products_in(info.files.below(DERIVED)):
         try:

@@ -1,12 +1,12 @@
-"""Tasks and their commit records: the only proof that a task is done.
+"""Write tasks with their commit records, read the records, and sweep files without one.
 
-A task writes whole chunks, syncs the files and their folders, then writes its record under a
-temporary name, syncs, renames and syncs the folder. Whatever has no valid record reads as pending and
-is swept when the run goes on. Nothing that depends on time, workers or order enters ``cube.zarr`` and
-``commits``: an interrupted run ends with the same bytes as an uninterrupted one.
+A commit record is the only proof that a task is done. A task without a valid record is pending: its files are
+swept and it is computed again. Time, workers and order leave no trace in ``cube.zarr`` and ``commits``: an
+interrupted run ends with the same bytes as an uninterrupted one.
 
-That a record is absent, torn or another run's makes its task pending. That it cannot be read does not:
-that stops whoever asked, so that nothing is swept on the word of a failing disk.
+Reading order: `write_task` (how a task is committed), `read_commits` and `scan` (which records are valid),
+`_Scan` (records and packs in one folder), `sweep` (what is removed). Texts of records and packs are in
+`pipeline.store.records`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from pipeline.store.runfile import RunInfo
 Echo = Callable[[str], None]
 
 _MOST_SCANS = 100
-"""Times that records are read anew because some were packed meanwhile."""
+"""Times that the folder is read again because another process packed records meanwhile."""
 
 
 # ---- writing -----------------------------------------------------------------------------------
@@ -52,49 +52,52 @@ _MOST_SCANS = 100
 def write_task(
     info: RunInfo, plan: Plan, index: int, values: Mapping[str, np.ndarray], counts: Mapping[str, int]
 ) -> None:
-    """Write a task's cells and commit them.
+    """Write a task's cells, then its commit record.
 
     Parameters
     ----------
-    info
-        The run.
-    plan
-        Its plan.
+    info, plan
+        The run and its plan.
     index
-        The task.
+        Index of the task.
     values
-        Every variable, in the shape of the task's block followed by its own dims.
+        Array by variable name, in the shape of the task's block followed by the variable's own dims.
     counts
-        Cells by status name, for `status`.
+        Number of cells by status name, for the command `status`.
 
     Raises
     ------
     ValueError
         If an array has another shape or dtype than the store, or a block cuts a chunk.
     DamagedError
-        If the metadata of a variable are not what was written.
+        If the metadata of a variable have changed since the set-up.
+    RefusedError
+        If the run directory was removed meanwhile.
     """
     info.files.refuse_links(CUBE, *(f"{CUBE}/{v.name}" for v in plan.variables), COMMITS)
     cube = info.files.below(CUBE)
     _require_metadata(info, plan)
     objects = [key for v in plan.variables for key in write_block(cube, plan, index, v.name, values[v.name])]
-    cube.sync(objects)
+    cube.sync(objects)  # the chunks are durable before their record exists
+    # no time and no host: the record's bytes are the same whoever computes the task
     record = {
         "digest": info.digest,
         "task": index,
         "status": dict(counts),
         "objects": entries_of(cube, objects),
     }
-    # in an object store nobody removes a folder under a run, and every question is a request
+    # not asked in an object store: it has no folder to remove, and each question is a request
     if info.files.local is not None and not info.files.is_there(RUN_FILE):
         cube.remove(objects)
         raise RefusedError(f"{info.name}: was removed while it was computed; give the command again.")
-    if not is_packed(info, index):  # else somebody has committed these very bytes before
+    # two workers may compute one task: a pack then holds this record, with the same bytes
+    if not is_packed(info, index):
+        # temporary name, sync, rename, sync of the folder: the record is there whole or not at all
         info.files.write_once(marker_key(index), record_text(record).encode())
 
 
 def _require_metadata(info: RunInfo, plan: Plan) -> None:
-    """Refuse to encode chunks by damaged metadata: they would be committed, and read as something else."""
+    """Refuse to encode chunks with damaged metadata: they would be committed and decoded wrongly."""
     own = {key: info.skeleton[key] for key in (f"{v.name}/zarr.json" for v in plan.variables)}
     problems = problems_of(info.files.below(CUBE), own)
     if problems:
@@ -104,7 +107,7 @@ def _require_metadata(info: RunInfo, plan: Plan) -> None:
 
 
 def is_packed(info: RunInfo, index: int) -> bool:
-    """Whether a pack vouches for a task already: it may have been given to two workers."""
+    """Return whether a task's record lies in a pack."""
     block = index // BLOCK
     if not info.files.is_there(pack_key(block)):
         return False
@@ -115,7 +118,7 @@ def is_packed(info: RunInfo, index: int) -> bool:
 def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
     """Write one variable's chunks of a task and return their keys."""
     array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+", zarr_format=3)
-    # The setting is not stored: without it a block equal to the fill value would leave no file.
+    # zarr does not store this setting; without it a block of fill values would leave no file
     array = array.with_config({"write_empty_chunks": True})
     block = plan.task(index)
     own = array.shape[len(block) :]
@@ -133,7 +136,7 @@ def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarr
 
 
 def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
-    """Append what a task took to ``timings.jsonl``; no part of the result, not synced."""
+    """Append a task's timing to ``timings.jsonl``, which is not part of the result and is not synced."""
     info.files.append(TIMINGS, json.dumps(entry, sort_keys=True))
 
 
@@ -141,28 +144,30 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 
 
 def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records:
-    """Return the valid records by task: whole, of this run and of a task that it has.
+    """Return the valid records by task: whole, of this run, and of a task in the plan.
 
-    As long as no record is packed, the objects of each are there in their size, too. In larger runs that is
-    left to who reads them, to `verify`, and to `pipeline.runs.run`: it would take as long as reading.
+    If no record is packed, a record counts only if all its files exist with the right sizes. Larger runs
+    leave this check to the reading of chunks, to `verify` and to `pipeline.runs.run`, since it takes as long
+    as reading.
 
     Parameters
     ----------
     info, plan
-        The run.
+        The run and its plan.
     echo
-        Prints a line; names every record that does not count, and why.
+        Function that prints a line: one for every record that does not count, with the reason.
 
     Raises
     ------
     UnreadableError
-        If a record, or a folder, is there and cannot be read.
+        If a record or a folder exists and cannot be read. Its tasks are not taken for pending: a failing disk
+        must not cause a sweep.
     RefusedError
         If a folder is a link.
     """
     records, rejected = scan(info, plan)
     problems = [f"{COMMITS}/{name}: {problem}; it does not count" for name, problem in rejected.items()]
-    if not records.packs:
+    if not records.packs:  # a small run: listing its files takes little time
         absent = absent_objects(info, records)
         whole = {index: commit for index, commit in records.items() if index not in absent}
         records = Records(info.files, info.digest, whole)
@@ -173,7 +178,8 @@ def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records
 
 
 def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, str]:
-    """What is missing or has another size, by task; a chunk is there before its record is."""
+    """Return the problems of tasks with a file that is missing or has another size, by task."""
+    # a chunk is durable before its record is, so a missing one was lost later
     sizes = info.files.below(CUBE).sizes() if records else {}
     found = {}
     for index, commit in records.items():
@@ -185,25 +191,32 @@ def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, st
 
 
 def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
-    """Return the record of one task, None if it has no valid one; its objects are not looked at.
+    """Return the record of one task; None if it has no valid one. Its files are not checked.
 
     Raises
     ------
     UnreadableError
-        If it is there and cannot be read.
+        If the record exists and cannot be read.
     """
     return scan(info, plan, (index // BLOCK,))[0].get(index)
 
 
 def scan(info: RunInfo, plan: Plan, blocks: Container[int] | None = None) -> tuple[Records, dict[str, str]]:
-    """Return the whole records of the run, and the problems of the others by file name.
+    """Return the valid records of the run, and the problems of the others by file name.
 
     Parameters
     ----------
     info, plan
-        The run.
+        The run and its plan.
     blocks
-        Those to look at; by default all.
+        Blocks of tasks to read; by default all.
+
+    Raises
+    ------
+    UnreadableError
+        If a file exists and cannot be read, or if the folder changes at every attempt.
+    RefusedError
+        If the folder is a link.
     """
     info.files.refuse_links(COMMITS)
     folder = info.files.below(COMMITS)
@@ -212,7 +225,7 @@ def scan(info: RunInfo, plan: Plan, blocks: Container[int] | None = None) -> tup
         found = _Scan(info, plan, blocks)
         vanished = found.read(folder, names)
         before, names = names, _names(folder)
-        # while this was reading, the records of a block may have moved into their pack
+        # another process may have packed a block meanwhile: its records vanish, its pack appears; read again
         if not vanished and _packs(before) == _packs(names):
             return Records(info.files, info.digest, found.singles, found.packs), found.rejected
     raise UnreadableError(
@@ -233,7 +246,7 @@ def _packs(names: Iterable[str]) -> list[str]:
 
 
 class _Scan:
-    """What lies in ``commits``."""
+    """The records and packs in ``commits``, and the problems of damaged ones."""
 
     def __init__(self, info: RunInfo, plan: Plan, blocks: Container[int] | None) -> None:
         self._info = info
@@ -244,8 +257,9 @@ class _Scan:
         self.rejected: dict[str, str] = {}
 
     def read(self, folder: Files, names: list[str]) -> bool:
-        """Read all records; returns whether some were gone when they were to be read."""
+        """Read all packs, then all single records; return whether a file vanished meanwhile."""
         vanished = False
+        # packs first: they tell which single records are only leftovers of a packing
         blocks = {name: block_of_pack(name) for name in _packs(names)}
         for name, content in folder.read_each(n for n, block in blocks.items() if self._asked(block)):
             vanished |= self._take(name, content, self._pack)
@@ -257,18 +271,18 @@ class _Scan:
         return block is not None and (self._blocks is None or block in self._blocks)
 
     def _alone(self, name: str) -> bool:
-        """Whether a record has to be read: it is not one that has been packed and not yet removed."""
+        """Return whether a single record has to be read: no valid pack holds it already."""
         stem = name.removesuffix(".json")
         if not stem.isdecimal():
-            return self._blocks is None
+            return self._blocks is None  # no record's name: read in a full scan, to be reported
         pack = self.packs.get(int(stem) // BLOCK)
         return self._asked(int(stem) // BLOCK) and (pack is None or int(stem) in pack.without)
 
     def _take(self, name: str, content: bytes | FileNotFoundError, read: Callable[[str, bytes], str]) -> bool:
-        if isinstance(content, NoFileError):
+        if isinstance(content, NoFileError):  # a folder or a link stands there
             self.rejected[name] = str(content)
         elif isinstance(content, FileNotFoundError):
-            return True
+            return True  # removed since the folder was listed: packed, or withdrawn
         elif problem := read(name, content):
             self.rejected[name] = problem
         return False
@@ -280,6 +294,7 @@ class _Scan:
         if isinstance(found, Pack) and is_inside:
             self.packs[block] = found
             return ""
+        # a damaged pack loses only its damaged lines
         saved = salvage(content, self._info.digest, block) if is_inside else {}
         self.singles |= saved
         problem = found if isinstance(found, str) else "of no tasks of this run"
@@ -289,6 +304,7 @@ class _Scan:
         found = read_record(content, self._info.digest)
         if isinstance(found, str):
             return found
+        # a record under another task's name would prove the wrong task
         if not 0 <= found.task < self._plan.n_tasks or marker_key(found.task) != f"{COMMITS}/{name}":
             return "torn or damaged"
         self.singles[found.task] = found
@@ -296,7 +312,7 @@ class _Scan:
 
 
 def cube_digest(info: RunInfo, commits: Mapping[int, Commit]) -> str:
-    """Digest of what is committed of a run: its identity, and all records."""
+    """Return a digest of a run's committed cells: of its identity and all its records."""
     own = isinstance(commits, Records)
     lines = commits.lines() if own else (line_of(commits[i], info.digest) for i in sorted(commits))  # type: ignore[attr-defined]
     digest = hashlib.sha256(info.digest.encode())
@@ -305,11 +321,11 @@ def cube_digest(info: RunInfo, commits: Mapping[int, Commit]) -> str:
     return digest.hexdigest()[:32]
 
 
-# ---- what nothing vouches for ------------------------------------------------------------------
+# ---- files without a record --------------------------------------------------------------------
 
 
 def leftover_keys(info: RunInfo, plan: Plan, commits: Records) -> list[str]:
-    """Files in ``cube.zarr`` and ``commits`` that no valid record vouches for, by key."""
+    """Return the keys of files in ``cube.zarr`` and ``commits`` that no valid record lists."""
     info.files.refuse_links(CUBE, COMMITS)
     owners = Owners(plan)
 
@@ -324,19 +340,19 @@ def leftover_keys(info: RunInfo, plan: Plan, commits: Records) -> list[str]:
 
 
 def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None) -> int:
-    """Remove leftovers: chunk files and records that no valid record vouches for. Returns how many.
+    """Remove chunks and records that no valid record lists; return their number.
 
-    Only for the holder of the lock. Nothing outside ``cube.zarr`` and ``commits`` is touched: a link in
-    them is removed, what it leads to stays.
+    Only the holder of the lock may call this. Files outside ``cube.zarr`` and ``commits`` stay. A link inside
+    them is removed, its target stays.
 
     Parameters
     ----------
     info, plan
-        The run.
+        The run and its plan.
     commits
-        All its valid records, as `read_commits` has just returned them.
+        All valid records, as `read_commits` has just returned them.
     echo
-        Prints a line; says what is removed.
+        Function that prints a line about the removed files.
     """
     leftovers = leftover_keys(info, plan, commits)
     info.files.remove(leftovers)

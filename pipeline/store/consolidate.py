@@ -1,8 +1,8 @@
-"""The cube rewritten for readers over plain HTTP: columns in small objects, one file that lists them all.
+"""Rewrite the cube for readers over plain HTTP: small chunks by column, one file that lists all arrays.
 
-A browser has gzip and no blosc, cannot list a folder, and asks for one state at a few values of the
-horizontal axis. So a chunk here is one state of all cells at some values of that axis, compressed by gzip,
-and the group's metadata describe every array. The numbers are those of the cube, bit for bit.
+A browser can decompress gzip but not blosc. It cannot list a folder. It asks for one state at a few values
+of the horizontal axis. A chunk here therefore holds one state of all cells at some values of that axis,
+compressed by gzip, and the group's metadata describe every array. The numbers equal the cube's bit for bit.
 """
 
 from __future__ import annotations
@@ -27,26 +27,28 @@ from pipeline.store.files import CUBE, entry_of
 from pipeline.store.run import Run
 
 CHUNK_BYTES = 500_000
-"""What a chunk holds before compression: a request's delay is then small beside its transfer."""
+"""Bytes of a chunk before compression, so large that a request's delay is short beside its transfer."""
 
 SLAB_BYTES = 200_000_000
-"""What is held in memory at a time."""
+"""Bytes that are held in memory at a time."""
 
 LEVEL = 6
-"""Of gzip."""
+"""Compression level of gzip."""
 
 PRIVATE = ("host",)
-"""Attributes of an opened cube that do not go to strangers."""
+"""Attributes of an opened cube that are not published."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A further array over the cells.
+    """An additional array over the cells.
 
     Attributes
     ----------
     values : ndarray
+        In the shape of the cells, followed by `own_dims`.
     attrs : mapping
+        Attributes of the array, such as its unit.
     own_dims : tuple of str
         Dims after those of the cells.
     """
@@ -60,18 +62,18 @@ Layers = Mapping[str, Layer]
 
 
 def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dict[str, dict[str, Any]]:
-    """Write what is committed of a run as a cube that browsers read column by column.
+    """Write the committed cells of a run as a cube that browsers read column by column.
 
     Parameters
     ----------
     run
-        An opened run; what it has not committed reads as pending in the new cube, too.
+        An opened run. Cells that it has not committed read as pending in the new cube, too.
     folder
-        Of the new ``cube.zarr``, which must not be there.
+        Folder in which ``cube.zarr`` is created. It must not have one yet.
     along
-        The swept parameter on the horizontal axis, as a dim of the cube; None if nothing is swept.
+        Dim of the swept parameter on the horizontal axis; None if nothing is swept.
     layers
-        Further arrays over the cells.
+        Additional arrays over the cells, by name.
 
     Returns
     -------
@@ -81,7 +83,7 @@ def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dic
     Raises
     ------
     DamagedError
-        If what is read of the run is not what was written.
+        If the content of a chunk of the run has changed since it was written.
     """
     place = folder / CUBE
     place.mkdir(parents=True)
@@ -94,15 +96,7 @@ def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dic
 
 
 class _Columns:
-    """How the arrays of a run are cut: chunks of some values of one dim and all starts, of one state.
-
-    Parameters
-    ----------
-    run
-        The run.
-    along
-        The dim.
-    """
+    """The chunking of the new cube: some values of one dim, all starts, one state."""
 
     def __init__(self, run: Run, along: str | None) -> None:
         self.dims, self.shape, self._sizes = run.plan.dims, run.plan.shape, run.plan.sizes
@@ -110,11 +104,11 @@ class _Columns:
         starts = [dim for dim in reversed(self.dims) if dim not in swept]
         others = [dim for dim in reversed(swept) if dim != along]
         self._along = along
-        # what is read together first; other parameters only where there is room left
+        # a chunk first takes in the dims that are read together, other parameters only if room is left
         self._order = [*starts, *([] if along is None else [along]), *others]
 
     def chunks(self, itemsize: int, own: tuple[str, ...] = ()) -> tuple[int, ...]:
-        """Chunk shape of an array over the cells, with dims of its own."""
+        """Return the chunk shape of an array over the cells, with its own dims."""
         apart = tuple(1 if dim == "state" else self._sizes[dim] for dim in own)
         room = max(1, CHUNK_BYTES // (itemsize * math.prod(apart)))
         found = {}
@@ -124,7 +118,7 @@ class _Columns:
         return (*(found[dim] for dim in self.dims), *apart)
 
     def slabs(self, chunks: tuple[int, ...], bytes_per_cell: int) -> Iterator[tuple[slice, ...]]:
-        """Whole chunks along the dim, as many at a time as the memory should hold."""
+        """Yield slices along the dim: whole chunks, as many at a time as `SLAB_BYTES` holds."""
         if self._along is None:
             yield (slice(None),) * len(self.dims)
             return
@@ -167,7 +161,7 @@ def _create(
     group: zarr.Group, name: str, dims: Iterable[Any], like: Any, chunks: tuple[int, ...], fill: Any,
     attrs: Mapping[Any, Any],
 ) -> Any:  # fmt: skip
-    """Create an array in codecs that browsers have of themselves; checksums stand at the ends of chunks."""
+    """Create an array with codecs that browsers can decode; checksums stand at the ends of chunks."""
     dtype: np.dtype[Any] = like.dtype
     texts = dtype.kind == "U"
     shuffled = [] if texts or dtype.itemsize == 1 else [Shuffle(elementsize=dtype.itemsize)]
@@ -190,13 +184,13 @@ def _create(
 
 
 def _plain(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Attributes as JSON has them."""
+    """Convert attributes to values that JSON can hold."""
     return {str(k): v.tolist() if isinstance(v, (np.ndarray, np.generic)) else v for k, v in attrs.items()}
 
 
 @contextlib.contextmanager
 def _unwarned() -> Iterator[None]:
-    """Without what zarr says of codecs and metadata that are no part of version 3 of its format."""
+    """Silence zarr's warnings about codecs and metadata that are not in version 3 of its format."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         warnings.filterwarnings("ignore", message="Numcodecs codecs are not")

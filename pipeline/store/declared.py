@@ -1,7 +1,7 @@
-"""What a cube's files declare, held against the plan before anything is decompressed or allocated.
+"""Check the sizes and codecs that a cube's files declare, before anything is decompressed or allocated.
 
 A run directory may come from a stranger, with digests that fit. A few bytes can declare gigabytes of zeros,
-metadata can name other codecs or shapes: neither is followed.
+and metadata can name other codecs or shapes. Both are refused.
 """
 
 from __future__ import annotations
@@ -18,34 +18,28 @@ from pipeline.layout.plan import Plan
 
 METADATA = "zarr.json"
 CODECS = (("bytes", "blosc", "crc32c"), ("vlen-utf8", "blosc", "crc32c"))
-"""Chains of codecs that cubes are written with: of numbers, and of texts."""
+"""Codecs that cubes are written with: one chain for numbers, one for texts."""
 
 MOST_TEXT = 1_000_000
-"""Bytes of an array of texts, such as the names of states."""
+"""Most bytes of an array of texts, such as the names of states."""
 
 _CHECKSUM = 4
 _HEADER = 16
-"""Bytes of blosc's header; the content's size stands in bytes 4 to 8 of it."""
+"""Bytes of blosc's header. Its bytes 4 to 8 hold the size of the content."""
 
 
 MOST_PRODUCT_BYTES, MOST_RATIO = 2_000_000_000, 50
-"""A product in `derived/` may be so large, or so many times as large as its files."""
+"""Most bytes that a product in `derived/` may declare, or most bytes per byte on disk, whichever is more."""
 
 
 def declared_bytes(chunk: Any) -> int:
-    """Size that a chunk compressed by blosc declares for its content; -1 if it has no header."""
+    """Return the size that a blosc chunk declares for its content; -1 if it has no header."""
     header = bytes(memoryview(chunk)[:_HEADER])
     return int.from_bytes(header[4:8], "little") if len(header) == _HEADER else -1
 
 
 class Declared:
-    """What files of the cube may declare.
-
-    Parameters
-    ----------
-    plan
-        Of the run.
-    """
+    """The checks of a cube's files against the run's plan: sizes, shapes and codecs."""
 
     def __init__(self, plan: Plan) -> None:
         self._sizes: Mapping[str, int] = {**dict(zip(plan.dims, plan.shape, strict=True)), **plan.sizes}
@@ -60,7 +54,7 @@ class Declared:
         self._texts: set[str] = set()
 
     def problem(self, key: str, content: Any) -> str | None:
-        """Say what a file declares that it must not; None if nothing."""
+        """Return what a file wrongly declares; None if its declarations fit the plan."""
         name, _, rest = key.partition("/")
         if not rest:
             return None
@@ -73,13 +67,13 @@ class Declared:
         return self._text_problem(bytes(content)) if name in self._texts else None
 
     def _text_problem(self, content: bytes) -> str | None:
-        """Texts begin with their number, for which room is made."""
+        """Check the number of texts that a chunk of texts begins with: decoding allocates so many."""
         number = int.from_bytes(numcodecs.blosc.decompress(content[:-_CHECKSUM])[:4], "little")
         most = max(self._sizes.values(), default=1)
         return None if number <= most else f"declares {number} texts, and may have {most}"
 
     def _most(self, name: str) -> int:
-        """Bytes of a chunk: of a variable just so many, of a coordinate at most."""
+        """Return the bytes of a chunk: exactly for a variable, at most for a coordinate."""
         if name in self._variables:
             _, chunk, dtype = self._variables[name]
             return math.prod(chunk) * np.dtype(dtype).itemsize
@@ -113,7 +107,7 @@ def _codecs_problem(codecs: tuple[Any, ...]) -> str:
 
 
 def product_problem(contents: Iterable[tuple[str, bytes]]) -> str | None:
-    """Say what the files of a product declare that they must not; None if nothing."""
+    """Return what the files of a product wrongly declare; None if their declarations fit."""
     chunk_bytes: dict[str, int] = {}
     total, on_disk = 0, 0
     chunks: list[tuple[str, int]] = []

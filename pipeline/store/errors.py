@@ -1,27 +1,27 @@
-"""What can be wrong with a run directory; each message says what to do."""
+"""Name the errors of a run directory; each message says what to do."""
 
 from __future__ import annotations
 
 
 class StoreError(Exception):
-    """The run directory cannot be used as asked; the message says why and what to do."""
+    """Base class: the run directory cannot be used as asked. The message says why and what to do."""
 
 
 class RefusedError(StoreError):
-    """The directory holds another run, or is no run directory."""
+    """An error for a directory that holds another run, or is no run directory."""
 
 
 class DamagedError(StoreError):
-    """What is stored is not what was written."""
+    """An error for stored content that has changed since it was written."""
 
 
 class LockedError(StoreError):
-    """Another process is writing to the run directory."""
+    """An error for a run directory that another process writes to."""
 
 
 class UnreadableError(StoreError):
-    """The file system failed while something was read; whether it is there is not known."""
+    """A failure of the file system during a read: it is unknown whether the file is there and whole."""
 
 
 class IncompleteError(StoreError):
-    """All tasks returned, and not all of them are committed."""
+    """An error for a run whose tasks all returned while some are not committed."""

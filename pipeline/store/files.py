@@ -1,4 +1,4 @@
-"""Files of a run by key: one interface, whatever holds them."""
+"""Define how a run's files are read and written by key, in a folder or in an object store."""
 
 from __future__ import annotations
 
@@ -21,23 +21,25 @@ DERIVED, FIGURES, EXTENDED, ASIDE = "derived", "figures", "extended.json", "asid
 OWN_FILES = (RUN_FILE, HOLDER, TIMINGS, EXTENDED)
 OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, HOLDER, TIMINGS, DERIVED, FIGURES, EXTENDED, ASIDE})
 
-# one letter before the colon is a drive; pathlib makes one slash of two
+# one letter before the colon is a Windows drive; pathlib turns two slashes into one
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 class Files(Protocol):
-    """Files of a run, or of a part of one, by key: parts joined by ``/``, such as ``commits/000001.json``.
+    """The files of a run, or of a part of a run, by key.
 
-    What cannot be read for another reason than that it is not there raises `UnreadableError`.
+    A key has parts joined by ``/``, such as ``commits/000001.json``.
+
+    A file that exists and cannot be read raises `UnreadableError`.
 
     Attributes
     ----------
     name : str
-        What people call it: for messages.
+        Name of the place in messages.
     place : str
-        What another process opens it by: see `open_files`.
+        Path or URL by which another process opens it with `open_files`.
     local : Path or None
-        The folder, where it is one.
+        The folder; None for an object store.
     """
 
     @property
@@ -50,105 +52,108 @@ class Files(Protocol):
     def local(self) -> Path | None: ...  # noqa: D102
 
     def below(self, prefix: str) -> Files:
-        """Files whose keys begin with a prefix and ``/``, by the rest of their keys."""
+        """Return the files whose keys begin with a prefix and ``/``, by the rest of their keys."""
         ...
 
     def names(self) -> list[str]:
-        """First parts of all keys, sorted.
+        """Return the first parts of all keys, sorted.
 
         Raises
         ------
         FileNotFoundError
-            If nothing is there.
+            If the place does not exist.
         NotADirectoryError
-            If a file is.
+            If the place is a file.
         """
         ...
 
     def is_there(self, key: str) -> bool:
-        """Whether a file is there; a link is none."""
+        """Return whether a file exists at a key. A link does not count."""
         ...
 
     def read(self, key: str) -> bytes:
-        """Content of a file.
+        """Return the content of a file.
 
         Raises
         ------
         FileNotFoundError
-            If there is none.
+            If the file does not exist.
         NoFileError
-            If a link, a folder or another thing that is no file is there.
+            If the key leads to a link, a folder or anything else that is not a file.
         """
         ...
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Contents, or why there is none, in the order of the keys; quicker than one by one."""
+        """Yield each key with its content, or with the error if there is none, in the order of the keys.
+
+        This is faster than reading one key at a time.
+        """
         ...
 
     def write(self, key: str, content: bytes) -> None:
-        """Write a file so that it is there whole or not at all, and durable when this returns."""
+        """Write a file whole or not at all. It is durable when this returns."""
         ...
 
     def write_once(self, key: str, content: bytes) -> None:
-        """As `write`, for a file that has one right content, whoever writes it."""
+        """Write a file as `write` does; all writers write the same content."""
         ...
 
     def append(self, key: str, line: str) -> None:
-        """Add a line to a file that is no part of the result."""
+        """Add a line to a file that is not part of the result."""
         ...
 
     def sizes(self) -> dict[str, int]:
-        """Size of every file by key; nothing if nothing is there."""
+        """Return the size of every file by key; an empty dict if the place does not exist."""
         ...
 
     def everything(self) -> list[str]:
-        """Keys of all that is there, links too."""
+        """Return the keys of all files, links included."""
         ...
 
     def remove(self, keys: Iterable[str]) -> None:
-        """Remove files; one that is gone already is no error."""
+        """Remove files; a file that does not exist is no error."""
         ...
 
     def sync(self, keys: Iterable[str]) -> None:
-        """Make files durable that zarr wrote, with the folders that they lie in."""
+        """Make files that zarr wrote durable, with their folders."""
         ...
 
     def prepare(self, prefix: str) -> None:
-        """Make a folder, where there are folders."""
+        """Make a folder, if the place has folders."""
         ...
 
     def odd(self, folders: Iterable[str]) -> list[str]:
-        """Keys of folders at the places of files, and of files at the places of folders.
+        """Return the keys of folders found where files should be, and of files where folders should be.
 
         Parameters
         ----------
         folders
-            All that should be folders.
+            Keys that should be folders.
         """
         ...
 
     def move_aside(self, key: str) -> str:
-        """Move something out of the way, into a folder `ASIDE`; returns where it lies now."""
+        """Move a file or folder into the folder `ASIDE`; return its new place."""
         ...
 
     def refuse_links(self, *prefixes: str) -> None:
-        """Refuse to work below a link: what it leads to is not the run's own.
+        """Refuse to work below a link: its target does not belong to the run.
 
         Raises
         ------
         RefusedError
-            Naming the link.
+            If one of the prefixes is a link; the message names it.
         """
         ...
 
     def zarr(self, *, read_only: bool) -> Store:
-        """What zarr reads and writes here."""
+        """Return the store through which zarr reads and writes here."""
         ...
 
     def lock(self) -> AbstractContextManager[bool | None]:
-        """Hold the lock: a courtesy between people, the commit protocol does not rest on it.
+        """Hold the lock. It is a courtesy between people; the commit protocol does not rely on it.
 
-        Gives False where locks do not work, so that another process may be writing, too.
+        Yields False where locks do not work; another process may then be writing, too.
 
         Raises
         ------
@@ -159,7 +164,9 @@ class Files(Protocol):
 
 
 def open_files(place: str | Path | Files) -> Files:
-    """Return the files of a run by its place: a folder, or ``s3://bucket/prefix``; files as they are.
+    """Return the files of a run by its place: a folder, or ``s3://bucket/prefix``.
+
+    `Files` are returned unchanged.
 
     Raises
     ------
@@ -178,7 +185,7 @@ def open_files(place: str | Path | Files) -> Files:
 
 
 def is_url(place: str | Path) -> bool:
-    """Whether a place is an object store's."""
+    """Return whether a place is in an object store."""
     return str(place).startswith("s3://")
 
 
@@ -201,17 +208,17 @@ def local_path(path: str | Path) -> Path:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file was being written when it was left: a name of `temporary_beside`."""
+    """Return whether a file name is a `temporary_beside` name: its writer was interrupted."""
     return name.startswith(".") and name.endswith(TEMPORARY)
 
 
 def entry_of(data: bytes) -> dict[str, Any]:
-    """Size and sha256 of a content, as commit records and ``run.json`` hold them."""
+    """Return the size and sha256 of a content, as commit records and ``run.json`` hold them."""
     return {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
 def entries_of(files: Files, keys: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Size and sha256 by key of files that were just written, as they are read back."""
+    """Read files that were just written; return their sizes and sha256 by key."""
     found = {}
     for key, content in files.read_each(keys):
         if isinstance(content, FileNotFoundError):
@@ -221,7 +228,7 @@ def entries_of(files: Files, keys: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def problems_of(files: Files, objects: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Compare files with their sizes and digests; a line per file that is not what was written.
+    """Compare files with their sizes and digests; return a line per file that differs.
 
     Parameters
     ----------

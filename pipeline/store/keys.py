@@ -1,4 +1,4 @@
-"""Which chunk belongs to which task: keys such as ``section/c.0.3.0.0`` follow from the plan, and back."""
+"""Map tasks to the keys of their chunks, such as ``section/c.0.3.0.0``, and keys back to tasks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from pipeline.layout.plan import Plan
 def chunk_keys(
     name: str, region: tuple[slice, ...], chunks: tuple[int, ...], shape: tuple[int, ...]
 ) -> list[str]:
-    """Keys of the chunks in a region; a region that cuts a chunk would lose a neighbour's cells."""
+    """Return the keys of the chunks in a region.
+
+    A region that cuts a chunk is refused with a `ValueError`: writing it would lose a neighbour's cells.
+    """
     for s, c, n in zip(region, chunks, shape, strict=True):
         if s.start % c or (s.stop % c and s.stop != n):
             raise ValueError(f"{name}: region {region} cuts chunks of {chunks}.")
@@ -19,7 +22,7 @@ def chunk_keys(
 
 
 def keys_of(plan: Plan, index: int) -> list[str]:
-    """Keys of all chunks of a task."""
+    """Return the keys of all chunks of a task."""
     block, found = plan.task(index), []
     for variable in plan.variables:
         own = tuple(plan.sizes[dim] for dim in variable.own_dims)
@@ -29,12 +32,12 @@ def keys_of(plan: Plan, index: int) -> list[str]:
 
 
 class Owners:
-    """The task that a chunk belongs to.
+    """A map from the keys of chunks to tasks.
 
     Parameters
     ----------
     plan
-        Of the run.
+        Plan of the run.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -48,7 +51,7 @@ class Owners:
             self._counts[variable.name] = tuple(-(-n // c) for n, c in zip(shape, chunks, strict=True))
 
     def task(self, key: str) -> int | None:
-        """Return the task of a chunk's key; None for what is no chunk of a cell."""
+        """Return the task that a chunk's key belongs to; None if the key names no chunk of a variable."""
         name, _, rest = key.partition("/")
         mark, *words = rest.split(".")
         counts = self._counts.get(name)

@@ -1,9 +1,9 @@
-"""Who writes to a run: the holder of a lock by host, process and time, and leases where there is no lock.
+"""Name the holder of a run's lock, and hold leases in object stores, which have no locks.
 
-An object store has no lock that goes with its process. A lease is the object ``lock`` that names its holder,
-put if absent and put again every `RENEW_S`; one that has not been renewed for `LEASE_S`, or whose process
-on this machine has ended, is taken over. As any lock it is a courtesy: the commit protocol does not rest
-on it.
+An object store has no lock that ends with its process. A lease is the object ``lock``; it names its holder.
+The holder puts it if it is absent, and again every `RENEW_S`. Another process takes the lease over if it has
+not been renewed for `LEASE_S`, or if its holder was a process of this machine that has ended. Like any lock,
+a lease is a courtesy: the commit protocol does not rely on it.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from pipeline.store.objects import ObjectFiles
 
 RENEW_S, LEASE_S = 30.0, 150.0
-"""Seconds after which a lease is renewed, and after which one that is not has lapsed."""
+"""Seconds between renewals of a lease, and seconds without renewal after which it lapses."""
 
 
 def holder() -> dict[str, Any]:
-    """Who asks for a lock: host, process, since when (UTC)."""
+    """Describe this process as a lock's holder: host, process, and the time (UTC)."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     return {"host": platform.node(), "pid": os.getpid(), "since": now}
 
 
 def in_words(content: bytes) -> str:
-    """Say who holds a lock, from what was written of it; empty if that is not whole."""
+    """Return a phrase that names a lock's holder; empty if the note about it is not whole."""
     found = _holder_in(content)
     return f" (process {found['pid']} on {found['host']} since {found['since']})" if found else ""
 
@@ -50,12 +50,12 @@ def _holder_in(content: bytes) -> dict[str, Any] | None:
 
 
 def is_note(content: bytes) -> bool:
-    """Whether a content says who holds a lock."""
+    """Return whether a content names a lock's holder."""
     return _holder_in(content) is not None
 
 
 def _has_ended(content: bytes) -> bool:
-    """Whether a holder was a process of this machine that is no more."""
+    """Return whether the holder was a process of this machine that has ended."""
     found = _holder_in(content)
     if found is None or found["host"] != platform.node():
         return False
@@ -95,7 +95,7 @@ def lease(files: ObjectFiles) -> Iterator[None]:
     finally:
         stop.set()
         thread.join()
-        # what cannot be done now does no harm: the lease lapses
+        # a failure does no harm here: the lease lapses
         with contextlib.suppress(FileNotFoundError, StoreError):
             files.put_lines()
             if files.read(LOCK) == content:
@@ -103,11 +103,11 @@ def lease(files: ObjectFiles) -> Iterator[None]:
 
 
 class _TakenError(Exception):
-    """Somebody else has put a lease."""
+    """An error for a lease that another process has put meanwhile."""
 
 
 def _take(files: ObjectFiles, content: bytes) -> str:
-    """Put the lease if there is none that holds; returns its tag."""
+    """Put the lease unless another one holds; return its tag."""
     import obstore
 
     try:
@@ -115,7 +115,7 @@ def _take(files: ObjectFiles, content: bytes) -> str:
     except obstore.exceptions.AlreadyExistsError:
         pass
     except (obstore.exceptions.BaseError, OSError):
-        # the answer may have been lost, and the lease put; what else is wrong shows below
+        # the lease may have been put although the answer was lost; any other problem shows below
         pass
     found = _found(files)
     if found is None:
@@ -134,13 +134,13 @@ def _take(files: ObjectFiles, content: bytes) -> str:
 
 
 def _found(files: ObjectFiles) -> tuple[bytes, str, float] | None:
-    """Content, tag and age in seconds of the lease that is there."""
+    """Return content, tag and age in seconds of the present lease; None if there is none."""
     import obstore
 
     try:
         found = obstore.get(files.store, LOCK)
     except FileNotFoundError:
-        files.is_there(LOCK)  # a missing bucket is another matter
+        files.is_there(LOCK)  # raises if the bucket itself is missing
         return None
     except (obstore.exceptions.BaseError, OSError):
         files.read(LOCK)
@@ -150,7 +150,7 @@ def _found(files: ObjectFiles) -> tuple[bytes, str, float] | None:
 
 
 def _replace(files: ObjectFiles, content: bytes, tag: str) -> str:
-    """Put the lease in the place of the one that has a tag."""
+    """Replace the lease that has a tag; return the tag of the new one."""
     import obstore
 
     try:

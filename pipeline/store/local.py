@@ -1,4 +1,4 @@
-"""The files of a run in a folder of this machine: written whole, synced in order, no link followed."""
+"""Read and write a run's files in a local folder: written whole, synced in order, no link followed."""
 
 from __future__ import annotations
 
@@ -25,47 +25,47 @@ from pipeline.store.lease import holder, in_words
 
 @dataclass(frozen=True)
 class LocalFiles:
-    """Files of a folder by key, such as ``commits/000001.json``; see `pipeline.store.files.Files`."""
+    """The files of a folder by key, such as ``commits/000001.json``; see `pipeline.store.files.Files`."""
 
     root: Path
 
     @property
     def name(self) -> str:
-        """The folder, as it was given."""
+        """Path of the folder, as it was given."""
         return str(self.root)
 
     @property
     def place(self) -> str:
-        """The folder, for other processes of this machine and its file systems."""
+        """Absolute path of the folder, for other processes."""
         return str(self.root.absolute())
 
     @property
     def local(self) -> Path:
-        """The folder."""
+        """Path of the folder."""
         return self.root
 
     def below(self, prefix: str) -> LocalFiles:
-        """Files of a folder in this one."""
+        """Return the files of a folder in this one."""
         return LocalFiles(self.root / prefix)
 
     def names(self) -> list[str]:
-        """Names of all that is in the folder, sorted."""
+        """Return the names of all entries of the folder, sorted."""
         with unreadable(self.root), os.scandir(self.root) as entries:
             return sorted(entry.name for entry in entries)
 
     def is_there(self, key: str) -> bool:
-        """Whether a plain file is there."""
+        """Return whether a plain file exists at a key."""
         return is_there(self.root / key)
 
     def read(self, key: str) -> bytes:
-        """Content of a plain file."""
+        """Return the content of a plain file."""
         path = self.root / key
         with unreadable(path), open_plain(path, "rb") as file:
             content: bytes = file.read()
         return content
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Contents, or why there is none, in the order of the keys."""
+        """Yield each key with its content, or with the error if there is none."""
         for key in keys:
             try:
                 yield key, self.read(key)
@@ -73,25 +73,25 @@ class LocalFiles:
                 yield key, error
 
     def write(self, key: str, content: bytes) -> None:
-        """Write a file whole or not at all, durable when this returns."""
+        """Write a file whole or not at all. It is durable when this returns."""
         path = self.root / key
         with writing(path):
-            self.root.stat()  # one that somebody has removed is not made again
+            self.root.stat()  # raises if the folder was removed: it is not made again
             make_folder(path.parent)
         write_atomically(path, content)
 
     def write_once(self, key: str, content: bytes) -> None:
-        """As `write`: a rename leaves one of two equal contents, whole."""
+        """Write a file as `write` does: of two writers of equal contents one wins, whole."""
         self.write(key, content)
 
     def append(self, key: str, line: str) -> None:
-        """Add a line to a file that is no part of the result; not synced."""
+        """Add a line to a file that is not part of the result; it is not synced."""
         path = self.root / key
         with writing(path), open_plain(path, "a", encoding="utf-8") as file:
             file.write(line + "\n")
 
     def sizes(self) -> dict[str, int]:
-        """Size of every plain file below by key; nothing if there is no folder."""
+        """Return the size of every plain file below by key; an empty dict if there is no folder."""
         self.refuse_links("")
         found: dict[str, int] = {}
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -99,13 +99,13 @@ class LocalFiles:
         return found
 
     def everything(self) -> list[str]:
-        """Keys of all that is below and is no folder, links too; nothing if there is no folder."""
+        """Return the keys of all files and links below; an empty list if there is no folder."""
         with unreadable(self.root), contextlib.suppress(FileNotFoundError, NotADirectoryError):
             return [path.relative_to(self.root).as_posix() for path in files_below(self.root)]
         return []
 
     def remove(self, keys: Iterable[str]) -> None:
-        """Remove files and links, not what these lead to; one that is gone already is no error."""
+        """Remove files and links but not the targets of links; a missing file is no error."""
         paths = [self.root / key for key in keys]
         for path in paths:
             with writing(path):
@@ -115,17 +115,17 @@ class LocalFiles:
                 sync_folder(folder)
 
     def sync(self, keys: Iterable[str]) -> None:
-        """Have files on the disk, then their folders, from theirs up to this one."""
+        """Make files durable, then their folders, from the innermost up to this one."""
         sync((self.root / key for key in keys), self.root)
 
     def prepare(self, prefix: str) -> None:
-        """Make a folder if it is not there; it and this one are durable then."""
+        """Make a folder if it does not exist, and make its entry durable."""
         make_folder(self.root / prefix)
         with writing(self.root):
             sync_folder(self.root.parent)
 
     def odd(self, folders: Iterable[str]) -> list[str]:
-        """Folders at the places of files, and files at the places of folders."""
+        """Return folders found where files should be, and files found where folders should be."""
         found, expected = [], list(folders)
         for folder in expected:
             path = self.root / folder
@@ -138,7 +138,7 @@ class LocalFiles:
         return found + [name for name in OWN_FILES if os.path.isdir(self.root / name)]
 
     def move_aside(self, key: str) -> str:
-        """Move something into a folder of this one."""
+        """Move a file or folder into the folder `ASIDE` of this one; return its new path."""
         path = self.root / key
         target = self.root / ASIDE / f"{key.replace('/', '-')}.{uuid.uuid4().hex[:8]}"
         refuse_links(target.parent)
@@ -154,7 +154,7 @@ class LocalFiles:
         refuse_links(*(self.root / prefix for prefix in prefixes))
 
     def zarr(self, *, read_only: bool) -> Store:
-        """The folder as zarr takes it."""
+        """Return the folder as a zarr store."""
         return LocalStore(self.root, read_only=read_only)
 
     def lock(self) -> AbstractContextManager[bool]:
@@ -163,7 +163,7 @@ class LocalFiles:
 
 
 def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
-    """Add the sizes of the plain files below a folder; a link to a folder in the topmost is refused."""
+    """Add the sizes of the plain files below a folder; refuse links to folders in the topmost one."""
     with unreadable(folder), os.scandir(folder) as entries:
         below = list(entries)
     for entry in below:
@@ -176,7 +176,7 @@ def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
 
 
 def unwritable(folder: Path) -> str | None:
-    """Say why nothing can be written in a folder, there or not yet; None if something can."""
+    """Return why a folder, which need not exist yet, cannot be written to; None if it can."""
     place = folder.absolute()
     while not os.path.lexists(place):
         place = place.parent
@@ -188,7 +188,7 @@ def unwritable(folder: Path) -> str | None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, and those that it lies in, and have their entries on the disk."""
+    """Make a folder and its parents, and make their entries durable."""
     if path.is_dir():
         return
     make_folder(path.parent)
@@ -198,7 +198,7 @@ def make_folder(path: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Have a file's content on the disk."""
+    """Make a file's content durable."""
     with writing(path), open_plain(path, "rb") as file:
         os.fsync(file.fileno())
 
@@ -215,7 +215,7 @@ def sync(files: Iterable[Path], top: Path) -> None:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """All that is below a folder and is no folder; a link is an entry, wherever it leads."""
+    """Yield all files below a folder. A link counts as a file, wherever it leads."""
     with os.scandir(folder) as entries:
         found = sorted(entries, key=lambda entry: entry.name)
     for entry in found:
@@ -226,12 +226,12 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def is_there(path: Path) -> bool:
-    """Whether a plain file is there; a link, or a folder, is none.
+    """Return whether a plain file exists at a path. A link or a folder does not count.
 
     Raises
     ------
     UnreadableError
-        If the file system does not say.
+        If the file system cannot tell.
     """
     try:
         with unreadable(path):
@@ -242,7 +242,9 @@ def is_there(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into one that stops the run; that something is absent is none.
+    """Turn errors of the file system into `UnreadableError`, which stops the run.
+
+    A missing file is not turned: it may be missing rightly.
 
     Raises
     ------
@@ -262,12 +264,12 @@ def unreadable(path: Path) -> Iterator[None]:
 
 
 def refuse_links(*paths: Path) -> None:
-    """Refuse a link: what it leads to is not the run's own.
+    """Refuse a link: its target does not belong to the run.
 
     Raises
     ------
     RefusedError
-        Naming the link.
+        If one of the paths is a link; the message names it.
     """
     for path in paths:
         if path.is_symlink():
@@ -278,7 +280,7 @@ def refuse_links(*paths: Path) -> None:
 
 
 def run_around(path: Path) -> Path | None:
-    """Return the run directory that a path lies in, or is; None if it lies in none."""
+    """Return the run directory that a path is or lies in; None if there is none."""
     real = path.absolute().resolve()
     for folder in (real, *real.parents):
         if sum(os.path.lexists(folder / name) for name in (RUN_FILE, CUBE, COMMITS)) >= 2:
@@ -287,21 +289,21 @@ def run_around(path: Path) -> Path | None:
 
 
 def refuse_place(path: Path, option: str = "", within: str = "") -> None:
-    """Refuse a place for results that lies inside of a run directory, or is a link that leads nowhere.
+    """Refuse a place for results inside of a run directory, and a link that leads nowhere.
 
     Parameters
     ----------
     path
-        A file or a folder, there or not.
+        A file or a folder; it need not exist.
     option
-        What names it, for the message.
+        Option of the command that gave it, for the message.
     within
-        Folder of a run directory in which it may lie.
+        Folder of a run directory in which results may lie; empty for none.
 
     Raises
     ------
     RefusedError
-        Saying which it is.
+        In both cases.
     """
     name = f"{option} {path}".strip()
     if path.is_symlink() and not path.exists():
@@ -312,7 +314,7 @@ def refuse_place(path: Path, option: str = "", within: str = "") -> None:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a file, a link (not what it leads to) or a folder; one that is gone already is no error."""
+    """Remove a file, a link (not its target) or a folder; a missing one is no error."""
     with contextlib.suppress(FileNotFoundError):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -322,14 +324,14 @@ def remove_tree(path: Path) -> None:
 
 @contextlib.contextmanager
 def writer_lock(directory: Path) -> Iterator[bool]:
-    """Hold the directory's lock: a courtesy between people, the commit protocol does not rest on it.
+    """Hold the directory's lock. It is a courtesy; the commit protocol does not rely on it.
 
-    The system frees the lock of a process that has ended, however it did. Gives False where locks fail.
+    The system frees the lock when its process ends, however it ends. Yields False where locks fail.
 
     Raises
     ------
     LockedError
-        If another process holds it; names that one.
+        If another process holds it; the message names that process.
     """
     from filelock import FileLock, Timeout
 
@@ -360,7 +362,7 @@ def writer_lock(directory: Path) -> Iterator[bool]:
 
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Say beside a lock who holds it, for those who ask in vain; a process that is killed leaves it there."""
+    """Write beside a lock who holds it, for messages. A killed process leaves this note behind."""
     content = json.dumps(holder()).encode()
     with contextlib.suppress(OSError):
         write_atomically(path, content)
@@ -369,6 +371,6 @@ def _named(path: Path) -> Iterator[None]:
     finally:
         with contextlib.suppress(OSError):
             with open_plain(path, "rb") as file:
-                is_own = file.read() == content  # the folder may have been renamed meanwhile
+                is_own = file.read() == content  # else another run's note: the folder was renamed meanwhile
             if is_own:
                 path.unlink()

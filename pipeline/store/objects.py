@@ -1,7 +1,7 @@
-"""The files of a run in an object store, by a URL such as ``s3://bucket/prefix``: put whole, markers once.
+"""Read and write a run's files in an object store, by a URL such as ``s3://bucket/prefix``.
 
-Who may use the store is known from the environment alone (``AWS_ACCESS_KEY_ID`` and the other names that
-S3 clients read); nothing of it is kept, written or said.
+Objects are put whole, and commit records only once. Credentials come from the environment alone
+(``AWS_ACCESS_KEY_ID`` and the other names that S3 clients read). They are never kept, written or printed.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ CREDENTIALS = (
     "AWS_ACCESS_KEY_ID", "AWS_SKIP_SIGNATURE", "AWS_WEB_IDENTITY_TOKEN_FILE", "AWS_METADATA_ENDPOINT",
     "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI", "AWS_CONTAINER_CREDENTIALS_FULL_URI",
 )  # fmt: skip
-"""Names in the environment any of which says who may use the store."""
+"""Environment variables, any one of them enough to tell who may use the store."""
 
 AT_ONCE = 16
-"""Requests under way at the same time."""
+"""Requests that are under way at the same time."""
 
 CONNECT_S, REQUEST_S = 5.0, 60.0
-"""How long reaching a store, and a whole request, may take, in seconds."""
+"""Longest time to reach a store, and longest time of a whole request, in seconds."""
 
 RETRIES, FIRST_WAIT_S, LONGEST_WAIT_S = 6, 0.2, 5.0
-"""How often a request is made again, and the seconds between: some ten in all."""
+"""Number of times a request is repeated, and the waits in between [s]: about ten seconds in total."""
 
 _URL = re.compile(r"s3://([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])((?:/[^/?#@\s]+)*)/?")
 _AGAIN = "what is committed stays; give the same command again, it goes on."
@@ -50,9 +50,9 @@ def parse_url(text: str) -> ObjectFiles:
     Raises
     ------
     RefusedError
-        If it is no such URL, or the package or the credentials for it are missing.
+        If `text` is no such URL, or if the package obstore or the credentials are missing.
     """
-    if "@" in text or "?" in text:  # not repeated: it may hold a password
+    if "@" in text or "?" in text:  # the message does not repeat the text, which may hold a password
         raise RefusedError("The URL of a run has no user, password or query: credentials are environment.")
     match = _URL.fullmatch(text)
     if match is None or {".", ".."} & set(text.split("/")):
@@ -75,12 +75,12 @@ _CREDENTIALS_HELP = (
 
 
 class ObjectFiles:
-    """Files of a run in a bucket, by key; see `pipeline.store.files.Files`.
+    """The files of a run in a bucket, by key; see `pipeline.store.files.Files`.
 
     Parameters
     ----------
     bucket, prefix
-        Where they are; the prefix has no slash at its ends and may be empty.
+        Place of the files. The prefix neither begins nor ends with a slash and may be empty.
     """
 
     local = None
@@ -93,7 +93,7 @@ class ObjectFiles:
         self._lines: dict[str, list[str]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # what travels to another process is the place: it has credentials of its own
+        # only the place is sent to another process, which has its own credentials
         return ObjectFiles, (self.bucket, self.prefix)
 
     def __eq__(self, other: object) -> bool:
@@ -107,33 +107,33 @@ class ObjectFiles:
 
     @property
     def name(self) -> str:
-        """The URL."""
+        """URL of the prefix."""
         return f"s3://{self.bucket}/{self.prefix}".rstrip("/")
 
     @property
     def place(self) -> str:
-        """The URL."""
+        """URL of the prefix."""
         return self.name
 
     @property
     def store(self) -> Any:
-        """What obstore knows the prefix by."""
+        """Client of obstore for the bucket and the prefix."""
         if self._store is None:
             self._store = _client(self.bucket, self.prefix)
         return self._store
 
     def below(self, prefix: str) -> ObjectFiles:
-        """Files below a prefix; the same ones every time, since each has connections of its own."""
+        """Return the files below a prefix. They are kept, since each has its own connections."""
         if prefix not in self._below:
             self._below[prefix] = ObjectFiles(self.bucket, f"{self.prefix}/{prefix}".lstrip("/"))
         return self._below[prefix]
 
     def path(self, key: str) -> str:
-        """URL of an object."""
+        """Return the URL of an object."""
         return f"{self.name}/{key}".rstrip("/")
 
     def names(self) -> list[str]:
-        """First parts of all keys, sorted."""
+        """Return the first parts of all keys, sorted."""
         import obstore
 
         found = self._ask("", lambda: obstore.list_with_delimiter(self.store))
@@ -143,7 +143,7 @@ class ObjectFiles:
         return names
 
     def is_there(self, key: str) -> bool:
-        """Whether an object is there."""
+        """Return whether an object exists."""
         import obstore
 
         try:
@@ -154,13 +154,13 @@ class ObjectFiles:
         return True
 
     def read(self, key: str) -> bytes:
-        """Content of an object."""
+        """Return the content of an object."""
         import obstore
 
         return self._ask(key, lambda: bytes(obstore.get(self.store, key).bytes()))
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Contents, or why there is none, some at once."""
+        """Yield each key with its content, or with the error if there is none; several are read at once."""
 
         def read(key: str) -> bytes | FileNotFoundError:
             try:
@@ -170,23 +170,23 @@ class ObjectFiles:
 
         rest = iter(keys)
         with ThreadPoolExecutor(AT_ONCE) as pool:
-            # no more of them lie in memory than are read at once
+            # memory holds no more contents than are read at once
             while some := list(islice(rest, AT_ONCE)):
                 yield from zip(some, pool.map(read, some), strict=True)
 
     def write(self, key: str, content: bytes) -> None:
-        """Put an object, in the place of one that is there."""
+        """Put an object; it replaces one with the same key."""
         import obstore
 
         self._ask(key, lambda: obstore.put(self.store, key, content, use_multipart=False), writing=True)
 
     def write_once(self, key: str, content: bytes) -> None:
-        """Put an object if there is none; one that is there must be the same.
+        """Put an object unless it exists; an existing one must have the same content.
 
         Raises
         ------
         DamagedError
-            If another one is there.
+            If an object with another content exists.
         """
         import obstore
 
@@ -195,9 +195,9 @@ class ObjectFiles:
                 obstore.put(self.store, key, content, mode="create", use_multipart=False)
                 return
             except obstore.exceptions.AlreadyExistsError:
-                pass  # so is a conflict between two puts, of which none may have been done
+                pass  # also raised when two puts collide, and then none may have succeeded
             except (obstore.exceptions.BaseError, OSError) as error:
-                # of a put whose answer was lost nobody knows whether it was done
+                # if the answer was lost, the put may have succeeded
                 explained = explain(self.path(key), error, writing=True)
                 if not isinstance(explained, UnreadableError) or attempt == RETRIES - 1:
                     raise explained from None
@@ -219,25 +219,25 @@ class ObjectFiles:
         return True
 
     def append(self, key: str, line: str) -> None:
-        """Keep a line until the lock is released: objects do not grow, and it is no part of the result."""
+        """Keep a line until the lock is released, since objects cannot grow."""
         self._lines.setdefault(key, []).append(line)
 
     def put_lines(self) -> None:
-        """Put what `append` has kept, after what is there."""
+        """Put the lines that `append` has kept after the lines that are stored."""
         for key, lines in self._lines.items():
             before = b"".join(c for _, c in self.read_each([key]) if isinstance(c, bytes))
             self.write(key, before + "".join(f"{line}\n" for line in lines).encode())
         self._lines = {}
 
     def sizes(self) -> dict[str, int]:
-        """Size of every object by key."""
+        """Return the size of every object by key."""
         import obstore
 
         found = self._ask("", lambda: obstore.list(self.store, chunk_size=1000).collect())
         return {entry["path"]: entry["size"] for entry in found}
 
     def everything(self) -> list[str]:
-        """Keys of all objects, sorted."""
+        """Return the keys of all objects, sorted."""
         return sorted(self.sizes())
 
     def remove(self, keys: Iterable[str]) -> None:
@@ -248,7 +248,7 @@ class ObjectFiles:
             self._ask("", lambda: obstore.delete(self.store, gone), writing=True)
 
     def sync(self, keys: Iterable[str]) -> None:
-        """Do nothing: what a store has answered for is durable."""
+        """Do nothing: an object is durable once the store has answered."""
 
     def prepare(self, prefix: str) -> None:
         """Do nothing: there are no folders."""
@@ -265,7 +265,7 @@ class ObjectFiles:
         """Do nothing: there are no links."""
 
     def zarr(self, *, read_only: bool) -> Store:
-        """The prefix as zarr takes it."""
+        """Return the prefix as a zarr store."""
         return RunStore(self, read_only=read_only)
 
     def lock(self) -> AbstractContextManager[None]:
@@ -284,7 +284,7 @@ class ObjectFiles:
 
 
 class RunStore(ObjectStore[Any]):
-    """What zarr reads and writes: errors in magpend's words, metadata read once by those who write."""
+    """A zarr store whose errors are in magpend's words. Writers read metadata only once."""
 
     def __init__(self, files: ObjectFiles, *, read_only: bool = False) -> None:
         super().__init__(files.store, read_only=read_only)
@@ -294,13 +294,13 @@ class RunStore(ObjectStore[Any]):
         return _run_store, (self._files, self.read_only)
 
     def with_read_only(self, read_only: bool = False) -> RunStore:
-        """As in zarr."""
+        """Return the same store, read-only or not, as zarr asks for."""
         return RunStore(self._files, read_only=read_only)
 
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """As in zarr."""
+        """Return the content of a key, as zarr asks for; None if there is none."""
         kept = self._files.metadata
         if key in kept and not self.read_only:
             return kept[key]
@@ -313,7 +313,7 @@ class RunStore(ObjectStore[Any]):
         return found
 
     async def set(self, key: str, value: Buffer) -> None:
-        """As in zarr."""
+        """Put the content of a key, as zarr asks for."""
         try:
             await super().set(key, value)
         except Exception as error:
@@ -325,7 +325,7 @@ def _run_store(files: ObjectFiles, read_only: bool) -> RunStore:
 
 
 def _client(bucket: str, prefix: str) -> Any:
-    """Open a bucket with what the environment says of endpoint, region and credentials."""
+    """Open a bucket with the endpoint, region and credentials of the environment."""
     from obstore.exceptions import BaseError
     from obstore.store import S3Store
 
@@ -334,7 +334,7 @@ def _client(bucket: str, prefix: str) -> Any:
             bucket,
             prefix=prefix or None,
             client_options={
-                # whoever writes http:// in the environment means it
+                # plain http is allowed only if the environment asks for it
                 "allow_http": _endpoint().startswith("http://"),
                 "connect_timeout": timedelta(seconds=CONNECT_S),
                 "timeout": timedelta(seconds=REQUEST_S),
@@ -357,16 +357,16 @@ def _endpoint() -> str:
 
 
 def explain(place: str, error: Exception, *, writing: bool = False) -> Exception:
-    """Return an error of a store in magpend's words: one line, and nothing that was sent.
+    """Translate an error of a store into one line in magpend's words, without what was sent.
 
     Parameters
     ----------
     place
-        URL of what was asked for.
+        URL that the request was for.
     error
-        As obstore raises it. Its text has the whole answer, which may name an access key.
+        Error from obstore. Its text holds the whole answer, which may name an access key.
     writing
-        Whether something was to be written.
+        Whether the request was to write.
     """
     text = str(error)
     status = re.search(r"status code: (\d{3})", text)
@@ -394,7 +394,7 @@ def explain(place: str, error: Exception, *, writing: bool = False) -> Exception
 
 
 def _where() -> str:
-    """Name of the store's machine, without what else a URL may hold."""
+    """Return the host name of the store, without other parts of its URL."""
     parts = urlsplit(_endpoint())
     try:
         return f"{parts.hostname}:{parts.port}" if parts.port else parts.hostname or "the object store"

@@ -1,7 +1,7 @@
-"""Packs of commit records: written once a block of tasks is whole, mended where records are withdrawn.
+"""Pack the commit records of whole blocks of tasks, and rewrite packs when records are withdrawn.
 
-All of it is for the holder of the lock. A pack is durable before the single records that it replaces are
-removed, so that a crash at any moment leaves every record somewhere.
+Only the holder of the lock may call these functions. A pack is durable before the single records that it
+replaces are removed: a crash at any moment leaves every record either there or in the pack.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from pipeline.store.runfile import RunInfo
 
 
 class Packer:
-    """Packs the records of a run as its blocks become whole.
+    """A packer of records: it packs each block of a run when its last task is committed.
 
     Parameters
     ----------
     info, plan
-        The run.
+        The run and its plan.
     commits
-        What is committed of it already.
+        Records that are committed already.
     """
 
     def __init__(self, info: RunInfo, plan: Plan, commits: Records) -> None:
@@ -46,7 +46,7 @@ class Packer:
             self._pack_if_whole(block)
 
     def add(self, index: int) -> None:
-        """Take that a task has been committed, for the first time."""
+        """Count a task that has been committed for the first time; pack its block if that is whole."""
         self._counts[index // BLOCK] += 1
         self._pack_if_whole(index // BLOCK)
 
@@ -56,7 +56,7 @@ class Packer:
 
 
 def pack_block(info: RunInfo, plan: Plan, block: int) -> bool:
-    """Put the records of a block into one file if all of them are valid; returns whether they are."""
+    """Put the records of a block into one file if all of them are valid; return whether they are."""
     tasks = range(block * BLOCK, (block + 1) * BLOCK)
     commits, _ = scan(info, plan, blocks={block})
     if not all(index in commits for index in tasks):
@@ -76,8 +76,8 @@ def withdraw(info: RunInfo, names: Iterable[str]) -> None:
     info
         The run.
     names
-        Their file names, as if every record had a file of its own; or the name of a pack that is damaged:
-        what is whole in it stays.
+        File names of the records, as if each had its own file; or the name of a damaged pack, whose
+        whole records stay.
     """
     info.files.refuse_links(COMMITS)
     folder = info.files.below(COMMITS)
@@ -95,7 +95,7 @@ def withdraw(info: RunInfo, names: Iterable[str]) -> None:
 
 
 def _rewrite(info: RunInfo, block: int, tasks: set[int]) -> None:
-    """Write a pack again with those of its records that are whole, but for some tasks'."""
+    """Rewrite a pack without the records of some tasks, and without damaged ones."""
     try:
         content = info.files.read(pack_key(block))
     except FileNotFoundError:

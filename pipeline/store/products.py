@@ -1,7 +1,7 @@
-"""Analysis products on disk: whole or absent, sealed by a digest of their content.
+"""Write and read the products of analyses: whole or absent, sealed by a digest of their content.
 
-Each is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. Words (``state``, ``direction``, names of
-sides) are stored as codes, which the attribute ``words`` lists.
+Each product is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. Labels (``state``, ``direction``,
+classes of motion) are stored as codes; the attribute ``words`` lists the labels.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SEAL = "content_sha256"
-"""Attribute of a product: digest of its other attributes and of all its files but the one that holds it."""
+"""Attribute of a product: a digest of its other attributes and of all files but ``zarr.json``."""
 
 _WORDS = "words"
 _MOST_TRIES = 20
-"""Times that a product at the place of a new one is removed before the new one is given up."""
+"""Times that a product in the way is removed before the new product is given up."""
 
 _PRODUCT_CHUNK_BYTES = 16_000_000
 _GROUP = "zarr.json"
@@ -47,11 +47,11 @@ Digests = list[tuple[str, str]]
 
 
 def write_product(place: Place, ds: xr.Dataset) -> None:
-    """Write a dataset so that it is at its place whole or not at all.
+    """Write a dataset to its place, whole or not at all.
 
-    Words are stored as codes (the attribute ``words`` lists them), since zarr format 3 has no strings
-    of fixed length. If another process puts a sound product of the same attributes there first, that
-    one stays.
+    Labels are stored as codes, which the attribute ``words`` lists, since zarr format 3 has no strings of
+    fixed length. If another process first puts a sound product with the same attributes there, that
+    product stays.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def write_product(place: Place, ds: xr.Dataset) -> None:
 
 
 def _put_product(files: Files, ds: xr.Dataset) -> None:
-    """Put a product into an object store, the attributes with the seal last: before, it is none."""
+    """Put a product into an object store; its seal comes last, and makes it a product."""
     data: dict[str, Any] = {}
 
     def digests() -> Digests:
@@ -100,16 +100,16 @@ def open_product(place: Place) -> xr.Dataset:
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If it does not exist.
     DamagedError
-        If it is not what was written.
+        If its content has changed since it was written.
     """
     import xarray as xr
 
     files = open_files(place)
     store: Any
     if files.local is None:
-        # all of it is read for the seal, so it is read once
+        # checking the seal reads every file, so each is read only once
         contents = dict(files.read_each(files.everything()))
         _sealed_attrs(files, contents.get(_GROUP), _digests_of(contents.items()))
         _refuse_declared(files, contents.items())
@@ -128,14 +128,14 @@ def open_product(place: Place) -> xr.Dataset:
 
 
 def read_product_attrs(place: Place) -> dict[str, Any]:
-    """Attributes of a product, once its seal has been found to fit.
+    """Return the attributes of a product after checking its seal.
 
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If it does not exist.
     DamagedError
-        If it is not what was written.
+        If its content has changed since it was written.
     """
     files = open_files(place)
     if (path := files.local) is not None:
@@ -155,13 +155,13 @@ def read_product_attrs(place: Place) -> dict[str, Any]:
 
 
 def _refuse_declared(files: Files, contents: Iterable[tuple[str, bytes | FileNotFoundError]]) -> None:
-    """Refuse a product whose files declare more than they have."""
+    """Refuse a product whose files declare more bytes than they have."""
     if problem := product_problem((key, value) for key, value in contents if isinstance(value, bytes)):
         raise DamagedError(f"{files.name}: {problem}")
 
 
 def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests: Digests) -> dict[str, Any]:
-    """Attributes of a product, compared with the digests of its other files."""
+    """Return the attributes of a product after comparing its seal with the digests of its files."""
     if not isinstance(group, bytes):
         if digests:
             raise DamagedError(f"{files.name}: it has no {_GROUP}")
@@ -176,7 +176,7 @@ def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests
 
 
 def remove_product(place: Place) -> None:
-    """Remove a product; one that is gone already is no error, of a link what it leads to stays.
+    """Remove a product; a missing one is no error. The target of a link stays.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def remove_product(place: Place) -> None:
     files = open_files(place)
     if files.local is None:
         keys = files.everything()
-        files.remove(key for key in keys if key == _GROUP)  # without it the rest is no product
+        files.remove(key for key in keys if key == _GROUP)  # goes first: without it the rest is not a product
         files.remove(key for key in keys if key != _GROUP)
         return
     path = files.local
@@ -198,8 +198,8 @@ def remove_product(place: Place) -> None:
 
 
 def leftover_products(files: Files, older_than: float) -> list[Files]:
-    """Temporary folders of products that nothing has changed for some seconds."""
-    if files.local is None:  # there, one without its seal is damaged
+    """Return temporary folders of products that have not changed for some seconds."""
+    if files.local is None:  # no temporary folders there: a product without its seal is damaged
         return []
     limit = time.time() - older_than
     found = [p for p in sorted(files.local.glob(f".*.zarr.*{TEMPORARY}")) if p.lstat().st_mtime < limit]
@@ -207,7 +207,7 @@ def leftover_products(files: Files, older_than: float) -> list[Files]:
 
 
 def products_in(files: Files) -> list[Files]:
-    """Products in a folder, sound or not.
+    """Return the products in a folder, sound or not.
 
     Raises
     ------
@@ -227,7 +227,7 @@ def _own(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None:
-    """Rename a finished product; a damaged or another one at its place makes way."""
+    """Rename a finished product to its place; remove a damaged or different product there."""
     for _ in range(_MOST_TRIES):
         try:
             temporary.rename(path)
@@ -243,7 +243,7 @@ def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None
 
 
 def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -> dict[str, Any]:
-    """Write all variables, then the attributes with the seal; returns the attributes without it."""
+    """Write all variables, then the attributes with the seal; return the attributes without it."""
     group = zarr.create_group(store, zarr_format=3)
     for name in sorted(map(str, ds.variables)):
         values, attrs = _coded(name, ds.variables[name])
@@ -261,7 +261,7 @@ def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -
 
 
 def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
-    """Digest of a product's attributes and of its files but the one that holds them."""
+    """Return the digest of a product's attributes and of its other files."""
     digest = hashlib.sha256(json.dumps(_own(attrs), sort_keys=True).encode())
     for key, sha256 in sorted(digests, key=lambda entry: entry[0].split("/")):
         digest.update(f"\n{key} {sha256}".encode())
@@ -269,7 +269,7 @@ def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
 
 
 def _digests(files: Files) -> Digests:
-    """Digests of a product's files but the one that holds the attributes."""
+    """Return the digests of a product's files but ``zarr.json``."""
     return _digests_of(files.read_each(key for key in files.everything() if key != _GROUP))
 
 
@@ -282,7 +282,7 @@ def _sha256(content: bytes) -> str:
 
 
 def _product_chunks(values: np.ndarray) -> tuple[int, ...]:
-    """Whole arrays, or parts of some megabytes cut along the first dims."""
+    """Return the chunk shape: whole arrays, or parts of some megabytes cut along the first dims."""
     chunks = [max(n, 1) for n in values.shape]
     for i, n in enumerate(chunks):
         rest = values.itemsize * int(np.prod(chunks[i + 1 :]))
@@ -293,20 +293,20 @@ def _product_chunks(values: np.ndarray) -> tuple[int, ...]:
 
 
 def _coded(name: str, variable: xr.Variable) -> tuple[np.ndarray, dict[str, Any]]:
-    """Values and attributes as they are stored: words as codes."""
+    """Return values and attributes as they are stored, with labels as codes."""
     values = np.asarray(variable.values)
     attrs: dict[str, Any] = _plain(variable.attrs)
     if values.dtype.kind not in "UO":
         return values, attrs
     if not all(isinstance(word, str) for word in values.flat):
-        raise TypeError(f"{name}: objects other than words cannot be stored.")
+        raise TypeError(f"{name}: objects other than texts cannot be stored.")
     words = {word: code for code, word in enumerate(dict.fromkeys(values.ravel().tolist()))}
     codes = np.array([words[word] for word in values.flat], np.int32).reshape(values.shape)
     return codes, {**attrs, _WORDS: list(words)}
 
 
 def _with_words(ds: xr.Dataset) -> dict[str, Any]:
-    """Variables that were words, as words again."""
+    """Return the variables that hold codes, with their labels restored."""
     found = {}
     for name, variable in ds.variables.items():
         if _WORDS in variable.attrs:
@@ -317,7 +317,7 @@ def _with_words(ds: xr.Dataset) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Attributes as JSON has them."""
+    """Convert attributes to values that JSON can hold."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Where and when something was made, with what: no part of what a run is, nor of its digest."""
+"""Record where, when and with which versions something was made. None of it enters a run's digest."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PACKAGES = ("magpend", "numpy", "numba", "zarr", "numcodecs", "xarray")
 
 
 def provenance() -> dict[str, str]:
-    """Time, host and, if magpend runs from a git repository, its commit.
+    """Return time, host and, if magpend runs from a git repository, its commit.
 
     Returns
     -------
@@ -33,7 +33,7 @@ def provenance() -> dict[str, str]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, of magpend and of the packages that its numbers and files go through."""
+    """Return the versions of Python, of magpend and of the packages that affect numbers and files."""
     found = {"python": platform.python_version(), "machine": platform.machine()}
     for name in _PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
@@ -43,15 +43,15 @@ def versions() -> dict[str, str]:
 
 @lru_cache
 def git_commit() -> str:
-    """Commit of the repository that magpend's sources are part of; empty if there is none."""
-    # a package installed below somebody's repository is no part of it
+    """Return the commit of the repository that holds magpend's sources; empty if there is none."""
+    # a package installed below somebody's repository does not belong to it
     if _git("ls-files", "--error-unmatch", str(Path(__file__).relative_to(_ROOT))) is None:
         return ""
     return _git("describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+changes") or ""
 
 
 def _git(*arguments: str) -> str | None:
-    """Output of a git command at magpend's sources; None if it fails."""
+    """Return the output of a git command at magpend's sources; None if it fails."""
     try:
         done = subprocess.run(
             ["git", "-C", str(_ROOT), *arguments],

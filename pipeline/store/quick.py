@@ -1,8 +1,7 @@
-"""Reading very many small chunks: without a coroutine for every step of every chunk, as zarr has them.
+"""Read very many small chunks in threads: faster than zarr's coroutines for every step of every chunk.
 
-What is read and decoded here is what zarr would have read and decoded; all it cannot do goes to zarr. It
-builds on the class of pipeline that is registered, and on `read` as `zarr.abc.codec.CodecPipeline` describes
-it; a chunk that comes in another form goes to zarr too.
+The result equals that of zarr. A chunk in any other form is left to zarr. The class here derives from the
+registered pipeline class and overrides `read` of `zarr.abc.codec.CodecPipeline`.
 """
 
 from __future__ import annotations
@@ -30,15 +29,15 @@ _Registered: Any = get_pipeline_class()
 
 
 class QuickPipeline(_Registered):  # type: ignore[misc]
-    """zarr's own way to read, but for small chunks of a `CommittedStore` in a local folder."""
+    """A codec pipeline for zarr with a shortcut for small chunks of a `CommittedStore` in a local folder."""
 
     async def read(self, batch_info: Iterable[Any], out: Any, drop_axes: tuple[int, ...] = ()) -> None:
-        """Put chunks where they belong in `out`; see zarr."""
+        """Read and decode chunks into `out`; see `zarr.abc.codec.CodecPipeline.read`."""
         items = list(batch_info)
         if len(items) > 1 and not drop_axes and _codecs_of(self) == _CHAIN:
             target = out.as_ndarray_like()
             batches = [items[i : i + _BATCH] for i in range(0, len(items), _BATCH)]
-            # threads: a disk, or a server, is asked for many files at a time
+            # threads, so that a disk or a server is asked for many files at a time
             left = await asyncio.gather(*(asyncio.to_thread(_put_all, batch, target) for batch in batches))
             items = [item for batch in left for item in batch]
         if items:
@@ -46,12 +45,12 @@ class QuickPipeline(_Registered):  # type: ignore[misc]
 
 
 def _codecs_of(pipeline: Any) -> tuple[type, ...]:
-    """Types of a pipeline's codecs in their order; none if it does not list them."""
+    """Return the types of a pipeline's codecs in order; empty if it does not list them."""
     return tuple(type(codec) for codec in pipeline) if isinstance(pipeline, Iterable) else ()
 
 
 def _put_all(items: list[Any], target: np.ndarray) -> list[Any]:
-    """Decode chunks into an array; returns those that are left to zarr."""
+    """Decode chunks into an array; return those that are left to zarr."""
     return [item for item in items if not _put(item, target)]
 
 
@@ -62,7 +61,7 @@ def _put(item: Any, target: np.ndarray) -> bool:
     content = place.store.small_chunk(place.path)
     if content is None:
         return False
-    # the sha256 of the whole chunk, or its crc32c, has just been compared
+    # small_chunk has compared the chunk's sha256, or its crc32c
     data = numcodecs.blosc.decompress(content[:-_CHECKSUM_BYTES])
     dtype = spec.dtype.to_native_dtype().newbyteorder("<")
     target[selection] = np.frombuffer(data, dtype).reshape(spec.shape)[chunk_selection]
@@ -74,6 +73,6 @@ register_pipeline(QuickPipeline)
 
 @contextlib.contextmanager
 def quick_reading() -> Iterator[None]:
-    """Let arrays that are opened within read as `QuickPipeline` does."""
+    """Use `QuickPipeline` for arrays that are opened inside this context."""
     with zarr.config.set({"codec_pipeline.path": f"{QuickPipeline.__module__}.{QuickPipeline.__qualname__}"}):
         yield

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
-    """Open a run directory; nothing but coordinates is read until it is used.
+    """Open a run directory; only coordinates are read until variables are used.
 
-    Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. What is committed
-    later shows after opening again.
+    Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. Open the run again to see
+    cells that were committed later.
 
     Parameters
     ----------
@@ -32,23 +32,23 @@ def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None =
         As in `xarray.open_zarr`: None indexes lazily and loads what is selected; ``{}`` makes dask
         arrays in the chunks of the store, for cubes larger than the memory.
     check
-        Whether every chunk is compared with the sha256 in its commit record when it is read. By default it
-        is, unless the environment has ``MAGPEND_VERIFY=0``.
+        Whether every chunk is compared with the sha256 in its commit record when it is read. The default is
+        True, unless the environment has ``MAGPEND_VERIFY=0``.
 
     Returns
     -------
     xarray.Dataset
-        With the model's name, the specification's TOML text, the settings of the integration by name,
-        those of products as ``<product>_<name>`` (such as ``lyapunov_n_periods``), and what made it
-        (``source``, ``created``, ``host``, ``git_commit``) in the attributes. It can be written as NetCDF.
+        The cube. Its attributes hold the model's name, the specification's TOML text, the settings of the
+        integration by name, those of products as ``<product>_<name>`` (such as ``lyapunov_n_periods``), and
+        the provenance (``source``, ``created``, ``host``, ``git_commit``). It can be written as NetCDF.
 
     Raises
     ------
     RefusedError
         If there is no run in `path`.
     DamagedError
-        If ``run.json``, metadata or coordinates are not what was written; where a cell is used later, if
-        its chunk is missing or is not what was written.
+        If ``run.json``, metadata or coordinates have changed since they were written. When a cell is used
+        later: if its chunk is missing or has changed.
 
     Examples
     --------
@@ -59,7 +59,7 @@ def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None =
 
 
 def cube_of(run: Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
-    """The cube of an opened run, showing what its commits vouch for."""
+    """Return the cube of an opened run; cells without a commit record read as pending."""
     import xarray as xr
 
     view: Any = committed_view(run.info, run.plan, run.commits, check=check)
@@ -74,7 +74,7 @@ def cube_of(run: Run, *, chunks: Any = None, check: bool | None = None) -> xr.Da
 
 
 def _attributes(run: Run) -> dict[str, Any]:
-    """What an opened cube says of itself."""
+    """Return the attributes of an opened cube."""
     info = run.info
     attrs: dict[str, Any] = {
         "title": info.title,
@@ -96,7 +96,7 @@ def _attributes(run: Run) -> dict[str, Any]:
 
 
 def _texts(labels: xr.DataArray) -> Any:
-    """Words in a dtype of numpy that every writer takes."""
+    """Convert labels to a numpy dtype that every writer accepts."""
     return (labels.dims, np.array(labels.values.tolist(), dtype=str), labels.attrs)
 
 

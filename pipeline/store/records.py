@@ -1,12 +1,12 @@
-"""Commit records: one file a task, and packs of these once a block of tasks is whole.
+"""Read and write commit records: one file per task, then one pack per whole block of tasks.
 
-A record is one line of JSON under its own checksum. When all tasks of a block of `BLOCK` are committed, the
-holder of the lock puts their lines into one file, as they are, and removes the single ones: opening a run of
-100,000 tasks then reads a hundred files. A pack's last line counts its cells by status and seals the whole.
-Its bytes follow from the records, so that they do not depend on when it was written, or by whom.
+A record is one line of JSON with its own checksum. When all tasks of a block of `BLOCK` are committed, the
+holder of the lock puts their lines, unchanged, into one file, the pack, and removes the single files. Opening
+a run of 100,000 tasks then reads a hundred files. A pack's last line counts its cells by status and holds a
+checksum of the whole pack. Its bytes follow from the records alone, not from the time or the writer.
 
-A damaged pack loses the records on its damaged lines, and no others. Where a task of a block is withdrawn,
-its pack is written again without that line, and once more when the task has been computed again.
+A damaged pack loses only the records on its damaged lines. If a task of a block is withdrawn, its pack is
+written again without that line, and once more when the task has been computed again.
 """
 
 from __future__ import annotations
@@ -24,14 +24,24 @@ from pipeline.store.files import COMMITS, Files
 from pipeline.store.seal import fits, seal, unseal
 
 BLOCK = 1000
-"""Tasks whose records make a pack; part of the directory's format."""
+"""Tasks whose records make a pack; this number is part of the directory's format."""
 
 _OPEN_PACKS = 8
 
 
 @dataclass(frozen=True)
 class Commit:
-    """A valid record."""
+    """A valid commit record.
+
+    Attributes
+    ----------
+    task : int
+        Index of the task.
+    status : dict
+        Number of cells by status name.
+    objects : dict
+        Size and sha256 of the task's files, by key below ``cube.zarr``.
+    """
 
     task: int
     status: dict[str, int]
@@ -42,17 +52,17 @@ class Commit:
 
 
 def marker_key(index: int) -> str:
-    """Where a task's record lies, until it is packed."""
+    """Return the key of a task's record, where it lies until it is packed."""
     return f"{COMMITS}/{index:06d}.json"
 
 
 def pack_key(block: int) -> str:
-    """Where the records of a block lie."""
+    """Return the key of a block's pack."""
     return f"{COMMITS}/{block * BLOCK:06d}-{(block + 1) * BLOCK - 1:06d}.jsonl"
 
 
 def block_of_pack(name: str) -> int | None:
-    """The block that a file in ``commits`` is the pack of; None if it is no pack."""
+    """Return the block that a file in ``commits`` is the pack of; None if it is no pack."""
     first = name.partition("-")[0]
     if not (first.isascii() and first.isdigit() and int(first) % BLOCK == 0):
         return None
@@ -64,12 +74,12 @@ def block_of_pack(name: str) -> int | None:
 
 
 def record_text(record: Mapping[str, Any]) -> str:
-    """A commit record as it is stored: one line, the same for equal records, under its own checksum."""
+    """Return a commit record as it is stored: one line with its checksum; equal records give equal lines."""
     return seal(json.dumps(record, sort_keys=True, allow_nan=False, ensure_ascii=False))
 
 
 def read_record(content: bytes, digest: str) -> Commit | str:
-    """Return a record if it is whole and of this run; else what is wrong with it."""
+    """Return a record if it is whole and belongs to this run; otherwise return the problem."""
     try:
         data = unseal(content)
         commit = Commit(int(data["task"]), dict(data["status"]), dict(data["objects"]))
@@ -78,28 +88,29 @@ def read_record(content: bytes, digest: str) -> Commit | str:
         return "torn or damaged"
     if found != digest:
         return "of another run"
-    # nobody who opens a stranger's run is led out of it
+    # a key must not lead out of the run directory, which may come from a stranger
     climbs = any(".." in key.split("/") or key.startswith("/") for key in commit.objects)
     return "torn or damaged" if climbs else commit
 
 
 def line_of(commit: Commit, digest: str) -> bytes:
-    """A record's line, as `write_task` has written it."""
+    """Return a record's line, byte for byte as `write_task` wrote it."""
     record = {"digest": digest, "task": commit.task, "status": commit.status, "objects": commit.objects}
     return record_text(record).encode()
 
 
 @dataclass(frozen=True)
 class Pack:
-    """What the last line of a pack says.
+    """The last line of a pack: a summary of its records.
 
     Attributes
     ----------
     block : int
+        Index of the block.
     cells : dict
-        Committed cells by status name.
+        Number of committed cells by status name.
     without : tuple of int
-        Tasks of the block that it has no record of: they were withdrawn.
+        Tasks of the block without a record: they were withdrawn.
     """
 
     block: int
@@ -108,13 +119,13 @@ class Pack:
 
     @property
     def tasks(self) -> list[int]:
-        """Tasks that it has records of, in the order of its lines."""
+        """Tasks with a record in the pack, in the order of its lines."""
         absent = set(self.without)
         return [i for i in range(self.block * BLOCK, (self.block + 1) * BLOCK) if i not in absent]
 
 
 def pack_text(commits: Mapping[int, Commit], digest: str, block: int) -> bytes:
-    """The pack of a block's records: their lines, in the order of their tasks, and what they add up to."""
+    """Return the pack of a block's records: their lines in the order of tasks, then the summary."""
     cells: Counter[str] = Counter()
     lines = []
     without = []
@@ -130,7 +141,7 @@ def pack_text(commits: Mapping[int, Commit], digest: str, block: int) -> bytes:
 
 
 def read_pack(content: bytes, digest: str, block: int) -> Pack | str:
-    """Return what a pack says if it is whole, of this run and of this block; else what is wrong with it."""
+    """Return a pack's summary if it is whole and of this run and block; otherwise return the problem."""
     if not fits(content):
         return "torn or damaged"
     try:
@@ -145,7 +156,7 @@ def read_pack(content: bytes, digest: str, block: int) -> Pack | str:
 
 
 def salvage(content: bytes, digest: str, block: int) -> dict[int, Commit]:
-    """Records of a damaged pack that are whole themselves."""
+    """Return the records of a damaged pack that are whole, by task."""
     found = {}
     for line in content.split(b"\n"):
         commit = read_record(line + b"\n", digest)
@@ -158,18 +169,18 @@ def salvage(content: bytes, digest: str, block: int) -> dict[int, Commit]:
 
 
 class Records(Mapping[int, Commit]):
-    """Valid records by task; those in packs are read when they are asked for.
+    """The valid records of a run by task; packed records are read when they are used.
 
     Parameters
     ----------
     files
-        Of the run.
+        Files of the run directory.
     digest
-        Of the run.
+        Digest of the run.
     singles
-        Records by task that lie in files of their own, or have been saved from a damaged pack.
+        Records by task that have their own files, or were salvaged from a damaged pack.
     packs
-        Those that have been found whole, by block.
+        Whole packs by block.
     """
 
     def __init__(
@@ -188,7 +199,7 @@ class Records(Mapping[int, Commit]):
         self._lock = threading.Lock()
 
     def is_packed(self, index: int) -> bool:
-        """Whether a task's record lies in a pack."""
+        """Return whether a task's record lies in a pack."""
         block = index // BLOCK
         return block in self.packs and index not in self._without[block]
 
@@ -215,7 +226,7 @@ class Records(Mapping[int, Commit]):
         return line
 
     def _block(self, block: int) -> dict[int, bytes | Commit]:
-        """Lines of a pack by task, each replaced by its record once that was asked for."""
+        """Return the lines of a pack by task; a line is replaced by its record after its first use."""
         with self._lock:
             if block not in self._open:
                 self._open[block] = self._read(block)
@@ -238,7 +249,7 @@ class Records(Mapping[int, Commit]):
         return {index: line + b"\n" for index, line in zip(pack.tasks, lines, strict=False)}
 
     def cells(self) -> dict[str, int]:
-        """Committed cells by status."""
+        """Return the number of committed cells by status."""
         found: Counter[str] = Counter()
         for pack in self.packs.values():
             found.update(pack.cells)
@@ -247,7 +258,7 @@ class Records(Mapping[int, Commit]):
         return dict(found)
 
     def lines(self) -> Iterator[bytes]:
-        """All records as they are written, in the order of their tasks."""
+        """Yield all records as they are written, in the order of tasks."""
         for index in self:
             if index in self.singles:
                 yield line_of(self.singles[index], self._digest)

@@ -1,4 +1,4 @@
-"""What stands in a run directory, opened once: specification, plan, commits and cube."""
+"""Open a run directory once: specification, plan, commits and cube."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _NEXT = (
     '  magpend.figure(run, "bifurcation")         a figure; also "basins", "section", "attractors", ...',
     "  magpend.table(magpend.attractors(run))     what attracts, and what has been shown of it",
 )
-"""Lines that say how one goes on from a run in Python."""
+"""Lines that say how to go on from a run in Python."""
 
 MOST_SHOWN = 70
-"""Most characters of a list of names in a line."""
+"""Most characters of a list of names in one line."""
 
 
 def _short(text: str) -> str:
@@ -42,14 +42,16 @@ def _short(text: str) -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """A run directory with what was committed at one moment, so that all results speak of the same cells.
+    """A run directory with its commits at one moment, so that all results refer to the same cells.
 
     Attributes
     ----------
     info : RunInfo
-        What ``run.json`` holds.
+        Content of ``run.json``.
     spec : Spec
+        Specification of the run.
     plan : Plan
+        Plan that follows from `spec`.
     commits : Records
         Valid commit records by task.
     """
@@ -61,7 +63,7 @@ class Run:
 
     @classmethod
     def open(cls, source: str | Path | Files | Run) -> Run:
-        """Return what stands in a run directory now; an opened run is returned as it is.
+        """Open a run directory with its present commits; an opened run is returned unchanged.
 
         Metadata and coordinates are compared with the digests in ``run.json``; no cell is read.
 
@@ -70,9 +72,9 @@ class Run:
         RefusedError
             If there is no run in `source`.
         DamagedError
-            If ``run.json``, metadata or coordinates are not what was written.
+            If ``run.json``, metadata or coordinates have changed since they were written.
         UnreadableError
-            If something is there and cannot be read.
+            If a file exists and cannot be read.
 
         Examples
         --------
@@ -106,7 +108,7 @@ class Run:
 
     @property
     def _facts(self) -> dict[str, str]:
-        """What a person wants to know of it first, by name."""
+        """Facts about the run that its `repr` shows, by name."""
         states, plan = ", ".join(self.model.state_names), self.plan
         shape = " x ".join(f"{dim} ({n})" for dim, n in zip(plan.dims, plan.shape, strict=True))
         here = sum(plan.cells_in(i) for i in self.commits)
@@ -119,22 +121,22 @@ class Run:
 
     @property
     def directory(self) -> Path:
-        """Where it is, if that is a folder of this machine."""
+        """The run directory; a `RefusedError` if it is not a folder of this machine."""
         return self.info.directory
 
     @property
     def name(self) -> str:
-        """What people call the directory."""
+        """Path or URL of the run directory."""
         return self.info.name
 
     @property
     def model(self) -> Model:
-        """What was integrated."""
+        """Model that was integrated."""
         return self.spec.model
 
     @property
     def parameters(self) -> Parameters:
-        """The model's parameters, but for those that are swept."""
+        """The model's parameters, without those that are swept."""
         return self.spec.values
 
     @property

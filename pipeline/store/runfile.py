@@ -1,4 +1,4 @@
-"""``run.json``: what is run, under which digest, and which files the set-up wrote."""
+"""Read and write ``run.json``: the specification, its digest, and the files that the set-up wrote."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ from pipeline.store.seal import CHECKSUM, fits, has_seal, seal
 
 @dataclass(frozen=True)
 class RunInfo:
-    """What ``run.json`` holds.
+    """The content of ``run.json``.
 
     Attributes
     ----------
     files : Files
-        Of the run directory.
+        Files of the run directory.
     digest : str
-        Of `identity`.
+        Digest of `identity`.
     identity : dict
-        What decides the numbers and the layout.
+        Everything that decides the numbers and the layout.
     title : str
+        Title from the specification.
     spec : dict
-        Plain data for `parse_spec`.
+        Specification as plain data for `parse_spec`.
     spec_text : str
-        The TOML file as it was.
+        Text of the TOML file.
     versions : dict
-        Of the packages that made it.
+        Versions of the packages that made the run.
     provenance : dict
         See `pipeline.store.provenance`.
     skeleton : dict
@@ -55,31 +56,31 @@ class RunInfo:
 
     @property
     def name(self) -> str:
-        """What people call the directory."""
+        """Path or URL of the run directory."""
         return self.files.name
 
     @property
     def directory(self) -> Path:
-        """The run directory, where it is a folder of this machine."""
+        """The run directory; a `RefusedError` if it is not a folder of this machine."""
         if self.files.local is None:
             raise RefusedError(f"{self.name}: is no folder of this machine, which this needs.")
         return self.files.local
 
 
 def is_run(files: Files) -> bool:
-    """Whether a run has been set up there."""
+    """Return whether a run has been set up at a place."""
     return files.is_there(RUN_FILE)
 
 
 def read_run(place: str | Path | Files) -> RunInfo:
-    """Read ``run.json``.
+    """Read and check ``run.json``.
 
     Raises
     ------
     RefusedError
-        If there is none, or one of another format.
+        If it does not exist, or has another format.
     DamagedError
-        If it is not what was written.
+        If its content has changed since it was written.
     """
     files = open_files(place)
     directory, path = files.name, files.below(RUN_FILE).name
@@ -102,7 +103,7 @@ def read_run(place: str | Path | Files) -> RunInfo:
 
 
 def _refuse_format(path: str, data: Mapping[str, Any], content: bytes) -> None:
-    """Refuse another format, unless the number is what is damaged: the file then contradicts its checksum."""
+    """Refuse another format, unless the checksum shows that the format number itself is damaged."""
     found = data["identity"]["format"]
     if isinstance(found, (int, float)) and found != FORMAT and (fits(content) or not has_seal(content)):
         raise RefusedError(
@@ -126,7 +127,7 @@ def write_run(
     spec_text: str,
     skeleton: Mapping[str, Mapping[str, Any]],
 ) -> RunInfo:
-    """Write ``run.json`` and return what it holds."""
+    """Write ``run.json`` and return its content."""
     content = {
         "digest": digest_of(identity),
         "identity": identity,
@@ -137,7 +138,7 @@ def write_run(
         "provenance": provenance(),
         "skeleton": skeleton,
     }
-    # not sorted: the order of the axes is that of the cube's dims
+    # keys are not sorted: the axes stand in the order of the cube's dims
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     files.write(RUN_FILE, seal(text).encode())
     return read_run(files)

@@ -1,7 +1,7 @@
-"""Texts under a checksum of their own: ``run.json``, commit records and packs of these.
+"""Seal texts by a checksum at their end: ``run.json``, commit records and packs.
 
-A sealed text is a JSON object (or lines that end in one) whose last member is the sha256 of every byte
-before it, so that no bit of it can change without being noticed.
+A sealed text is a JSON object, or lines that end in one. Its last member is the sha256 of every byte before
+it, so that any changed bit is noticed.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ _END = '"}\n'
 
 
 class SealError(ValueError):
-    """A text is not what was sealed; the message says how it can be seen."""
+    """An error for a text that differs from what was sealed; the message says how this shows."""
 
 
 def seal(text: str, before: bytes = b"") -> str:
-    """Append the checksum to a JSON object that is not empty; `before` is what precedes it in its file."""
+    """Append the checksum to a JSON object that is not empty; `before` precedes it in its file."""
     body = text.rstrip()
     if not body.endswith("}"):
         raise ValueError("only a JSON object can be sealed.")
@@ -29,12 +29,12 @@ def seal(text: str, before: bytes = b"") -> str:
 
 
 def has_seal(content: bytes) -> bool:
-    """Whether a content names a checksum at its end, fitting or not."""
+    """Return whether a content ends with a checksum, fitting or not."""
     return _MARK.encode() in content[-200:]
 
 
 def fits(content: bytes) -> bool:
-    """Whether a content is, byte for byte, what was sealed."""
+    """Return whether a content is, byte for byte, as it was sealed."""
     n = 64 + len(_END)
     body, end = content[:-n], content[-n:]
     return body.endswith(_MARK.encode()) and end == hashlib.sha256(body).hexdigest().encode() + _END.encode()
@@ -46,7 +46,7 @@ def unseal(content: bytes) -> dict[str, Any]:
     Raises
     ------
     SealError
-        If the content is not what was sealed.
+        If the checksum is missing or does not fit the content.
     """
     if not fits(content):
         raise SealError("its checksum does not fit" if has_seal(content) else "it ends without its checksum")

@@ -1,4 +1,4 @@
-"""Set a run directory up, or set a damaged one right: what the specification says is written again."""
+"""Set up a run directory, or rebuild the damaged files of its set-up from the specification."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ Echo = Callable[[str], None]
 
 
 def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | None:
-    """Say whether this run can be done in this directory; changes nothing.
+    """Check whether a run can be done in a directory; nothing is changed.
 
     Returns
     -------
     RunInfo or None
-        What is there already; None if the run can be set up, or its ``run.json`` has to be made again.
+        The run that is there already; None if it can be set up, or its ``run.json`` must be rebuilt.
 
     Raises
     ------
     RefusedError
-        If another run is there (with the difference), or something else.
+        If the directory holds another run (the message lists the differences) or other files.
     """
     files = open_files(place)
     if files.local is not None:
@@ -88,7 +88,7 @@ def _refuse_place(folder: Path) -> None:
 
 
 def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
-    """Refuse a directory without a sound ``run.json`` unless it is empty or provably this run's."""
+    """Refuse a directory without a sound ``run.json`` unless it is empty or provably holds this run."""
     foreign = [name for name in names if not _is_own(name)]
     if foreign:
         raise RefusedError(
@@ -113,7 +113,7 @@ def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
 
 
 def _refuse_notes(files: Files) -> None:
-    """Refuse a lock's note or timings that no run has left: they would be replaced, or added to."""
+    """Refuse a lock's note or timings that no run wrote: the run would overwrite or extend them."""
     for name, is_own in ((HOLDER, is_note), (TIMINGS, _is_timings)):
         for _, content in files.read_each([name]):
             if isinstance(content, bytes) and not is_own(content):
@@ -121,7 +121,7 @@ def _refuse_notes(files: Files) -> None:
 
 
 def _is_timings(content: bytes) -> bool:
-    """Whether a file begins as ``timings.jsonl`` does, or is empty."""
+    """Return whether a file is empty or begins as ``timings.jsonl`` does."""
     try:
         first = json.loads(content.split(b"\n")[0] or b'{"task": 0}')
     except (ValueError, RecursionError):
@@ -141,7 +141,7 @@ def _names(files: Files) -> list[str]:
 
 
 def _holds_something(files: Files, name: str) -> bool:
-    """Whether something is there but empty folders, or what a set-up was writing when it was stopped."""
+    """Return whether a place holds more than empty folders and temporary files of a set-up."""
     if name not in _names(files):
         return False
     try:
@@ -152,11 +152,11 @@ def _holds_something(files: Files, name: str) -> bool:
 
 
 def _digests(files: Files) -> set[str]:
-    """Digests of runs that the group's metadata and the commit records name."""
+    """Return the digests of runs that the group's metadata and the commit records name."""
     records = [
         f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith((".json", ".jsonl"))
     ]
-    # of a pack, its first record
+    # a pack names the digest in its first record
     found = {_text_in(content, "digest") for _, content in files.read_each(records)}
     for _, content in files.read_each([f"{CUBE}/{GROUP_KEY}"]):
         found.add(_text_in(content, "attributes", "digest"))
@@ -164,7 +164,7 @@ def _digests(files: Files) -> set[str]:
 
 
 def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
-    """A text in a JSON file; None if it is not there or not whole."""
+    """Return a text in a JSON file; None if the file or the text is missing or damaged."""
     if isinstance(content, FileNotFoundError):
         return None
     try:
@@ -179,9 +179,9 @@ def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
 def create(
     place: str | Path | Files, spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str
 ) -> RunInfo:
-    """Make a run directory; ``run.json`` comes last, so that without it nothing has begun.
+    """Make a run directory. ``run.json`` is written last: without it, no run has begun.
 
-    Call `check` first: files of the same names are replaced.
+    Call `check` first: files with the same names are replaced.
     """
     files = open_files(place)
     contents = skeleton_files(spec, plan, identity, spec_text, spec.title)
@@ -200,22 +200,24 @@ def establish(
     *,
     alone: bool = True,
 ) -> RunInfo:
-    """Make a run directory, or find one and rebuild what is damaged of its set-up. For the lock's holder.
+    """Make a run directory, or open it and rebuild its damaged set-up.
 
-    Where ``run.json`` or a file of the skeleton had to be made again, the committed tasks are compared with
-    their records, and those that do not fit are withdrawn.
+    Only the holder of the lock may call this.
+
+    If ``run.json`` or a file of the skeleton had to be rebuilt, the committed tasks are compared with their
+    records, and tasks that do not fit are withdrawn.
 
     Raises
     ------
     RefusedError
-        As `check`.
+        See `check`.
     """
     files = open_files(place)
     for key in odd_keys(files, skeleton_keys(spec, plan)):
         echo(f"{key}: {ODD}; moved to {files.move_aside(key)}")
     info = check(files, identity)
     names = _names(files)
-    if alone:  # else somebody may be writing it just now
+    if alone:  # else another process may be writing these files now
         left = (f".{RUN_FILE}.", f".{HOLDER}.")
         files.remove([name for name in names if name.startswith(left)])
     if COMMITS not in names:
@@ -234,7 +236,7 @@ def establish(
         for problem in problems:
             echo(f"{CUBE}/{problem}: rebuilt from the specification")
         if rest:
-            # another version of zarr words the metadata otherwise: its files, and their digests
+            # another version of zarr writes other metadata: write all files and digests again
             info = create(files, spec, plan, identity, info.spec_text)
     damaged = verify(info, plan).damaged
     withdraw(info, damaged)
@@ -244,10 +246,10 @@ def establish(
 
 
 def rebuild_skeleton(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
-    """Write damaged files of the skeleton again; returns the problems that stay.
+    """Rebuild damaged files of the skeleton; return the problems that remain.
 
-    A file is written only if it has the digest that ``run.json`` names; another version of zarr, or of
-    magpend, may word it otherwise.
+    A file is written only if its digest is the one in ``run.json``. Another version of zarr or of magpend may
+    write other bytes.
     """
     problems = skeleton_problems(info)
     if not problems:

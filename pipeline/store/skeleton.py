@@ -1,7 +1,7 @@
-"""The files that a run's set-up writes: metadata of all variables, and the coordinates.
+"""Make the files of a run's set-up: the metadata of all variables, and the coordinates.
 
-They follow from the specification, the plan, the identity and the text alone, byte for byte, so that a
-damaged one can be made again.
+Their bytes follow from the specification, the plan, the identity and the text alone, so that a damaged file
+can be rebuilt.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ GROUP_KEY = "zarr.json"
 def skeleton_files(
     spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str
 ) -> dict[str, bytes]:
-    """Content by key of all files of an empty cube; the group's own metadata come first."""
+    """Return the contents of all files of an empty cube by key; the group's metadata come first."""
     attrs = {
         "kind": plan.kind,
         "model": model_attribute(spec.model),
@@ -62,13 +62,13 @@ def skeleton_files(
 
 
 def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
-    """Keys of the metadata of all variables and coordinates."""
+    """Return the keys of the metadata of all variables and coordinates."""
     names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(spec), *_labels(spec))]
     return [f"{name}/{GROUP_KEY}" for name in names]
 
 
 def _labels(spec: Spec) -> list[Coordinate]:
-    """Names along the dims that are not cell dims."""
+    """Return the coordinates along the dims that are not cell dims."""
     model = spec.model
     found = [
         Coordinate("state", ("state",), _values(model.state_names), {"long_name": "component of the state"}),
@@ -86,13 +86,13 @@ def _labels(spec: Spec) -> list[Coordinate]:
 
 
 def _values(labels: Iterable[Any]) -> np.ndarray:
-    """Words, or whole numbers."""
+    """Return labels as an array of texts or of whole numbers."""
     values = list(labels)
     return np.array(values, dtype=object if isinstance(values[0], str) else np.int32)
 
 
 def entries_of(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
-    """Size and sha256 by key, for ``run.json``."""
+    """Return size and sha256 by key, for ``run.json``."""
     return {key: entry_of(content) for key, content in files.items()}
 
 
@@ -106,19 +106,19 @@ def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[s
 
 
 def skeleton_problems(info: RunInfo) -> list[str]:
-    """A line per file of the set-up that is not what was written."""
+    """Return a line per file of the set-up that is missing or has changed."""
     folders = {key.partition("/")[0] for key in info.skeleton if "/" in key}
     info.files.refuse_links(CUBE, *(f"{CUBE}/{folder}" for folder in folders))
     return problems_of(info.files.below(CUBE), info.skeleton)
 
 
 def check_skeleton(info: RunInfo) -> None:
-    """Compare metadata and coordinates with the digests in ``run.json``; reads no cell.
+    """Compare metadata and coordinates with the digests in ``run.json``; no cell is read.
 
     Raises
     ------
     DamagedError
-        Naming the files and the remedy.
+        If a file is missing or has changed; the message names the files and the remedy.
     """
     problems = skeleton_problems(info)
     if problems:

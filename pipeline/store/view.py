@@ -1,8 +1,8 @@
-"""The cube as readers see it: a chunk without a valid commit record does not exist, and a changed one stops.
+"""Show readers the committed cells of the cube: other cells read as pending, changed chunks raise an error.
 
-Every chunk is compared with the sha256 in its commit record when it is read, metadata and coordinates with
-``run.json``. ``MAGPEND_VERIFY=0`` in the environment leaves that out: then the chunk's own crc32c notices
-what has changed within it, and nothing notices a whole chunk in another's place.
+Every chunk is compared with the sha256 in its commit record when it is read; metadata and coordinates are
+compared with ``run.json``. ``MAGPEND_VERIFY=0`` in the environment turns this off. The chunk's own crc32c
+then still reveals changed bytes, but not a whole chunk in the place of another.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ VERIFY = "MAGPEND_VERIFY"
 """Environment variable; ``0`` reads chunks without comparing them with their records."""
 
 SMALL = 200_000
-"""Chunks of so many bytes are read by `pipeline.store.quick`; larger ones by zarr, one by one."""
+"""Largest size in bytes of a chunk that `pipeline.store.quick` reads; zarr reads larger ones."""
 
 
 def checks_chunks() -> bool:
-    """Whether what is read is compared with its record."""
+    """Return whether chunks are compared with their records when they are read."""
     return os.environ.get(VERIFY, "1").strip().lower() not in ("0", "no", "false", "off")
 
 
 class Shown:
-    """Size and sha256 of what a reader sees, by key: the set-up's files, and what commits vouch for."""
+    """The files that a reader sees, with size and sha256: the set-up's files and committed chunks."""
 
     def __init__(self, info: RunInfo, plan: Plan, commits: Mapping[int, Commit]) -> None:
         self._skeleton = info.skeleton
@@ -48,11 +48,11 @@ class Shown:
         self._commits = commits
 
     def arrays(self) -> list[str]:
-        """Names of what lies in the cube."""
+        """Return the names of the arrays in the cube."""
         return sorted({key.partition("/")[0] for key in self._skeleton})
 
     def entry(self, key: str) -> Mapping[str, Any] | None:
-        """Size and sha256 of a file; None if readers do not see it."""
+        """Return size and sha256 of a file; None if readers do not see it."""
         if key in self._skeleton:
             return self._skeleton[key]
         task = self._owners.task(key)
@@ -64,17 +64,17 @@ class Shown:
 class CommittedStore(WrapperStore[Store]):
     """A read-only view of the cube in which a chunk without a valid record does not exist.
 
-    zarr then reads it as the fill value: pending. A chunk that has a record and is absent or not what was
-    written raises `DamagedError`.
+    zarr then reads the fill value, which means pending. A chunk that has a record but is missing or has
+    changed raises `DamagedError`.
 
     Parameters
     ----------
     store
-        Where the cube lies.
+        Store of the cube.
     files
-        Of the run.
+        Files of the run directory.
     shown
-        What is seen of it.
+        Files that readers see.
     checks
         Whether contents are compared with their records.
     """
@@ -91,18 +91,18 @@ class CommittedStore(WrapperStore[Store]):
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """As in zarr, without what is not committed.
+        """Return the content of a key, as zarr asks for; None if it is not committed.
 
         Raises
         ------
         DamagedError
-            If what is there is not what was written.
+            If the content has changed since it was written.
         """
         entry = self._shown.entry(key)
         if entry is None:
             return None
         if self._files.local is not None:
-            # read and compared in one go, away from the loop that asks for others meanwhile
+            # a thread reads and compares, while the event loop asks for other chunks
             content: Any = await asyncio.to_thread(self._read, key, entry)
         else:
             found = await self._store.get(key, prototype)
@@ -114,12 +114,12 @@ class CommittedStore(WrapperStore[Store]):
     def small_chunk(self, key: str) -> bytes | None:
         """Content of a small chunk in a local folder; None for anything else.
 
-        It is compared with its record, or else with the checksum at its own end.
+        It is compared with its record or, if that is turned off, with the crc32c at its end.
 
         Raises
         ------
         DamagedError
-            If what is there is not what was written.
+            If the content has changed since it was written.
         """
         entry = self._shown.entry(key) if self._files.local is not None else None
         if entry is None or entry["size"] > SMALL:
@@ -130,7 +130,7 @@ class CommittedStore(WrapperStore[Store]):
         return content
 
     def _read(self, key: str, entry: Mapping[str, Any]) -> bytes:
-        """Content of a local file, compared with its record unless that is left out."""
+        """Read a local file and compare it with its record, unless that is turned off."""
         try:
             content: bytes | None = self._files.read(f"{CUBE}/{key}")
         except FileNotFoundError:
@@ -156,11 +156,11 @@ class CommittedStore(WrapperStore[Store]):
         )
 
     async def exists(self, key: str) -> bool:
-        """As in zarr, without what is not committed."""
+        """Return whether a key is in the set-up or committed."""
         return self._shown.entry(key) is not None
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """As in zarr; of the cube itself, what the set-up has put there."""
+        """Yield the names in a folder; for the cube itself, the arrays of the set-up."""
         if prefix.strip("/"):
             async for name in self._store.list_dir(prefix):
                 yield name
@@ -171,7 +171,7 @@ class CommittedStore(WrapperStore[Store]):
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
-        """As in zarr, without what is not committed."""
+        """Return parts of the contents of keys, as zarr asks for."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     async def _get_many(
@@ -196,14 +196,14 @@ def _slice(byte_range: ByteRequest, size: int) -> slice:
 def committed_view(
     info: RunInfo, plan: Plan, commits: Mapping[int, Commit], *, check: bool | None = None
 ) -> CommittedStore:
-    """Return the store to read from; it shows the skeleton and what `commits` vouch for.
+    """Return the store to read from; it shows the skeleton and the committed chunks.
 
     Parameters
     ----------
     info, plan, commits
-        The run, and its valid records.
+        The run, its plan and its valid records.
     check
-        Whether to compare what is read with its record; by default as the environment says.
+        Whether to compare chunks with their records. The default follows `checks_chunks`.
     """
     store = info.files.below(CUBE).zarr(read_only=True)
     shown = Shown(info, plan, commits)

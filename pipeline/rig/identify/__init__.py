@@ -1,1 +1,1 @@
-"""Identification: parameters of a model from recordings."""
+"""Identify parameters of a model from recordings."""

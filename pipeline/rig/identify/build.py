@@ -1,4 +1,4 @@
-"""From a specification and its recordings to the problem that is fitted."""
+"""Build the fitting problem from a specification and its recordings."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from pipeline.rig.recordings import findings_of, load_mapping, read_recording, s
 from pipeline.spec.problems import SpecError
 
 FEWEST_SAMPLES = 12
-"""Of a piece: below it a free start takes most of what there is to know."""
+"""Fewest samples of a piece; a free start takes most of the information in a shorter one."""
 
 DRIVE = "drive"
 DUTY = "duty_cycle"
 MOST_ROUNDING = 0.45
-"""Scatter of edges, in samples, that rounding to samples makes: evenly spread over one, 0.29."""
+"""Largest scatter of edges, in samples, that is taken for rounding. A uniform error has 0.29."""
 
 LEAST_NOISE = 1e-6
-"""Noise is taken as at least this share of a channel's spread: simulated recordings may have none."""
+"""Least noise of a channel as a fraction of its spread. Simulated recordings may have no noise."""
 
 
 @dataclass(frozen=True)
 class Built:
-    """What is fitted, and what is held out.
+    """The pieces that are fitted, and the pieces that are held out.
 
     Attributes
     ----------
     problem : Problem
     held_out : tuple of Piece
-        Judged afterwards, their starts alone refitted.
+        Pieces that are judged afterwards; only their starts are fitted.
     simulated : bool
         Whether any of the recordings is simulated.
     findings : tuple of tuple of str
-        What was found in each recording, a sentence each, notes left out.
+        Sentences about each recording's findings, without notes.
     """
 
     problem: Problem
@@ -54,7 +54,7 @@ class Built:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Samples of a recording that make a piece."""
+    """The samples of a recording that make a piece."""
 
     recording: int
     number: int
@@ -68,7 +68,7 @@ def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
     Raises
     ------
     SpecError
-        With the problems of all of them.
+        If one cannot be read; the message lists the problems of all.
     """
     found, problems = [], []
     for i, table in enumerate(spec.recordings):
@@ -83,13 +83,13 @@ def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
 
 
 def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
-    """Return the problem that a specification and its recordings pose.
+    """Return the fitting problem of a specification and its recordings.
 
     Raises
     ------
     SpecError
-        With all problems at once, before anything is integrated: a channel or drive that is not there, pieces
-        that are too short, numbers of held-out pieces that do not exist, nothing left to fit.
+        With all problems at once, before anything is integrated: a missing channel or drive, pieces that are
+        too short, held-out pieces that do not exist, nothing left to fit.
     """
     problems: list[str] = []
     channels = channels_of(spec.model, spec.fit.channels, recordings, problems)
@@ -130,9 +130,9 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
 def channels_of(
     model: Model, wanted: Sequence[str], recordings: Sequence[xr.Dataset], problems: list[str]
 ) -> tuple[str, ...]:
-    """Return the channels that are compared: those asked for, else what all recordings measure.
+    """Return the channels that are compared: the given ones, by default those that all recordings measure.
 
-    By default rates are left out where the states that they are of are measured: they hold nothing new.
+    By default a rate is left out if its state is measured, since it adds no information.
     """
     rates = {s.rate for s in model.states if s.rate}
     measured = [[n for n in model.state_names if n in ds.data_vars] for ds in recordings]
@@ -158,7 +158,7 @@ def channels_of(
 def drive_problems(
     model: Model, tables: Sequence[RecordingTable], recordings: Sequence[xr.Dataset], where: str
 ) -> list[str]:
-    """Say what is wrong with the drives of recordings: not there, of another kind, or not of one kind."""
+    """Return problems with the drives of recordings: missing, of the wrong kind, or of mixed kinds."""
     problems = []
     for i, (table, ds) in enumerate(zip(tables, recordings, strict=True)):
         path = f"{where}[{i}].drive = {table.drive!r}"
@@ -218,10 +218,10 @@ def free_of(spec: IdentificationSpec, channels: Sequence[str], n_recordings: int
 def noise_of(
     model: Model, channels: Sequence[str], smoothed: Sequence[xr.Dataset], stated: Mapping[str, float]
 ) -> np.ndarray:
-    """Return the noise that channels are weighted with [SI].
+    """Return the standard deviation that each channel is weighted with [SI].
 
-    It is that of the specification, else of the recordings, the same for all channels of one unit: what the
-    model lacks outweighs the sensors' noise in most rigs, and does not go by it.
+    The specification may state it. Otherwise the recordings give it, one value for all channels of a unit: in
+    most rigs the model's error exceeds the sensors' noise and is not proportional to it.
     """
     noise = {}
     for name in channels:
@@ -246,22 +246,22 @@ def pieces_of(
     Parameters
     ----------
     model
-        Whose states they have.
+        Model that has the states.
     channels
-        That are compared.
+        Channels that are compared.
     both
-        The recording as measured, and smoothed: the first guess of a start is read off the latter.
+        The recording as measured, and smoothed. The smoothed one gives the first guess of a start.
     table
-        How it is cut, and what its drive is.
+        The recording's table in the specification: length of pieces, kind of drive.
     recording
-        Its number.
+        Index of the recording.
     decimate
-        Take every so many samples.
+        Step between the samples that are used.
 
     Raises
     ------
     SpecError
-        Naming the pieces that are too short, or that the drive does not cover.
+        If pieces are too short or the drive does not cover them; the message names them.
     """
     ds, smoothed = both
     drive = _drive_of(table, ds)
@@ -293,7 +293,7 @@ def pieces_of(
 
 
 def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Stretch]:
-    """Return the stretches of a recording: its pieces, each cut into equal parts of about a length.
+    """Return the stretches of a recording: its pieces, each cut into equal parts of about a given length.
 
     Parameters
     ----------
@@ -302,7 +302,7 @@ def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Str
     piece_s
         Length [s]; by default pieces stay whole.
     recording
-        Its number.
+        Index of the recording.
     """
     found: list[Stretch] = []
     piece, time = ds["piece"].values, ds["time"].values
@@ -322,7 +322,7 @@ def _runs(piece: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _usable(ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _Driven | None) -> slice:
-    """Samples of a stretch from where everything is measured, and as far as the drive is known."""
+    """Return the samples of a stretch from the first with all channels, as far as the drive is known."""
     begin, end = stretch.samples.start, stretch.samples.stop
     time = ds["time"].values[begin:end]
     good = np.all([np.isfinite(ds[name].values[begin:end]) for name in channels], axis=0)
@@ -334,7 +334,7 @@ def _usable(ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _D
 
 
 def _start(model: Model, own: xr.Dataset) -> np.ndarray:
-    """First guess of the state at the first sample: measured or smoothed, 0 for what is neither."""
+    """Return a first guess of the state at the first sample; 0 for states without a smoothed value."""
     found = []
     for state in model.states:
         value = float(own[state.name].values[0]) if state.name in own else 0.0
@@ -344,22 +344,22 @@ def _start(model: Model, own: xr.Dataset) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Driven:
-    """A recording's drive, and the times of the recording that it covers [s]."""
+    """A recording's drive, and the times that it covers [s]."""
 
     drive: Drive | None
     begin_s: float
     end_s: float
 
     def window(self, begin: float, end: float) -> Drive:
-        """The part that a piece needs."""
+        """Return the part of the drive that a piece needs."""
         if self.drive is None:
-            # no torque, beside recordings that have one
+            # no torque here, while other recordings have one
             return Drive.from_torque(np.array([0.0, end - begin]), np.zeros(2))
         return self.drive.window(begin - self.begin_s, end - self.begin_s)
 
 
 def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
-    """The drive of a recording; None for none."""
+    """Return the drive of a recording; None for none."""
     time = ds["time"].values
     if table.drive == "none":
         return None
@@ -383,9 +383,9 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
 
 
 def _steadied(edges: Edges) -> Edges:
-    """Edges on the line through them, if they scatter about it by no more than sampling hides.
+    """Replace edges by their fitted line when their scatter is below the sampling resolution.
 
-    An edge between two samples is known to half of their distance; a line through many is known far better.
+    A single edge is known to half a sampling interval; a line through many edges is known far better.
     """
     if not edges.resolution_s:
         return edges
@@ -404,6 +404,6 @@ def _steadied(edges: Edges) -> Edges:
 
 
 def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:
-    """Number the predecessors anew after some were taken out; who lost one follows none."""
+    """Renumber the predecessors of pieces after some were taken out; -1 where the predecessor is gone."""
     numbers = {p.number: offset + k for k, p in enumerate(pieces)}
     return [replace(p, follows=numbers.get(p.number - 1, -1) if p.follows >= 0 else -1) for p in pieces]

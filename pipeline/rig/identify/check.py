@@ -1,4 +1,4 @@
-"""Judge an identification on another recording: the starts of its pieces alone are refitted."""
+"""Judge an identification on another recording; only the starts of its pieces are fitted."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from pipeline.spec.problems import SpecError
 
 
 def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dict[str, Any]:
-    """Judge an identification on another recording.
+    """Judge a finished identification on another recording.
 
-    Pieces are as they are in the file, whole, each with a free start; every sample counts, and the criterion
-    is that of least squares whatever the loss of the fit. Sensors' zeros stay as identified.
+    The file's pieces stay whole, and each has a free start. Every sample counts. The criterion is least
+    squares, whatever the loss of the fit. Sensors' zeros keep their identified values.
 
     Parameters
     ----------
     directory
-        Of a finished identification.
+        Directory of a finished identification.
     recording
-        A file with the channels of a recording that was fitted.
+        A file with the same channels as one of the fitted recordings.
     like
-        Number of that recording: its mapping, drive and zeros are taken.
+        Index of that recording; its mapping, drive and zeros are used.
 
     Returns
     -------
     dict
-        ``rms`` and ``correlation`` by channel [SI], ``pieces`` with the rms of each, ``units`` by channel,
+        ``rms`` [SI] and ``correlation`` by channel, ``pieces`` with the rms of each, ``units`` by channel,
         ``file``, ``sha256`` and ``directory``.
 
     Raises

@@ -1,4 +1,4 @@
-"""Identifications side by side: laws are compared by the pieces that were held out, not by the fit."""
+"""Compare identifications by their held-out pieces, not by their fits."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from pipeline.spec.problems import SpecError
 
 
 def compare(directories: Sequence[str | Path]) -> Table:
-    """Put finished identifications side by side, the one that predicts best first.
+    """Compare finished identifications; the one with the best prediction comes first.
 
     Parameters
     ----------
     directories
-        Of identifications of the same recordings, with the same pieces held out.
+        Directories of identifications of the same recordings, with the same pieces held out.
 
     Returns
     -------
     Table
-        A row for each: its directory, title and number of unknowns; the root mean square over all channels
-        of fitted and of held-out pieces, ``fit`` and ``held_out``, each channel in units of the noise that it
-        is weighted with in the first; and those of each channel [SI]. Without held-out pieces the last are
-        NaN, and the order is that of the fit.
+        A row for each identification: directory, title and number of unknowns. ``fit`` and ``held_out`` are
+        the root mean squares over all channels of fitted and of held-out pieces, each channel in units of its
+        noise in the first identification. ``fit_NAME`` and ``held_out_NAME`` are those of each channel [SI].
+        Without held-out pieces their values are NaN, and rows are sorted by ``fit``.
 
     Raises
     ------
     SpecError
-        If they are of different recordings, channels or held-out pieces: their residuals are no measure then.
+        If recordings, channels or held-out pieces differ, since residuals cannot be compared then.
     RefusedError
         If one is not finished.
     """

@@ -1,11 +1,11 @@
-"""The directory of an identification: what it is, its outcomes one by one, its results.
+"""Write and read the directory of an identification.
 
     identification.json   specification, mappings, digest, versions, host, time: written once
     outcomes/             a file for each local fit and each profile, written whole
-    result.json           estimates and all that is said of them; its presence says that all is there
+    result.json           estimates with their errors and warnings; written last
     residuals.nc  preset.toml  figures/  lock
 
-An identification that was stopped goes on with the outcomes that are there, and ends with the same bytes.
+An identification that was stopped continues with the kept outcomes, and ends with the same bytes.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ _ROOM = Path(__file__).parent
 _NOT_NUMBERS = (
     "check.py", "comparison.py", "directory.py", "figures.py", "reports.py", "residuals.py",
 )  # fmt: skip
-"""Modules that decide no number."""
+"""Modules that do not affect the numbers."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A recording as an identification knows it.
+    """A recording of an identification, with its mapping.
 
     Attributes
     ----------
@@ -79,21 +79,24 @@ class Source:
 
 @dataclass(frozen=True)
 class Info:
-    """What ``identification.json`` holds.
+    """The content of ``identification.json``.
 
     Attributes
     ----------
     directory : Path
+        Directory of the identification.
     digest : str
-        Of `identity`.
+        Digest of `identity`.
     identity : dict
-        What decides the numbers.
+        Everything that decides the numbers.
     title, spec_text : str
+        Title and text of the specification.
     files : list of str
         Names of the recordings.
     mappings : list of str
         Texts of their mapping files.
     versions, provenance : dict
+        Versions of packages; time and host.
     """
 
     directory: Path
@@ -108,7 +111,7 @@ class Info:
 
 
 def sources_of(spec: IdentificationSpec) -> list[Source]:
-    """Read what decides an identification besides its specification.
+    """Read the recordings and mappings of a specification, which also decide the numbers.
 
     Raises
     ------
@@ -132,7 +135,7 @@ def sources_of(spec: IdentificationSpec) -> list[Source]:
 
 
 def _kept(path: Path) -> str:
-    """Text of a mapping file; if its model is no name, the mapping as it was understood, which is whole."""
+    """Return the text of a mapping file; the parsed mapping in full if its model is a file or an object."""
     text = path.read_text("utf-8")
     model = tomllib.loads(text).get("model")
     is_whole = isinstance(model, str) and not is_model_file(model) and not is_object_path(model)
@@ -140,7 +143,7 @@ def _kept(path: Path) -> str:
 
 
 def identity_of(spec: IdentificationSpec, sources: Sequence[Source]) -> dict[str, Any]:
-    """Return all that decides the numbers: specification, recordings, kernel, model, code."""
+    """Return everything that decides the numbers: specification, recordings, kernel, model, code."""
     tables = spec.as_dict()
     for table, source in zip(tables["recordings"], sources, strict=True):
         del table["file"], table["mapping"]
@@ -160,19 +163,19 @@ def identity_of(spec: IdentificationSpec, sources: Sequence[Source]) -> dict[str
 
 
 def is_identification(directory: str | Path) -> bool:
-    """Whether an identification has been begun there."""
+    """Return whether a directory holds an identification."""
     return is_there(local_path(directory) / IDENTIFICATION)
 
 
 def read_info(directory: str | Path) -> Info:
-    """Read ``identification.json``.
+    """Read and check ``identification.json``.
 
     Raises
     ------
     RefusedError
-        If there is none, or one of another format.
+        If it does not exist, or has another format.
     DamagedError
-        If it is not what was written.
+        If its content has changed since it was written.
     """
     directory = local_path(directory)
     path = directory / IDENTIFICATION
@@ -201,17 +204,17 @@ def read_info(directory: str | Path) -> Info:
 
 
 def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
-    """Say whether this identification can be done in this directory; changes nothing.
+    """Check whether an identification can be done in a directory; nothing is changed.
 
     Returns
     -------
     Info or None
-        What is there already, if anything is.
+        The identification that is there already; None if there is none.
 
     Raises
     ------
     RefusedError
-        If another identification is there (with the difference), or something else.
+        If the directory holds another identification (the message lists the differences) or other files.
     """
     if directory.exists() and not directory.is_dir():
         raise RefusedError(f"{directory}: is a file; give another --out.")
@@ -240,13 +243,13 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
 
 
 def _short(line: str) -> str:
-    """A line without the whole text of a mapping."""
+    """Shorten a line that may hold the whole text of a mapping."""
     flat = " ".join(line.split())
     return flat if len(flat) <= 400 else f"{flat[:197]} ... {flat[-197:]}"
 
 
 def establish(directory: Path, spec: IdentificationSpec, sources: Sequence[Source], spec_text: str) -> Info:
-    """Make the directory, or return what it holds; call `check` first."""
+    """Make the directory, or return the identification in it; call `check` first."""
     identity = identity_of(spec, sources)
     if check(directory, identity) is None:
         directory.mkdir(parents=True, exist_ok=True)
@@ -262,12 +265,12 @@ def establish(directory: Path, spec: IdentificationSpec, sources: Sequence[Sourc
 
 
 class Outcomes:
-    """Outcomes by name, each computed once and kept in a file of its own.
+    """Outcomes by name; each is computed once and kept in its own file.
 
     Parameters
     ----------
     folder
-        Where they are kept.
+        Folder of the files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -275,7 +278,7 @@ class Outcomes:
         self.recalled = 0
 
     def recall(self, name: str, unpack: Callable[[Mapping[str, np.ndarray]], T]) -> T | None:
-        """Return an outcome if it is there, and whole."""
+        """Return an outcome if its file exists and is whole; otherwise None."""
         path = self._folder / f"{name}.npz"
         if not is_there(path):
             return None
@@ -295,7 +298,7 @@ class Outcomes:
 
 
 def write_result(directory: Path, result: Mapping[str, Any], files: Sequence[str]) -> None:
-    """Write ``result.json``, which says that everything is there, with the digests of the other files."""
+    """Write ``result.json`` with the digests of the other files; it marks the identification as finished."""
     entries = {name: entry_of((directory / name).read_bytes()) for name in sorted(files)}
     write_atomically(directory / RESULT, canonical({**result, "files": entries}))
 
@@ -308,7 +311,7 @@ def read_result(directory: str | Path) -> dict[str, Any]:
     RefusedError
         If it is not finished.
     DamagedError
-        If it is no JSON.
+        If it is not JSON.
     """
     path = local_path(directory) / RESULT
     read_info(directory)
@@ -325,7 +328,7 @@ def read_result(directory: str | Path) -> dict[str, Any]:
 
 
 def is_complete(directory: Path) -> bool:
-    """Whether all results are there and as they were written."""
+    """Return whether all results exist and have not changed."""
     if not is_there(directory / RESULT):
         return False
     try:

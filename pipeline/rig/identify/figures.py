@@ -1,4 +1,4 @@
-"""Pictures of an identification: fit over data, residuals in four views, profiles, correlations."""
+"""Draw the figures of an identification: fit over data, residuals, profiles, correlations."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from pipeline.plots.files import save_data, save_figure
 from pipeline.rig.identify.residuals import Series, per_piece, pieces_in, rate_of, residual_views
 
 MOST_PIECES = 4
-"""Pieces that are shown over the data."""
+"""Most pieces that are drawn over the data."""
 
 MOST_DOTS = 3000
-"""Residuals against the rate that are drawn; the means in bins are those of all."""
+"""Most residuals that are drawn against the rate. The means in bins use all residuals."""
 
 VIEWS = 4
-"""Of residuals: autocorrelation, by piece, against the rate, histogram."""
+"""Number of views of residuals: autocorrelation, by piece, against the rate, histogram."""
 
 MILLI = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "rad/s": ("mrad/s", 1e3)}
-"""In what residuals are drawn."""
+"""Unit and factor in which residuals are drawn, by unit."""
 
 SQUARE = style.Frame(width=131.0)
-"""Of a matrix."""
+"""Frame of a matrix."""
 
 FITTED, HELD = style.BLUE, style.VERMILLION
 
@@ -43,11 +43,11 @@ def draw_all(folder: Path, residuals: xr.Dataset, result: Mapping[str, Any]) -> 
     Parameters
     ----------
     folder
-        Where to write.
+        Folder to write to.
     residuals
         See `pipeline.rig.identify.reports.residuals_of`.
     result
-        What ``result.json`` holds.
+        Content of ``result.json``.
 
     Returns
     -------
@@ -75,7 +75,7 @@ def _title(attrs: Mapping[Any, Any], what: str) -> str:
 
 
 def _finish(fig: style.DataFigure) -> None:
-    """Say that recordings are simulated where they are, and finish."""
+    """Mark the figure if recordings are simulated, and finish it."""
     if fig.data.attrs.get("simulated"):
         fig.text(0.012, 0.992, "simulated recording", ha="left", va="top", fontsize=fig.look.legend)
     style.finish(fig)
@@ -91,7 +91,7 @@ def _milli(ds: xr.Dataset, channel: str) -> tuple[str, float]:
 
 
 def plot_fit(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw measured and computed values of some pieces, and what is left between them.
+    """Draw measured and computed values of some pieces, with their residuals.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def plot_fit(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFi
     Returns
     -------
     DataFigure
-        The first piece, the one that fits worst, one that was held out, and the last. Its `data` are theirs.
+        It shows the first piece, the worst fit, a held-out piece, and the last. Its `data` are those pieces.
     """
     chosen = _chosen(pieces_in(ds))
     channels = str(ds.attrs["channels"]).split()
@@ -187,9 +187,9 @@ def plot_residuals(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     Returns
     -------
     DataFigure
-        A column for each channel. Wrong friction shows in the third row: the mean of the residuals then goes
-        with the rate. Its `data` are the curves and means drawn, of pieces that were fitted but in the second
-        row.
+        A column for each channel. Wrong friction shows in the third row: the mean residual then depends on
+        the rate. Its `data` are the curves and means drawn. Except in the second row, only fitted pieces
+        count.
     """
     channels = str(ds.attrs["channels"]).split()
     views = residual_views(ds, channels)
@@ -279,7 +279,7 @@ def _draw_histogram(ax: Axes, views: xr.Dataset, channel: str, factor: float) ->
 def plot_profiles(
     attrs: Mapping[Any, Any], result: Mapping[str, Any], *, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the profile of each unknown, with the parabola of its standard error.
+    """Draw the profile of each unknown, with the parabola from its standard error.
 
     Parameters
     ----------
@@ -353,7 +353,7 @@ def _draw_profile(
 
 
 def _engineering(size: float) -> tuple[float, int]:
-    """Factor and power of ten that bring a number between 1 and 1000."""
+    """Return a factor and its power of ten that bring a very small or large number between 1 and 1000."""
     if not size > 0 or 1e-2 <= size < 1e4:
         return 1.0, 0
     exponent = 3 * math.floor(math.log10(size) / 3)
@@ -363,7 +363,7 @@ def _engineering(size: float) -> tuple[float, int]:
 def plot_correlations(
     attrs: Mapping[Any, Any], result: Mapping[str, Any], *, frame: style.Frame = SQUARE
 ) -> style.DataFigure:
-    """Draw the correlations of the estimates as a matrix; what is not determined stays empty.
+    """Draw the correlations of the estimates as a matrix; undetermined entries stay empty.
 
     Parameters
     ----------

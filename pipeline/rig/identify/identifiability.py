@@ -1,4 +1,4 @@
-"""What the data determine and what they do not, in numbers and in plain words."""
+"""Determine which parameters the data determine, and describe it in numbers and sentences."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ import numpy as np
 from pipeline.rig.identify.statistics import Covariance
 
 LOOSE = 0.5
-"""Standard error along a direction, as a share of the parameters' sizes, from which it is not determined."""
+"""Standard error along a direction, relative to the parameters' sizes, above which it is not determined."""
 
 SHOWN = 0.15
-"""Share of its largest component from which on a parameter is named in a direction."""
+"""Component, relative to the largest, from which on a parameter is named in a direction."""
 
 ALIKE = 0.99
-"""Correlation from which on two estimates are said to move together."""
+"""Correlation above which two estimates are reported as known better together than apart."""
 
 BY_PRIOR = 0.9
-"""Share of a prior's standard deviation above which an estimate is its prior's."""
+"""Ratio of standard error to the prior's above which an estimate rests on its prior alone."""
 
 NEVER = 1e-6
-"""Share of the largest singular value below which one is zero to rounding."""
+"""Ratio to the largest singular value below which one counts as zero."""
 
 
 @dataclass(frozen=True)
 class Direction:
-    """A direction in the space of the parameters, each in units of its size.
+    """A direction in parameter space, each parameter in units of its size.
 
     Attributes
     ----------
     singular_value : float
-        Of the scaled slopes of the residuals: by how many standard deviations of the noise they move, all
-        together, for a step of one size. The data alone; priors do not count.
+        Norm of the change of all residuals, in standard deviations of the noise, for a step of one size.
+        Priors do not count.
     error : float
-        Standard error along it, as a share of the sizes; infinite where the data say nothing.
+        Standard error along the direction, relative to the sizes; infinite if the data do not determine it.
     vector : ndarray (n_free,)
-        Of length 1.
+        Unit vector.
     """
 
     singular_value: float
@@ -46,22 +46,22 @@ class Direction:
 
     @property
     def is_loose(self) -> bool:
-        """Whether the data do not determine it."""
+        """Whether the data do not determine the direction."""
         return self.error > LOOSE
 
 
 def sizes_of(
     theta: np.ndarray, start: np.ndarray, lower: np.ndarray, upper: np.ndarray, sensed: np.ndarray
 ) -> np.ndarray:
-    """Size of each parameter, that changes are compared with.
+    """Return the size of each parameter, to which changes are compared.
 
     Parameters
     ----------
     theta, start, lower, upper
         (n_free,) Estimates, starts and bounds.
     sensed
-        (n_free,) Size of a measured quantity for parameters that are offsets of one, which may well be 0;
-        NaN for others.
+        (n_free,) Size of the measured quantity for parameters that are its offset and may be 0; NaN for
+        others.
 
     Returns
     -------
@@ -74,16 +74,16 @@ def sizes_of(
 
 
 def directions_of(information: np.ndarray, scale: np.ndarray, inflation: float) -> list[Direction]:
-    """Singular values and vectors of the scaled slopes, the best determined direction first.
+    """Return the directions of the scaled information matrix, the best determined one first.
 
     Parameters
     ----------
     information
-        (n_free, n_free), of the data alone.
+        Information of the data alone, (n_free, n_free).
     scale
-        (n_free,), see `sizes_of`.
+        Sizes of the parameters, (n_free,), see `sizes_of`.
     inflation
-        See `Covariance`.
+        Factor on standard errors, see `Covariance`.
     """
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     singular = np.sqrt(np.maximum(values[::-1], 0.0))
@@ -97,7 +97,7 @@ def directions_of(information: np.ndarray, scale: np.ndarray, inflation: float) 
 
 
 def invisible(information: np.ndarray, names: Sequence[str]) -> list[str]:
-    """Names of the parameters that no residual depends on."""
+    """Return the names of the parameters that no residual depends on."""
     own = np.diag(information)
     return [name for name, value in zip(names, own, strict=True) if not value > 0.0]
 
@@ -109,20 +109,20 @@ def warnings_of(
     prior_sd: np.ndarray,
     at_bound: Sequence[str],
 ) -> list[str]:
-    """Say in plain words what the data do not determine.
+    """Return sentences about what the data do not determine.
 
     Parameters
     ----------
     names
-        Of the parameters.
+        Names of the parameters.
     directions
-        Of the data alone.
+        Directions from the data alone.
     covariance
-        Priors included.
+        Covariance with priors included.
     prior_sd
-        (n_free,), NaN where there is none.
+        Standard deviations of priors, (n_free,); NaN where there is none.
     at_bound
-        For each parameter ``lower``, ``upper`` or nothing: at which of its bounds the estimate lies.
+        For each parameter, the bound at which the estimate lies: ``lower``, ``upper`` or an empty text.
     """
     found = [_loose(names, d, prior_sd) for d in directions if d.is_loose]
     errors = covariance.errors

@@ -1,4 +1,4 @@
-"""From a specification's file to a finished identification, or what is missing of one."""
+"""Run an identification from its specification, or complete one that was stopped."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ from pipeline.store.local import make_folder, refuse_links, writer_lock
 Echo = Callable[[str], None]
 
 NEAR_BOUND = 1e-4
-"""Distance to a bound, as a share of a parameter's size, at which an estimate lies on it."""
+"""Distance to a bound, relative to a parameter's size, below which an estimate lies on it."""
 
 
 SAME_MOTION = 1e-3
-"""Difference of two motions, as a share of the measured spread, that the integration does not make."""
+"""Difference of two trajectories, relative to the measured spread, that exceeds the error of integration."""
 
 
 class NotConvergedError(ArithmeticError):
-    """No start converged: there is no result."""
+    """An error for an identification in which no start converged."""
 
 
 def identify(
     spec: str | Path, out: str | Path | None = None, *, figures: bool = True, echo: Echo = print
 ) -> dict[str, Any]:
-    """Identify what a specification asks for, or what is missing of it.
+    """Identify the parameters that a specification names, or complete an identification that was stopped.
 
     Parameters
     ----------
@@ -61,12 +61,12 @@ def identify(
     figures
         Whether to draw.
     echo
-        Prints a line.
+        Function that prints a line.
 
     Returns
     -------
     dict
-        What ``result.json`` holds.
+        Content of ``result.json``.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def identify(
 
 
 def directory_of(spec: str | Path, out: str | Path | None) -> Path:
-    """Where an identification goes: `out`, or ``runs/<name>``."""
+    """Return the directory of an identification: `out`, or ``runs/<name>``."""
     return local_path(out) if out is not None else default_directory(find_spec(spec), False)
 
 
@@ -128,12 +128,12 @@ def _write(
 
 
 def refuse_invisible(problem: Problem) -> None:
-    """Refuse unknowns on which no residual depends, by a first evaluation.
+    """Refuse unknowns that no residual depends on, by a first evaluation.
 
     Raises
     ------
     SpecError
-        Naming them all; also if the trajectories diverge at the start.
+        If there are such unknowns (the message names all), or if trajectories diverge at the start.
     """
     first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
     if _is_driven(problem):
@@ -159,7 +159,7 @@ def refuse_invisible(problem: Problem) -> None:
 
 
 def _is_driven(problem: Problem) -> bool:
-    """Whether a motion without a drive depends on the period that it would have."""
+    """Return whether trajectories without a drive depend on the drive's period."""
     piece = problem.pieces[0]
     if piece.drive is not None:
         return False
@@ -175,7 +175,7 @@ def _is_driven(problem: Problem) -> bool:
 
 
 def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo) -> reports.Finding:
-    """Search, judge, and say how sure it is.
+    """Search for the best fit, judge it, and compute its errors.
 
     Raises
     ------
@@ -218,7 +218,7 @@ def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo)
 
 
 def require_starts(fit: Fit, what: str) -> None:
-    """Refuse to judge by starts that were not found; raises `NotConvergedError`."""
+    """Raise `NotConvergedError` unless the starts of judged pieces were found."""
     if not fit.converged:
         raise NotConvergedError(
             f"the starts of the {what} did not converge ({fit.message}), so there is nothing to judge by."
@@ -290,18 +290,18 @@ def _unpack_profile(name: str, data: Mapping[str, np.ndarray]) -> Profile:
 
 
 def _plain_errors(linear: Linearised, scale: np.ndarray) -> np.ndarray:
-    """Standard errors of independent residuals as large as the noise."""
+    """Return standard errors for independent residuals as large as the noise."""
     inverse = np.linalg.pinv(linear.information * np.outer(scale, scale), rcond=1e-12, hermitian=True)
     return np.asarray(np.sqrt(np.diag(inverse)) * scale)
 
 
 class Kept:
-    """Outcomes of starts by number; what `pipeline.rig.identify.search.search` asks for.
+    """The kept outcomes of starts by number, as `pipeline.rig.identify.search.search` uses them.
 
     Parameters
     ----------
     outcomes
-        Where they are kept.
+        Files of the outcomes.
     """
 
     def __init__(self, outcomes: Outcomes) -> None:
@@ -309,14 +309,14 @@ class Kept:
         self.fits: dict[int, Fit] = {}
 
     def recall(self, number: int) -> Fit | None:
-        """Return the outcome if it is stored."""
+        """Return the outcome of a start if it is stored; otherwise None."""
         fit = self._outcomes.recall(_name(number), unpack_fit)
         if fit is not None:
             self.fits[number] = fit
         return fit
 
     def store(self, number: int, fit: Fit) -> None:
-        """Store it."""
+        """Store the outcome of a start."""
         self._outcomes.store(_name(number), pack_fit(fit))
         self.fits[number] = fit
 
@@ -326,7 +326,7 @@ def _name(number: int) -> str:
 
 
 def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
-    """A fit as arrays."""
+    """Return a fit as arrays."""
     lengths = np.array([len(r) for r in fit.residuals], np.int64)
     return {
         "theta": fit.theta, "starts": fit.starts, "rows": fit.rows, "jacobian": fit.jacobian,
@@ -337,7 +337,7 @@ def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
 
 
 def unpack_fit(data: Mapping[str, np.ndarray]) -> Fit:
-    """The fit of `pack_fit`."""
+    """Return the fit that `pack_fit` turned into arrays."""
     residuals = np.split(data["residuals"], np.cumsum(data["lengths"])[:-1])
     return Fit(
         data["theta"], data["starts"], float(data["cost"]), bool(data["converged"]), str(data["message"]),

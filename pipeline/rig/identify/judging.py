@@ -1,4 +1,4 @@
-"""How well computed motions fit measured ones: root mean squares, correlation, pieces judged afterwards."""
+"""Judge how well computed trajectories fit measured ones: root mean squares and correlations."""
 
 from __future__ import annotations
 
@@ -14,18 +14,22 @@ from pipeline.rig.identify.search import slowest_period
 from pipeline.rig.identify.starts import fit_starts
 
 FIRST_PERIODS = 0.7
-"""Of the slowest oscillation, over which starts are fitted first; then twice that, and so on up to the piece.
-A long piece forgives no bad guess."""
+"""Length, in periods of the slowest oscillation, over which starts are fitted first.
+
+The length is then doubled until it covers the piece: a long piece does not tolerate a bad guess.
+"""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Measured against computed, piece by piece.
+    """The residuals of measured pieces, with measures of the fit.
 
     Attributes
     ----------
     channels : tuple of str
+        Channels that are compared.
     pieces : tuple of Piece
+        Pieces that are judged.
     residuals : tuple of ndarray (n, n_channels)
         Measured less computed [SI]; NaN where nothing was measured.
     """
@@ -36,11 +40,11 @@ class Judgement:
 
     @property
     def rms(self) -> dict[str, float]:
-        """Root mean square of the residuals of each channel [SI]."""
+        """Root mean square of each channel's residuals [SI]."""
         return self._rms(self.residuals)
 
     def rms_of(self, k: int) -> dict[str, float]:
-        """Root mean square of the residuals of one piece [SI]."""
+        """Return the root mean square of each channel's residuals in one piece [SI]."""
         return self._rms([self.residuals[k]])
 
     def _rms(self, residuals: Sequence[np.ndarray]) -> dict[str, float]:
@@ -58,7 +62,7 @@ class Judgement:
         return {name: _pearson(measured[:, c], computed[:, c]) for c, name in enumerate(self.channels)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data: both criteria, the root mean squares of each piece; None for what is not defined."""
+        """Return plain data: rms and correlation, and the rms of each piece; None if undefined."""
         return {
             "rms": _known(self.rms),
             "correlation": _known(self.correlation),
@@ -83,25 +87,25 @@ def _pearson(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def judge_fit(problem: Problem, fit: Fit) -> Judgement:
-    """Judge a fit on the pieces that it was made of."""
+    """Judge a fit on the pieces that it was fitted to."""
     return Judgement(problem.channels, problem.pieces, fit.residuals)
 
 
 def known_problem(
     problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
 ) -> Problem:
-    """Return the problem in which all but the starts of some pieces is known.
+    """Return the problem in which only the starts of given pieces are unknown.
 
     Parameters
     ----------
     problem
-        What was fitted.
+        Problem that was fitted.
     values
-        All parameters by name.
+        All parameters by name [SI].
     zeros
-        Sensors' zeros by the names of their unknowns.
+        Sensors' zeros by the names of their unknowns [SI].
     pieces
-        To be judged.
+        Pieces to be judged.
     """
     free = tuple(f for f in problem.free if f.name in zeros)
     known = replace(
@@ -114,7 +118,7 @@ def known_problem(
 def judge(
     problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
 ) -> tuple[Judgement, Fit]:
-    """Judge known parameters on pieces that they were not fitted to: their starts alone are refitted.
+    """Judge known parameters on pieces that they were not fitted to; only the starts are fitted.
 
     Parameters
     ----------
@@ -124,8 +128,9 @@ def judge(
     Returns
     -------
     Judgement
+        Residuals of the pieces.
     Fit
-        Of the starts; whether it converged counts.
+        Fit of the starts. Check that it converged.
     """
     known = known_problem(problem, values, zeros, pieces)
     longest = max(float(p.time[-1]) for p in known.pieces)
@@ -138,7 +143,7 @@ def judge(
 
 
 def _beginning(problem: Problem, length_s: float) -> Problem:
-    """The problem over the first part of each piece."""
+    """Return the problem over the first part of each piece."""
     fewest = 4 * len(problem.model.states)
     pieces = []
     for p in problem.pieces:

@@ -1,4 +1,4 @@
-"""From a fit to what statistics need of it: residuals and slopes sample by sample, the starts eliminated."""
+"""Linearise a fit for its statistics: residuals and slopes by sample, with the starts eliminated."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from pipeline.rig.identify.problem import Problem
 from pipeline.rig.identify.statistics import Linearised, eliminate_starts, robust_weights
 
 STEP = 1e-4
-"""Of the central differences, in units of the sizes: their error is about its square."""
+"""Step of the central differences in units of the sizes; their error is about its square."""
 
 RTOL = 1e-10
-"""Tolerance under the differences; its noise in a slope is this over `STEP`."""
+"""Tolerance of the integration under the differences; a slope's noise is this over `STEP`."""
 
 MAD = 1.4826
-"""Standard deviation of Gaussian noise over its median absolute value."""
+"""Ratio of the standard deviation of Gaussian noise to its median absolute value."""
 
 
 def linearise(problem: Problem, fit: Fit) -> Linearised:
-    """Return residuals and slopes at a fit's optimum, the starts eliminated.
+    """Return residuals and slopes at a fit's optimum, with the starts eliminated.
 
-    The fit's own slopes are compressed piece by piece; what is autocorrelated needs them along time.
+    The fit's own slopes are compressed piece by piece. Statistics of autocorrelated residuals need them along
+    time.
     """
     n_free, n_states = len(problem.free), len(problem.model.states)
     scale = loss_scale_of(problem, fit)
@@ -34,7 +35,7 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
     slopes, following = [], []
     for k, own in enumerate(full):
         flat = own.reshape(-1, own.shape[-1])
-        # pieces with free starts each have their own; the fit's one-sided differences would blur what is null
+        # free starts are eliminated piece by piece here: the fit's one-sided differences are less exact
         moves = (
             eliminate_starts(flat, n_free)[1] if follow is None else follow[k * n_states : (k + 1) * n_states]
         )
@@ -53,7 +54,7 @@ def _information(
     problem: Problem, fit: Fit, slopes: list[np.ndarray], residuals: tuple[np.ndarray, ...],
     prior: np.ndarray, scale: float,
 ) -> np.ndarray:  # fmt: skip
-    """Information of everything: of the samples with the curvature of the loss, else that of the fit."""
+    """Return the information matrix: that of the samples, or with continuity that of the fit."""
     if problem.continuity is not None:
         return eliminate_starts(fit.jacobian, len(problem.free))[0]
     total = np.diag(prior)
@@ -66,7 +67,7 @@ def _information(
 
 
 def loss_scale_of(problem: Problem, fit: Fit) -> float:
-    """Residual from which on the loss of a fit grows slower than the square; see `fit_local`."""
+    """Return the residual above which the loss of a fit grows slower than the square; see `fit_local`."""
     if problem.loss == "linear":
         return 1.0
     z = np.concatenate(fit.residuals) / problem.noise
@@ -74,7 +75,7 @@ def loss_scale_of(problem: Problem, fit: Fit) -> float:
 
 
 def groups_of(problem: Problem) -> tuple[int, ...]:
-    """Independent stretch of each piece: with continuity, pieces that continue others belong to them."""
+    """Return the independent stretch of each piece; with continuity, joined pieces are one stretch."""
     found: list[int] = []
     for k, piece in enumerate(problem.pieces):
         joined = problem.continuity is not None and 0 <= piece.follows < k
@@ -83,10 +84,10 @@ def groups_of(problem: Problem) -> tuple[int, ...]:
 
 
 def sample_slopes(problem: Problem, fit: Fit) -> list[np.ndarray]:
-    """Slopes of the residuals of each piece in units of the noise, (n, n_channels, n_free + n_states).
+    """Return each piece's slopes in units of the noise, (n, n_channels, n_free + n_states).
 
-    Central differences in one call of the engine: the starts of all pieces move at once, since none depends
-    on another's. At a bound they are one-sided.
+    They are central differences from one call of the engine. The starts of all pieces are changed at once,
+    since no piece depends on another's start. At a bound the differences are one-sided.
     """
     n_free, scales = len(problem.free), problem.model.scales
     thetas, starts, widths = [], [], []

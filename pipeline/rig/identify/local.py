@@ -1,4 +1,4 @@
-"""The local stage: least squares over the unknowns and the pieces' starts."""
+"""Fit the unknowns and the pieces' starts by least squares, from one first guess."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ from pipeline.rig.identify.starts import carry_starts, fit_starts, project_start
 Array = NDArray[np.float64]
 
 TOLERANCE = 1e-9
-"""Relative change of the unknowns, and a tenth of that of the cost, at which a fit has converged."""
+"""Relative change of the unknowns at which a fit has converged; for the cost it is a tenth of this."""
 
 MAX_EVALUATIONS = 100
 
 DENSE_COLUMNS = 600
-"""Above it the Jacobian is taken as sparse, and its steps are solved for by iteration."""
+"""Number of columns above which the Jacobian is sparse and its steps are solved iteratively."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Outcome of a local stage.
+    """The outcome of a local fit.
 
     Attributes
     ----------
     theta : ndarray, (n_free,)
+        Unknowns [SI].
     starts : ndarray, (n_piece, n_states)
+        Starts of the pieces [SI].
     cost : float
         Half the sum of squares in units of the noise.
     converged : bool
@@ -58,12 +60,12 @@ class Fit:
 
 
 class _Search:
-    """What `least_squares` walks in, and what is known at its last points.
+    """The function that `least_squares` minimises, with its last and its best point.
 
-    The vector holds the unknowns in units of their sizes; with a weight on the gaps, all starts follow them.
-    Without one, each start depends on its own piece alone: it is found anew for the unknowns of each point,
-    and its directions are projected out of the rows (variable projection: Golub and Pereyra, SIAM J. Numer.
-    Anal. 10, 1973, 413, in Kaufman's form).
+    The vector holds the unknowns in units of their sizes. With a weight on the gaps it also holds all starts.
+    Without a weight each start depends on its own piece alone. It is then fitted for the unknowns of each
+    point, and its directions are projected out of the rows (variable projection: Golub and Pereyra, SIAM J.
+    Numer. Anal. 10, 1973, 413, in Kaufman's form).
     """
 
     def __init__(self, problem: Problem, starts: Array, echo: Echo | None) -> None:
@@ -78,14 +80,14 @@ class _Search:
         self._base: _Point | None = None
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Unknowns, and starts as given or as the vector has them."""
+        """Return the unknowns, and the starts from the vector or as given."""
         full = x * self.sizes
         if not self.joint:
             return full, self.starts
         return full[: self.n_free], full[self.n_free :].reshape(self.starts.shape)
 
     def at(self, x: Array) -> _Point:
-        """Evaluate, or recall the last evaluation."""
+        """Evaluate a point, or recall the last evaluation."""
         key = x.tobytes()
         if self._last is None or key != self._key:
             theta, starts = self.split(x)
@@ -105,7 +107,7 @@ class _Search:
         return self._last
 
     def _starts_for(self, theta: Array) -> Array:
-        """Starts for unknowns: those of the best point, carried on along its slopes, then fitted."""
+        """Return fitted starts for given unknowns; the guess extrapolates from the best point."""
         base = self._base
         if base is None:
             return fit_starts(self.problem, theta, self.starts).starts
@@ -139,23 +141,23 @@ def fit_local(
     tolerance: float = TOLERANCE,
     echo: Echo | None = None,
 ) -> Fit:
-    """Least squares from a first guess (`scipy.optimize.least_squares`, trust region with bounds).
+    """Fit by least squares from a first guess (`scipy.optimize.least_squares`, trust region with bounds).
 
     Parameters
     ----------
     problem
     theta0
-        First guess of the unknowns, (n_free,); brought into the bounds.
+        First guess of the unknowns, (n_free,); clipped to the bounds.
     starts
         First guess of the pieces' starts, (n_piece, n_states); by default the problem's.
     fixed
-        Unknowns that are held at a value, by name: the fit is over the others, `Fit.theta` has all.
+        Unknowns that are held at a value, by name. The others are fitted; `Fit.theta` holds all.
     max_evaluations
-        Limit; beyond it a fit has not converged.
+        Largest number of evaluations; beyond it the fit has not converged.
     tolerance
-        Relative change of the unknowns, and a tenth of that of the cost, at which it has.
+        Relative change of the unknowns below which the fit has converged; for the cost it is a tenth of this.
     echo
-        Called with the unknowns and the cost whenever the cost has become less.
+        Called with the unknowns and the cost whenever the cost decreases.
 
     Returns
     -------
@@ -163,7 +165,7 @@ def fit_local(
 
     Notes
     -----
-    A robust loss counts residuals in units of their own scale, which a first fit of least squares gives.
+    A robust loss takes residuals in units of their scale, which a first least-squares fit gives.
     """
     if fixed:
         return _fit_others(problem, theta0, starts, fixed, _Ending(max_evaluations, tolerance))
@@ -186,7 +188,7 @@ def _solve(problem: Problem, theta0: Array, starts: Array, ending: _Ending, echo
     walk = _Search(problem, starts, echo)
     theta0 = np.clip(theta0, problem.lower, problem.upper)
     full = np.append(theta0, starts.ravel()) if walk.joint else np.array(theta0)
-    # the matrices are small: more threads would wait for each other
+    # the matrices are so small that more threads would wait for each other
     with threadpool_limits(1):
         if not len(full):
             return _starts_alone(walk)
@@ -196,7 +198,7 @@ def _solve(problem: Problem, theta0: Array, starts: Array, ending: _Ending, echo
 
 
 def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, bool, str]:
-    """Where `least_squares` ends, whether it had converged, and why it ended."""
+    """Return the point where `least_squares` ended, whether it converged, and its message."""
     from scipy.optimize import least_squares
     from scipy.sparse import csr_array
 
@@ -215,7 +217,7 @@ def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, boo
 
 
 def _starts_alone(walk: _Search) -> Fit:
-    """With nothing unknown but the starts."""
+    """Fit the starts if nothing else is unknown."""
     problem, nothing = walk.problem, np.zeros(0)
     starts, settled = fit_starts(problem, nothing, walk.starts)
     n = int(np.count_nonzero(~settled))
@@ -240,7 +242,7 @@ def _fit_others(
     problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float],
     ending: _Ending,
 ) -> Fit:  # fmt: skip
-    """Fit with some unknowns held; the outcome speaks of all again."""
+    """Fit with some unknowns held; the outcome holds all unknowns."""
     held = np.array([name in fixed for name in problem.names], bool)
     part = fit_local(
         problem.without(fixed), np.asarray(theta0)[~held], starts=starts,

@@ -1,4 +1,4 @@
-"""Residuals and slopes of a whole population of unknowns, in one call of the engine."""
+"""Compute residuals and slopes of a whole population of unknowns in one call of the engine."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from pipeline.rig.identify.problem import Problem
 Array = NDArray[np.float64]
 
 STEP = 1e-5
-"""Step of the differences, in units of an unknown's size; slopes are good to 1e-5 to 1e-3 of the largest."""
+"""Step of the differences in units of an unknown's size; slopes are accurate to 1e-5 to 1e-3."""
 
 VARIATIONAL = "variational"
-"""The other choice of `Problem.slopes`."""
+"""Value of `Problem.slopes` for slopes by variational equations."""
 
 SLOPES_RTOL = 1e-9
-"""Largest tolerance where differences are taken."""
+"""Largest tolerance of the integration if slopes are differences."""
 
 LOST = 1e6
-"""Residual, in units of the noise, where a trajectory has diverged."""
+"""Residual, in units of the noise, of a trajectory that diverged."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A member of a population.
+    """The residuals and slopes of one member of a population.
 
     Attributes
     ----------
     residuals : tuple of ndarray, (n, n_channels)
         Measured less computed, piece by piece [SI]; NaN where nothing was measured.
     rows : ndarray, (m,)
-        Residuals in units of the noise; with slopes, compressed by an orthogonal transformation per piece, so
-        that ``rows @ rows / 2`` is the cost all the same.
+        Residuals in units of the noise. With slopes they are compressed by an orthogonal transformation per
+        piece, which keeps the cost, ``rows @ rows / 2``.
     jacobian : ndarray, (m, n_free + n_piece*n_states)
         Slopes of `rows`: the unknowns first, then the starts, piece by piece; empty without slopes.
     failed : int
-        Pieces whose trajectory did not reach its end.
+        Number of pieces whose trajectory did not reach its end.
     """
 
     residuals: tuple[Array, ...]
@@ -58,7 +58,7 @@ class Evaluation:
 
 
 class _Motions(NamedTuple):
-    """What the engine says of a population; `columns` are the states that were written."""
+    """The trajectories of a population, and their slopes; `columns` are the states that were written."""
 
     states: Array  # (member, piece, time, column)
     slopes: Array  # (member, change, piece, time, column): by the moving unknowns, then by the own start
@@ -66,7 +66,7 @@ class _Motions(NamedTuple):
 
 
 def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) -> list[Evaluation]:
-    """Evaluate a population.
+    """Compute residuals and slopes of every member of a population.
 
     Parameters
     ----------
@@ -76,11 +76,12 @@ def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) ->
     starts
         Starts of the pieces, shape (n, n_piece, n_states) [SI].
     slopes
-        Whether slopes are wanted; `Problem.slopes` says how they are taken.
+        Whether to compute slopes; `Problem.slopes` selects the method.
 
     Returns
     -------
     list of Evaluation
+        One for each member.
     """
     if not slopes:
         motions = _without_slopes(problem, thetas, starts)
@@ -108,7 +109,7 @@ def _without_slopes(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 
 
 def _steps(problem: Problem, thetas: Array) -> Array:
-    """Changes of the moving unknowns for differences, (member, change); they stay within the bounds."""
+    """Return steps of the trajectory's unknowns for differences, (member, change), within the bounds."""
     found = np.zeros((len(thetas), len(problem.moving)))
     for j, i in enumerate(problem.moving):
         f, values = problem.free[i], thetas[:, i]
@@ -119,7 +120,7 @@ def _steps(problem: Problem, thetas: Array) -> Array:
 
 
 def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
-    """Packed parameters (member, change, n_parameters), one moving unknown changed in each."""
+    """Return packed parameters (member, change, n_parameters), each with one unknown changed."""
     members = []
     for theta, own in zip(thetas, steps, strict=True):
         rows = np.tile(theta, (len(own), 1))
@@ -129,7 +130,7 @@ def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
 
 
 def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
-    """Slopes as one-sided differences between lanes: each has one unknown or state of its start changed."""
+    """Compute slopes as differences between lanes; each has one unknown or start state changed."""
     steps, n = _steps(problem, thetas), len(problem.model.states)
     moves = STEP * np.diag(problem.model.scales)
     packed = problem.pack(thetas)[:, None]
@@ -147,7 +148,7 @@ def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 
 
 def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
-    """Slopes by the variational equations: a tangent vector for each unknown and each state of the starts."""
+    """Compute slopes by variational equations: one tangent vector per unknown and per state of the starts."""
     system, steps = with_parameter_tangent(problem.system), _steps(problem, thetas)
     n, n_moving = len(problem.model.states), len(problem.moving)
     same = np.repeat(problem.pack(thetas)[:, None], n_moving + n, axis=1)
@@ -168,7 +169,7 @@ def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 def _integrate(
     problem: Problem, parameters: Array, starts: Array, tolerance: float, system: System | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """States (member, change, piece, time, column) and which trajectories failed (member, change, piece)."""
+    """Return states (member, change, piece, time, column), and which failed (member, change, piece)."""
     shape, n = starts.shape[:3], len(problem.model.states)
     n_pieces = shape[2]
     columns = list(problem.columns) if problem.continuity is None else list(range(n))
@@ -188,7 +189,7 @@ def _integrate(
 
 
 def _thrice(drive: Drive | None) -> Drive | None:
-    """The drive for all three sets of parameters of `with_parameter_tangent`."""
+    """Return the drive for all three sets of parameters of `with_parameter_tangent`."""
     if drive is None or not drive.names:
         return drive
     names = tuple(f"{name}{end}" for end in ("", PLUS, MINUS) for name in drive.names)
@@ -196,7 +197,7 @@ def _thrice(drive: Drive | None) -> Drive | None:
 
 
 def _grid(problem: Problem, k: int) -> Array:
-    """Times of a piece, and the start of the one that continues it where that counts."""
+    """Return the times of a piece; with continuity, also the start of the piece that continues it."""
     time = problem.pieces[k].time
     if problem.continuity is None or not any(p.follows == k for p in problem.pieces):
         return time
@@ -204,7 +205,7 @@ def _grid(problem: Problem, k: int) -> Array:
 
 
 def _read(problem: Problem, k: int, states: Array) -> Array:
-    """Channels among computed states at a piece's instants, (..., n, n_channels)."""
+    """Return the channels among computed states at a piece's times, (..., n, n_channels)."""
     n = len(problem.pieces[k].time)
     read = states if problem.continuity is None else states[..., list(problem.columns)]
     return np.asarray(read[..., :n, :])
@@ -213,7 +214,7 @@ def _read(problem: Problem, k: int, states: Array) -> Array:
 def _block(
     problem: Problem, k: int, theta: Array, member: _Motions, slopes: bool
 ) -> tuple[int, Array, Array]:
-    """A piece's number, rows and slopes by the unknowns and its own start, compressed."""
+    """Return a piece's number, compressed rows, and slopes by the unknowns and its own start."""
     piece, n_free = problem.pieces[k], len(problem.free)
     n_own = n_free + len(problem.model.states)
     given = np.isfinite(piece.measured)
@@ -237,7 +238,7 @@ def _block(
 
 
 def _robust(z: Array, problem: Problem) -> tuple[Array, Array]:
-    """Rows whose halved squares add up to the loss, and their slope by the residual `z`."""
+    """Return rows whose halved squares add up to the loss, and their slope by the residual `z`."""
     if problem.loss == "linear":
         return z, np.ones_like(z)
     scale = problem.loss_scale
@@ -256,7 +257,7 @@ def _robust(z: Array, problem: Problem) -> tuple[Array, Array]:
 
 
 def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> list[tuple[int, Array, Array]]:
-    """Rows of the gaps between stretches and their successors; slopes by the unknowns and by both starts."""
+    """Return rows of the gaps between stretches, with slopes by the unknowns and by both starts."""
     if problem.continuity is None:
         return []
     n_free, n_states = len(problem.free), len(problem.model.states)
@@ -280,7 +281,7 @@ def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> li
 def _with_priors(
     problem: Problem, theta: Array, blocks: list[tuple[int, Array, Array]], slopes: bool
 ) -> tuple[Array, Array]:
-    """Stack the blocks, each at its columns, and the independent measurements below them."""
+    """Stack the blocks, each at its columns, with rows of the priors below."""
     priors = [(i, f) for i, f in enumerate(problem.free) if f.has_prior]
     last = np.array([(f.prior_mean - theta[i]) / f.prior_sd for i, f in priors])
     rows = np.concatenate([*(b[1] for b in blocks), last])

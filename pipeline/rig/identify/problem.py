@@ -1,4 +1,4 @@
-"""What is identified from what: unknowns, pieces of recordings, and how parameters follow from unknowns."""
+"""Define the fitting problem: unknowns, pieces of recordings, and parameters as functions of unknowns."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ from magpend_core.models.parameters import Parameters
 from magpend_core.sampling import Drive, with_recorded_drive
 
 ZERO = "zero"
-"""First word of the names of sensors' zeros: ``zero.CHANNEL`` or ``zero.CHANNEL.RECORDING``."""
+"""Prefix of the names of sensors' zeros: ``zero.CHANNEL`` or ``zero.CHANNEL.RECORDING``."""
 
 
 @dataclass(frozen=True)
 class Free:
-    """One unknown: a parameter of the model or a sensor's zero.
+    """An unknown: a parameter of the model or a sensor's zero.
 
     Attributes
     ----------
     name : str
-        The parameter's, or ``zero.CHANNEL`` for all recordings, ``zero.CHANNEL.RECORDING`` for one.
+        Name of the parameter; ``zero.CHANNEL`` for all recordings, ``zero.CHANNEL.RECORDING`` for one.
     start, lower, upper : float
         First guess and bounds [SI].
     unit, meaning : str
+        Unit, and description in words.
     prior_mean, prior_sd : float
-        An independent measurement; NaN for none.
+        Mean and standard deviation of an independent measurement; NaN for none.
     """
 
     name: str
@@ -44,7 +45,7 @@ class Free:
 
     @property
     def size(self) -> float:
-        """What counts as 1 in this unknown: steps of differences and of the search are fractions of it."""
+        """Scale of the unknown; steps of differences and of the search are fractions of it."""
         width = self.upper - self.lower
         least = 1e-2 * width if math.isfinite(width) else 0.0
         return max(abs(self.start), least) or 1.0
@@ -62,17 +63,17 @@ class Piece:
     Attributes
     ----------
     recording, number : int
-        Of the recording, and of the piece in it.
+        Index of the recording, and of the piece in it.
     time : ndarray, (n,)
-        Since the stretch's start, rising from 0 [s].
+        Time since the stretch's start, rising from 0 [s].
     measured : ndarray, (n, n_channels)
-        NaN where nothing was measured [SI].
+        Measured values [SI]; NaN where nothing was measured.
     start : ndarray, (n_states,)
         First guess of the state at time 0 [SI].
     drive : Drive, optional
-        None for none.
+        Drive of the piece; None for none.
     follows : int
-        Number, in the problem, of the stretch that this one continues; -1 for none.
+        Index in the problem of the stretch that this one continues; -1 for none.
     """
 
     recording: int
@@ -86,31 +87,34 @@ class Piece:
 
 @dataclass(frozen=True)
 class Problem:
-    """Least squares of measured states over parameters and the pieces' starts.
+    """A least-squares problem: measured states against parameters and the pieces' starts.
 
     Attributes
     ----------
     model : Model
+        Model that is fitted.
     fixed : Parameters
-        Values of all that is not identified.
+        Values of the parameters that are not identified.
     free : tuple of Free
+        Unknowns.
     tied : dict
-        Parameter to factor and name of the one that it follows.
+        By parameter, the factor and the name of the parameter that it follows.
     channels : tuple of str
-        The states that are compared.
+        States that are compared.
     pieces : tuple of Piece
+        Pieces that are fitted.
     noise : ndarray, (n_channels,)
-        Standard deviation that counts as 1 [SI].
+        Standard deviations that residuals are divided by [SI].
     loss : str
         ``linear``, ``soft_l1``, ``huber`` or ``cauchy``, as in `scipy.optimize.least_squares`.
     loss_scale : float
-        Residual, in units of the noise, from which on a robust loss grows slower than the square.
+        Residual, in units of the noise, above which a robust loss grows slower than the square.
     continuity : float, optional
         Weight of the gap between a stretch's end and the next one's start; None leaves the starts free.
     rtol : float
         Tolerance of the integration, relative and absolute.
     slopes : str
-        How slopes are taken: ``differences`` between lanes or ``variational`` equations.
+        Method for slopes: ``differences`` between lanes or ``variational`` equations.
     recorded : bool
         Whether the pieces' drives are measured torques instead of the model's own drive.
     """
@@ -131,7 +135,7 @@ class Problem:
 
     @cached_property
     def system(self) -> System:
-        """What is integrated."""
+        """System that is integrated."""
         return with_recorded_drive(self.model.system) if self.recorded else self.model.system
 
     @property
@@ -161,17 +165,17 @@ class Problem:
 
     @cached_property
     def columns(self) -> tuple[int, ...]:
-        """Number of each channel's state."""
+        """Index of each channel's state."""
         return tuple(self.model.state_names.index(name) for name in self.channels)
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """Numbers of the unknowns on which the trajectories depend."""
+        """Indices of the unknowns on which the trajectories depend."""
         return tuple(i for i, f in enumerate(self.free) if not f.name.startswith(f"{ZERO}."))
 
     @cached_property
     def zeros(self) -> np.ndarray:
-        """Derivative of what a sensor reads by the unknowns: (recording, n_channels, n_free) of 0 and 1."""
+        """Derivative of the sensors' readings by the unknowns, (recording, n_channels, n_free), 0 or 1."""
         n = 1 + max((p.recording for p in self.pieces), default=0)
         found = np.zeros((n, len(self.channels), len(self.free)))
         for i, f in enumerate(self.free):
@@ -183,9 +187,10 @@ class Problem:
 
     @cached_property
     def state_noise(self) -> np.ndarray:
-        """Standard deviation that counts as 1 in each state, (n_states,).
+        """Standard deviation that gaps in each state are divided by, (n_states,).
 
-        The noise of the channels; that of other states is in proportion to their spread over the starts.
+        Channels have their noise. The values of other states are proportional to their spread over the
+        starts.
         """
         spread = self.starts.std(axis=0) + 1e-12 * np.array(self.model.scales)
         reference = float(np.mean(self.noise / spread[list(self.columns)]))
@@ -194,7 +199,7 @@ class Problem:
         return np.asarray(noise)
 
     def values(self, theta: np.ndarray) -> dict[str, float]:
-        """Parameters by name for values of the unknowns."""
+        """Return the parameters by name for given unknowns."""
         found = self.fixed.as_dict()
         found |= {self.free[i].name: float(theta[i]) for i in self.moving}
         for name, (factor, other) in self.tied.items():
@@ -202,7 +207,7 @@ class Problem:
         return found
 
     def pack(self, thetas: np.ndarray) -> np.ndarray:
-        """Packed parameters for rows of unknowns, (n, n_parameters)."""
+        """Return packed parameters for rows of unknowns, (n, n_parameters)."""
         names = list(self.fixed.names)
         packed = np.tile(self.fixed.pack(), (len(thetas), 1))
         for i in self.moving:
@@ -215,7 +220,7 @@ class Problem:
     def without(self, fixed: Mapping[str, float]) -> Problem:
         """Return the problem with some unknowns held at given values.
 
-        A sensor's zero that is held moves into the measured values.
+        A sensor's zero that is held is subtracted from the measured values.
         """
         held = {name: value for name, value in fixed.items() if not name.startswith(f"{ZERO}.")}
         kept = tuple(f for f in self.free if f.name not in fixed)

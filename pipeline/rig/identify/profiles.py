@@ -1,8 +1,8 @@
-"""Profile likelihoods: how the best fit gets worse as one parameter is held off its estimate.
+"""Compute profile likelihoods: the growth of the criterion as one parameter is held off its estimate.
 
-The interval is where twice the growth of the criterion stays below what the covariance makes of it, so that
-on a quadratic criterion it is the interval of the standard error, autocorrelated residuals included; where it
-is not, the profile's interval is the better one (Raue et al., Bioinformatics 25, 2009, 1923).
+The growth is scaled by the covariance, autocorrelated residuals included. On a quadratic criterion the
+profile's interval therefore equals the interval of the standard error. On any other criterion the profile's
+interval is the better one (Raue et al., Bioinformatics 25, 2009, 1923).
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     from pipeline.rig.identify.problem import Problem
 
 STEPS = (0.4, 0.8, 1.2, 1.6)
-"""Where a profile is taken, on either side, in half widths of the interval of the standard error."""
+"""Distances at which a profile is computed on either side, in half widths of the interval."""
 
 TOLERANCES = (1e-9, 1e-6)
-"""Least and largest tolerance of the fits, see `pipeline.rig.identify.local.fit_local`."""
+"""Smallest and largest tolerance of the fits, see `pipeline.rig.identify.local.fit_local`."""
 
 UNKNOWN_STEP = 0.1
-"""Half width that is tried where the standard error is not known, as a share of the parameter's size."""
+"""Half width that is tried if the standard error is unknown, relative to the parameter's size."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """How the criterion grows away from an estimate.
+    """The growth of the criterion away from an estimate.
 
     Attributes
     ----------
@@ -37,10 +37,10 @@ class Profile:
     values : ndarray (n,)
         Rising, in the parameter's unit; the estimate is among them.
     growth : ndarray (n,)
-        Twice the growth of the cost over that of the best fit, divided by what one standard error makes of it
-        squared: 1 at one standard error on a quadratic criterion. NaN where a fit did not converge.
+        Twice the growth of the cost over the best fit, scaled so that it is 1 at one standard error on a
+        quadratic criterion. NaN where a fit did not converge.
     interval : tuple of float
-        95 %; infinite where the profile does not rise far enough within the bounds.
+        95 % interval; infinite where the profile does not rise far enough within the bounds.
     """
 
     name: str
@@ -50,28 +50,28 @@ class Profile:
 
     @property
     def lowest(self) -> float:
-        """Least growth: below 0 where a better fit than the best was found."""
+        """Least growth; below 0 if the profile found a better fit than the best."""
         return float(np.nanmin(self.growth))
 
 
 @dataclass(frozen=True)
 class Curvature:
-    """What is known of a parameter near its estimate.
+    """The curvature of the criterion along a parameter near its estimate.
 
     Attributes
     ----------
     error : float
         Standard error; infinite if it is not known.
     plain : float
-        Standard error of residuals that are independent and as large as the noise.
+        Standard error for independent residuals as large as the noise.
     critical : float
         Half width of the interval in standard errors.
     size : float
-        Of the parameter.
+        Size of the parameter.
     others : ndarray (n_free,)
-        By how much the optimum of all parameters moves with this one.
+        Derivative of the optimum of all parameters by this one.
     starts : ndarray (n_piece, n_states)
-        By how much that of the starts does.
+        Derivative of the optimum of the starts by this parameter.
     """
 
     error: float
@@ -85,16 +85,16 @@ class Curvature:
 def profile(
     problem: Problem, best: Fit, name: str, about: Curvature, fit_local: Callable[..., Fit]
 ) -> Profile:
-    """Take the profile of one parameter: all others and all starts fitted again at each value.
+    """Compute the profile of one parameter; all others and all starts are fitted again at each value.
 
     Parameters
     ----------
     problem, best
-        What was fitted, and its best fit.
+        Problem that was fitted, and its best fit.
     name
-        Of the free parameter.
+        Name of the free parameter.
     about
-        Its curvature.
+        Curvature along the parameter.
     fit_local
         See `pipeline.rig.identify.local.fit_local`.
     """
@@ -104,7 +104,7 @@ def profile(
     known = np.isfinite(about.error) and about.error > 0
     half = about.critical * about.error if known else UNKNOWN_STEP * about.size
     unit = (about.error / about.plain) ** 2 if known else 1.0
-    # the cost to a hundredth of what one standard error makes of it
+    # so that the cost is accurate to a hundredth of its growth at one standard error
     tolerance = float(np.clip(0.05 * unit / max(best.cost, 1e-300), *TOLERANCES))
     found = {estimate: 0.0}
     for side in (-1.0, 1.0):
@@ -124,11 +124,11 @@ def profile(
 
 
 def following(information: np.ndarray, index: int) -> np.ndarray:
-    """By how much the optimum of all parameters moves with one of them, (n_free,)."""
+    """Return the derivative of the optimum of all parameters by one of them, (n_free,)."""
     others = np.delete(np.arange(len(information)), index)
     moves = np.ones(len(information))
     both = information[np.ix_(others, others)]
-    # scaled, so that what is singular is told from what is small
+    # scaled, so that small columns are not taken for singular ones
     size = np.sqrt(np.maximum(np.diag(both), 1e-300))
     inverse = np.linalg.pinv(both / np.outer(size, size), rcond=1e-10, hermitian=True)
     moves[others] = -(inverse @ (information[others, index] / size)) / size
@@ -138,16 +138,16 @@ def following(information: np.ndarray, index: int) -> np.ndarray:
 def interval_of(
     values: np.ndarray, growth: np.ndarray, estimate: float, critical: float
 ) -> tuple[float, float]:
-    """Where the signed root of a profile's growth crosses the critical value, by linear interpolation.
+    """Return where the root of a profile's growth crosses the critical value, interpolated linearly.
 
     Parameters
     ----------
     values, growth
         See `Profile`.
     estimate
-        Where the growth is 0.
+        Value at which the growth is 0.
     critical
-        In standard errors.
+        Half width of the interval in standard errors.
     """
     ends: list[Any] = []
     for side in (-1.0, 1.0):

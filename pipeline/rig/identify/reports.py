@@ -1,4 +1,4 @@
-"""What is said of a finished identification: ``result.json``, the preset, the residuals, lines for people."""
+"""Report a finished identification: ``result.json``, the preset, the residuals, printed lines."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from pipeline.rig.identify.statistics import Covariance
 from pipeline.store.provenance import versions
 
 SAME = 1e-3
-"""Share by which the cost of a start that reached the same optimum may exceed the least."""
+"""Relative excess of the cost up to which a start has reached the best optimum."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Everything that was found, before it is written.
+    """All results of an identification before they are written.
 
     Attributes
     ----------
@@ -41,11 +41,11 @@ class Finding:
     directions : list of Direction
     profiles : dict of Profile
     fitted, held_out : Judgement
-        Of the pieces that were fitted, and of those that were not, if there are any.
+        Judgements of the fitted pieces, and of the held-out ones if there are any.
     n_effective : dict
-        Independent residuals by channel.
+        Number of independent residuals by channel.
     at_bound : list of str
-        For each unknown ``lower``, ``upper`` or nothing: at which of its bounds its estimate lies.
+        For each unknown, the bound at which its estimate lies: ``lower``, ``upper`` or an empty text.
     warnings : list of str
     """
 
@@ -63,7 +63,7 @@ class Finding:
 
     @property
     def values(self) -> dict[str, float]:
-        """All parameters of the model by name."""
+        """All parameters of the model by name [SI]."""
         return self.problem.values(self.best.theta)
 
     @property
@@ -77,12 +77,12 @@ class Finding:
         return sum(self.is_same(fit) for fit in self.starts.values())
 
     def is_same(self, fit: Fit) -> bool:
-        """Whether a start reached the best optimum."""
+        """Return whether a fit reached the best optimum."""
         return fit.converged and fit.cost <= (1 + SAME) * self.best.cost
 
 
 def zeros_of(problem: Problem, fit: Fit) -> dict[str, float]:
-    """Sensors' zeros of a fit by the names of their unknowns."""
+    """Return the sensors' zeros of a fit by the names of their unknowns."""
     named = zip(problem.names, fit.theta, strict=True)
     return {name: float(value) for name, value in named if name.startswith(f"{ZERO}.")}
 
@@ -91,7 +91,7 @@ def result_of(
     spec: IdentificationSpec, found: Finding, sources: Sequence[Source], digest: str,
     findings: Sequence[Sequence[str]],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return ``result.json`` as plain data; nothing in it depends on when or how fast it was found."""
+    """Return ``result.json`` as plain data. It does not depend on time or speed."""
     names = found.problem.names
     return {
         "title": spec.title,
@@ -131,7 +131,7 @@ def result_of(
 
 
 def _sureness(found: Finding) -> dict[str, Any]:
-    """Covariance, correlations, singular values and profiles as plain data."""
+    """Return covariance, correlations, singular values and profiles as plain data."""
     names = found.problem.names
     return {
         "covariance": {
@@ -164,7 +164,7 @@ def _sureness(found: Finding) -> dict[str, Any]:
 
 
 def _errors(sources: Sequence[Source], findings: Sequence[Sequence[str]]) -> list[str]:
-    """Findings that make what is computed from a recording wrong."""
+    """Return the findings that make results from a recording wrong."""
     return [
         f"{s.file} has an {line}" for s, said in zip(sources, findings, strict=True) for line in said
         if line.startswith("error")
@@ -193,26 +193,26 @@ def _estimate(found: Finding, i: int) -> dict[str, Any]:
 
 
 def interval_of(found: Finding, i: int) -> tuple[float, float]:
-    """95 % interval of an estimate by its standard error, within the bounds."""
+    """Return the 95 % interval of an estimate by its standard error, within the bounds."""
     free, value = found.problem.free[i], float(found.best.theta[i])
     half = found.covariance.critical * float(found.covariance.errors[i])
     return max(value - half, free.lower), min(value + half, free.upper)
 
 
 def _number(value: float) -> float | None:
-    """A number as JSON has it."""
+    """Return a number that JSON can hold; None if it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 
 def _plain(values: Any) -> Any:
-    """Nested lists of numbers as JSON has them."""
+    """Return nested lists of numbers that JSON can hold."""
     if isinstance(values, np.ndarray | list | tuple):
         return [_plain(v) for v in values]
     return _number(float(values))
 
 
 def write_values(path: Path, spec: IdentificationSpec, found: Finding, sources: Sequence[Source]) -> None:
-    """Write the preset: all parameters, each with where it comes from."""
+    """Write the preset: all parameters, each with its origin."""
     files = ", ".join(f"{s.file} (sha256 {s.sha256[:12]})" for s in sources)
     phrases = {}
     for i, free in enumerate(found.problem.free):
@@ -230,7 +230,7 @@ def write_values(path: Path, spec: IdentificationSpec, found: Finding, sources: 
 
 
 def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
-    """Return measured values, computed ones and residuals of all pieces, one after the other."""
+    """Return measured values and residuals of all pieces as a dataset, one piece after the other."""
     parts = [(found.fitted, 0)] + ([(found.held_out, 1)] if found.held_out is not None else [])
     columns: dict[str, list[np.ndarray]] = {}
 
@@ -264,7 +264,7 @@ def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
 
 
 def lines_of(result: Mapping[str, Any]) -> list[str]:
-    """Say a result to people."""
+    """Return the result as lines to print."""
     estimates = result["estimates"]
     width = max(map(len, estimates))
     lines = []
@@ -284,7 +284,7 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
 
 
 def judgement_lines(judged: Mapping[str, Any], units: Mapping[str, str]) -> list[str]:
-    """Both criteria, a line for each channel."""
+    """Return a line for each channel with its rms and correlation."""
     lines = []
     for name, rms in judged["rms"].items():
         shown = "-" if rms is None else f"{rms:.4g} {units[name]}"

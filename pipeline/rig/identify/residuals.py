@@ -1,4 +1,4 @@
-"""Views of residuals: by piece, along time, against the rate, and their distribution."""
+"""Compute views of residuals: by piece, along time, against the rate, and their distribution."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ from scipy import stats
 from pipeline.rig.identify.statistics import LEVEL, pooled_autocorrelation
 
 LONGEST_LAG = 1 / 3
-"""Of the shortest piece: how far the autocorrelation is shown."""
+"""Longest lag of the autocorrelation, as a fraction of the shortest piece."""
 
 BINS = 30
 
 
 @dataclass(frozen=True)
 class Series:
-    """Where a piece lies in a dataset of residuals.
+    """The place of a piece in a dataset of residuals.
 
     Attributes
     ----------
     recording, number : int
+        Index of the recording, and of the piece in it.
     held_out : bool
+        Whether the piece was held out.
     samples : tuple of int
-        First, and one past the last.
+        First sample, and one past the last.
     worst : float
-        Sum of the mean squares of its channels, each in units of that channel's mean over all pieces.
+        Mean square of its residuals, each channel relative to its mean square over all pieces.
     """
 
     recording: int
@@ -38,7 +40,7 @@ class Series:
     worst: float
 
     def of(self, ds: xr.Dataset) -> xr.Dataset:
-        """Its part of the dataset."""
+        """Return the piece's part of the dataset."""
         return ds.isel(sample=slice(*self.samples))
 
 
@@ -57,7 +59,7 @@ def pieces_in(ds: xr.Dataset) -> list[Series]:
 
 
 def per_piece(ds: xr.Dataset, channel: str) -> xr.Dataset:
-    """Root mean square of a channel's residuals by piece, in the order of recordings and pieces."""
+    """Return the rms of a channel's residuals by piece, in the order of recordings and pieces."""
     pieces = sorted(pieces_in(ds), key=lambda s: (s.recording, s.number))
     residual = ds[f"{channel}_residual"].values
     rms = [float(np.sqrt(np.nanmean(residual[slice(*s.samples)] ** 2))) for s in pieces]
@@ -72,9 +74,9 @@ def per_piece(ds: xr.Dataset, channel: str) -> xr.Dataset:
 
 
 def rate_of(ds: xr.Dataset, channel: str) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of the computed values of a channel, and the residuals there, of all fitted pieces.
+    """Return a channel's computed rates and its residuals at the same times, for all fitted pieces.
 
-    Computed values have no noise, so that differences of neighbours will do.
+    Computed values have no noise, so the rates are differences of neighbours.
     """
     rates, left = [], []
     for series in pieces_in(ds):
@@ -91,7 +93,7 @@ def rate_of(ds: xr.Dataset, channel: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residual_views(ds: xr.Dataset, channels: list[str]) -> xr.Dataset:
-    """Return the curves that are drawn of residuals: autocorrelation, mean against the rate, density.
+    """Return curves of the residuals: autocorrelation, mean against the rate, density.
 
     Parameters
     ----------

@@ -1,8 +1,9 @@
-"""The global stage: many first guesses, each followed to an optimum over stretches that grow.
+"""Search globally: follow many first guesses to an optimum, over stretches of growing length.
 
-Far from the truth a long piece is out of step with its recording and the cost is rugged. Short stretches
-from smoothed states are not, so a guess is first fitted to those, then to longer ones, and to the whole
-pieces with free starts at last (multiple shooting: Bezruchko et al., Chaos Solitons Fractals 29, 2006, 82).
+Far from the true parameters a long piece is out of phase with its recording, and the cost is rugged. Short
+stretches from smoothed states are not, so a guess is first fitted to those, then to longer ones, and to the
+whole pieces with free starts at last (multiple shooting: Bezruchko et al., Chaos Solitons Fractals 29, 2006,
+82).
 """
 
 from __future__ import annotations
@@ -24,24 +25,24 @@ from pipeline.rig.identify.starts import fit_starts
 Array = NDArray[np.float64]
 
 STRETCHES = (0.35, 0.8, 1.8)
-"""Lengths of stretches in periods of the slowest oscillation of the recordings, before whole pieces."""
+"""Lengths of stretches, in periods of the recordings' slowest oscillation, before whole pieces."""
 
 STAGE_EVALUATIONS, STAGE_TOLERANCE = 25, 1e-4
 STAGE_SAMPLES = 40
-"""Samples of a stretch that are looked at before whole pieces."""
+"""Samples of a stretch that are used before whole pieces."""
 
 POPULATION = 32
-"""Members that are integrated at once."""
+"""Members that are integrated at the same time."""
 
 
 class Keep(Protocol):
-    """Stores and recalls the outcome of a start by its number."""
+    """A store of the outcomes of starts, by their numbers."""
 
     def recall(self, number: int) -> Fit | None:
-        """Return the outcome if it is stored."""
+        """Return the outcome of a start if it is stored; otherwise None."""
 
     def store(self, number: int, fit: Fit) -> None:
-        """Store it."""
+        """Store the outcome of a start."""
 
 
 def search(
@@ -55,26 +56,27 @@ def search(
     keep: Keep | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> list[Fit]:
-    """Fit from many first guesses.
+    """Fit from many first guesses; return the fits, best first.
 
     Parameters
     ----------
     problem
     n_starts
-        First guesses that are followed to an optimum; the first is the problem's own.
+        Number of first guesses that are followed to an optimum; the first is the problem's own.
     seed
-        Of the guesses.
+        Seed of the guesses.
     spread
-        They lie within this fraction of the problem's own guess around it, and within the bounds.
+        Largest distance of a guess from the problem's own, relative to the unknowns' sizes. All guesses lie
+        within the bounds.
     method
         ``sobol``: the best of `n_samples` points of a Sobol sequence are followed, and CMA-ES is tried if
         none of them converges; ``cma``: CMA-ES over the shortest stretches finds the guesses.
     n_samples
-        Points that are looked at; at least `n_starts`.
+        Number of points that are evaluated; at least `n_starts`.
     keep
-        Stores outcomes one by one, so that a killed search goes on.
+        Store of outcomes, so that a killed search can continue.
     tell
-        Says what has been found.
+        Function that prints a line about each outcome.
 
     Returns
     -------
@@ -95,7 +97,7 @@ def _kept(
     problem: Problem, stages: Sequence[Problem], k: int, theta: Array, total: int, keep: Keep | None,
     tell: Callable[[str], None],
 ) -> Fit:  # fmt: skip
-    """Return a start's outcome, from the store if it is there."""
+    """Return the outcome of a start: the stored one, or that of a new fit."""
     fit = keep.recall(k) if keep is not None else None
     if fit is None:
         fit = refine(
@@ -114,7 +116,7 @@ def _kept(
 def guess(
     problem: Problem, n_starts: int, seed: int, spread: float, method: str, n_samples: int, shortest: Problem
 ) -> list[Array]:
-    """Return first guesses, the problem's own first."""
+    """Return first guesses; the problem's own comes first."""
     if n_starts == 1:
         return [problem.start]
     if method == "cma":
@@ -130,7 +132,7 @@ def guess(
 
 
 def sobol(problem: Problem, n: int, seed: int, spread: float) -> Array:
-    """Points of a scrambled Sobol sequence around the problem's own guess, (n, n_free)."""
+    """Return points of a scrambled Sobol sequence around the problem's own guess, (n, n_free)."""
     from scipy.stats import qmc
 
     if n < 1 or not problem.free:
@@ -142,7 +144,7 @@ def sobol(problem: Problem, n: int, seed: int, spread: float) -> Array:
 
 
 def costs(problem: Problem, thetas: Array) -> Array:
-    """Costs of a population with the starts as guessed; infinite where a trajectory diverges."""
+    """Return the costs of a population with the starts as guessed; infinite if a trajectory diverges."""
     found = []
     for at in range(0, len(thetas), POPULATION):
         members = thetas[at : at + POPULATION]
@@ -152,7 +154,7 @@ def costs(problem: Problem, thetas: Array) -> Array:
 
 
 def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
-    """Look for the least cost over short stretches by CMA-ES; a population per call of the engine."""
+    """Minimise the cost over short stretches by CMA-ES, one population per call of the engine."""
     import cma
 
     sizes = np.array([f.size for f in problem.free])
@@ -173,10 +175,10 @@ def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
 def refine(
     problem: Problem, theta: Array, *, stages: Sequence[Problem] | None = None, echo: Echo | None = None
 ) -> Fit:
-    """Fit from one first guess: short stretches, longer ones, whole pieces, all with free starts.
+    """Fit from one first guess: over short stretches, longer ones, then whole pieces, with free starts.
 
-    Where noise leads short stretches astray, longer ones may not find back: so whole pieces decide which
-    length's outcome the last fit begins with.
+    Noise may lead short stretches to a wrong optimum from which longer ones do not return. The last fit
+    therefore begins from the stage whose outcome has the least cost over whole pieces.
     """
     candidates = []
     for stage in _stages(problem) if stages is None else stages:
@@ -192,7 +194,7 @@ def refine(
 
 
 def _stages(problem: Problem) -> list[Problem]:
-    """Return the problem over stretches of growing lengths, with starts read off the recordings."""
+    """Return the problem over stretches of growing lengths, with starts estimated from the recordings."""
     longest = max(p.time[-1] for p in problem.pieces)
     period = slowest_period(problem)
     lengths = [share * period for share in STRETCHES if share * period < 0.8 * longest]
@@ -200,9 +202,9 @@ def _stages(problem: Problem) -> list[Problem]:
 
 
 def slowest_period(problem: Problem) -> float:
-    """Longest period [s] of a channel's oscillations, by its crossings of its mean.
+    """Return the longest period [s] of the channels' oscillations, from crossings of their mean.
 
-    The length of the longest piece if there are none.
+    Without crossings, return the length of the longest piece.
     """
     found = []
     for k in range(len(problem.channels)):
@@ -219,9 +221,9 @@ def slowest_period(problem: Problem) -> float:
 
 
 def cut(problem: Problem, length_s: float) -> Problem:
-    """Return the problem over stretches of about a length, thinned out, with starts that are read off.
+    """Return the problem over thinned stretches of about a given length, with starts estimated from the data.
 
-    The rates at the starts are those of local cubic polynomials through a sixth of a stretch on either side.
+    Local cubic polynomials through a sixth of a stretch on either side give the rates at the starts.
     """
     pieces = [stretch for p in problem.pieces for stretch in _stretches(problem, p, length_s)]
     return replace(problem, pieces=tuple(pieces), continuity=None, loss="linear")
@@ -249,7 +251,7 @@ def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
 
 
 def _read_off(problem: Problem, piece: Piece, at: int, half: int) -> Array:
-    """State at a sample: measured channels, and their rates, by a local cubic polynomial."""
+    """Estimate the state at a sample: channels and their rates, from a local cubic polynomial."""
     window = slice(max(at - half, 0), at + half + 1)
     t = piece.time[window] - piece.time[at]
     state = np.array(piece.start)

@@ -1,4 +1,4 @@
-"""What was set otherwise in one recording than in others: values of parameters that go with its pieces."""
+"""Apply parameter values that were set in single recordings only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.rig.identify.problem import Piece
 
 
 def setting_problems(model: Model, values: Mapping[str, float], where: str) -> list[str]:
-    """Say which settings are no parameters of the model, or out of their bounds."""
+    """Return problems with settings: unknown parameters, values out of bounds."""
     found = []
     for name, value in values.items():
         if name not in model.parameter_names:
@@ -28,19 +28,19 @@ def setting_problems(model: Model, values: Mapping[str, float], where: str) -> l
 
 
 def apply_settings(pieces: Sequence[Piece], settings: Mapping[int, Mapping[str, float]]) -> list[Piece]:
-    """Give each piece the settings of its recording, as values that its drive brings along.
+    """Give each piece the settings of its recording, as parameter values of its drive.
 
     Parameters
     ----------
     pieces
-        Of any recordings.
+        Pieces of any recordings.
     settings
-        Values of parameters by number of the recording.
+        Values of parameters by index of the recording.
 
     Returns
     -------
     list of Piece
-        Their drives all bring values of the same parameters; NaN leaves a parameter as it is for all.
+        The drives of all pieces have values of the same parameters; NaN leaves a parameter unchanged.
     """
     names: dict[str, None] = {}
     for piece in pieces:

@@ -1,4 +1,4 @@
-"""The specification of an identification: what a person writes in TOML, validated as a whole."""
+"""Parse and validate the specification of an identification as a whole."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from pipeline.spec.tables import Table
 
 
 class SensorsTable(Table):
-    """What of the sensors is identified as well."""
+    """The table ``[sensors]``: unknowns of the sensors."""
 
     zero: Annotated[tuple[str, ...], Field(strict=False)] = Field(
         (), description="Channels whose zero is unknown: one offset per recording"
@@ -36,14 +36,14 @@ class SensorsTable(Table):
 
 
 class RecordingTable(Table):
-    """A recording, what its drive did, and what of it is used."""
+    """A table ``[[recordings]]``: a recording, the kind of its drive, and the part that is used."""
 
-    file: str = Field(description="The recording, seen from the specification")
-    mapping: str = Field(description="Its mapping file, likewise")
+    file: str = Field(description="Recording, relative to the specification")
+    mapping: str = Field(description="Mapping file of the recording, relative to the specification")
     drive: Literal["none", "recorded", "edges"] = Field(
         "none",
-        description="`none`: the drive was off; `recorded`: the torque is what was measured; `edges`: the "
-        "instants of switching are what was measured, shape and size are the model's",
+        description="`none`: the drive was off; `recorded`: the torque was measured; `edges`: the times of "
+        "switching were measured, the model gives shape and amplitude",
     )
     parameters: dict[str, float] = Field(
         default_factory=dict,
@@ -52,57 +52,60 @@ class RecordingTable(Table):
     piece_s: Annotated[float, Field(gt=0)] | None = Field(
         None, description="Cut pieces into equal stretches of about this length [s], each with a free start"
     )
-    window_s: Pair | None = Field(None, description="Part that is used [s since the first sample]")
+    window_s: Pair | None = Field(
+        None, description="Start and end of the part that is used [s since the first sample]"
+    )
     hold_out: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = Field(
-        (), description="Numbers of pieces (of stretches, with `piece_s`) that are judged, not fitted"
+        (), description="Indices of pieces (with `piece_s`, of stretches) that are judged but not fitted"
     )
 
 
 class FitTable(Table):
-    """The criterion."""
+    """The table ``[fit]``: the criterion of the fit."""
 
     channels: Annotated[tuple[str, ...], Field(strict=False)] = Field(
-        (), description="States that are compared; by default all that are measured in all recordings, rates "
-        "left out where their angles are measured",
+        (), description="States that are compared; by default those that all recordings measure, without "
+        "rates of measured angles",
     )  # fmt: skip
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = Field(
-        "linear", description="Of residuals in units of their scale; `linear` is least squares"
+        "linear", description="Loss of residuals in units of their scale; `linear` is least squares"
     )
     continuity: Literal["free"] | Annotated[float, Field(gt=0, strict=False)] = Field(
         "free",
-        description="Of stretches cut by `piece_s`: `free`, or the weight of the gaps between the end of one "
-        "and the start of the next, in units of the noise",
+        description="For stretches cut by `piece_s`: `free` starts, or the weight of the gap between the end "
+        "of one and the start of the next, in units of the noise",
     )
     noise: dict[str, Annotated[float, Field(gt=0)]] = Field(
         default_factory=dict,
-        description="Standard deviation that channels are weighted with; by default as estimated, the same "
-        "for all channels of one unit",
+        description="Standard deviation that channels are weighted with; by default estimated, one value for "
+        "all channels of a unit",
     )
-    decimate: Annotated[int, Field(ge=1)] = Field(1, description="Take every so many samples")
+    decimate: Annotated[int, Field(ge=1)] = Field(1, description="Step between the samples that are used")
     rtol: Annotated[float, Field(gt=0, le=1e-3)] = Field(1e-8, description="Tolerance of the integration")
     slopes: Literal["differences", "variational"] = Field(
         "differences",
-        description="Sensitivities: differences between lanes, or variational equations (exacter, slower)",
+        description="Sensitivities: differences between lanes, or variational equations (more exact, slower)",
     )
 
 
 class SearchTable(Table):
-    """The global stage, and what is done after it."""
+    """The table ``[search]``: the global search, and the profiles after it."""
 
     n_starts: Annotated[int, Field(ge=1, le=10_000)] = Field(
-        8, description="First guesses that are followed to an optimum, the specification's own first"
+        8,
+        description="Number of first guesses that are refined; the first is the specification's",
     )
-    seed: Annotated[int, Field(ge=0)] = Field(1, description="Of the guesses")
+    seed: Annotated[int, Field(ge=0)] = Field(1, description="Seed of the guesses")
     spread: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.3, description="How far from the specification's starts they lie, as a share of these"
+        0.3, description="Largest distance of guesses from the specification's start, relative to it"
     )
     method: Literal["sobol", "cma"] = Field(
         "sobol", description="`sobol`: the best of many points; `cma`: CMA-ES over short stretches"
     )
     n_samples: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
-        256, description="Points that are looked at for the best `n_starts`"
+        256, description="Number of points from which the best `n_starts` are chosen"
     )
-    profiles: bool = Field(True, description="Take profile likelihoods")
+    profiles: bool = Field(True, description="Whether to compute profile likelihoods")
 
 
 @dataclass(frozen=True)
@@ -112,20 +115,23 @@ class IdentificationSpec:
     Attributes
     ----------
     title : str
+        Title of the identification.
     model : Model
+        Model that is fitted.
     preset : str, optional
-        As written; by default the model's first.
+        Preset as given; by default the model's first.
     parameters : dict
-        Fixed values by name, over the preset's.
+        Fixed values by name, which replace the preset's.
     values : Parameters
-        Of the preset with `parameters` put in.
+        Values of the preset with `parameters` applied.
     unknowns : tuple of Unknown
+        Identified parameters.
     tied : dict
-        Factor and name of the identified parameter that a parameter follows.
+        By parameter, the factor and the name of the identified parameter that it follows.
     sensors, recordings, fit, search
-        The tables.
+        Tables of the specification.
     folder : Path
-        That relative paths are relative to.
+        Folder that paths of files are relative to.
     """
 
     title: str
@@ -152,11 +158,11 @@ class IdentificationSpec:
         return tuple(u.name for u in self.unknowns)
 
     def path(self, name: str) -> Path:
-        """A file that the specification names."""
+        """Return the path of a file that the specification names."""
         return self.folder / name
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data with all defaults filled in, the title left out; equal for equal identifications."""
+        """Return plain data with all defaults filled in, without title; equal for equal identifications."""
         return {
             "kind": IDENTIFICATION,
             "model": self.model.reference,
@@ -178,7 +184,7 @@ class IdentificationSpec:
 
 
 def _plain(bound: float) -> float | str:
-    """A bound as JSON has it."""
+    """Return a bound that JSON can hold."""
     return bound if math.isfinite(bound) else str(bound)
 
 
@@ -201,7 +207,7 @@ def load_identification(path: str | Path) -> IdentificationSpec:
 
 
 def parse_identification(data: Mapping[str, Any], folder: Path) -> IdentificationSpec:
-    """Validate plain data; `folder` is what the names of files are relative to.
+    """Validate the tables of a specification; paths of files are relative to `folder`.
 
     Raises
     ------
@@ -245,7 +251,7 @@ def _text(data: Mapping[str, Any], key: str, problems: list[str]) -> str | None:
 
 
 def _found(preset: str | None, folder: Path) -> str | Path | None:
-    """A preset's name, or the path of its file."""
+    """Return a preset's name, or the path of its file."""
     return folder / preset if preset is not None and is_file(preset) else preset
 
 
@@ -289,7 +295,7 @@ def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> t
 
 
 def _channel_problems(model: Model, sensors: SensorsTable | None, fit: FitTable | None) -> list[str]:
-    """Channels that are no states of the model."""
+    """Return problems with channels that are not states of the model."""
     named = {
         "sensors.zero": sensors.zero if sensors is not None else (),
         "fit.channels": fit.channels if fit is not None else (),

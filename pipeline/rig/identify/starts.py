@@ -1,4 +1,4 @@
-"""The pieces' starts for given parameters: small problems of their own, side by side or projected out."""
+"""Fit the pieces' starts for given parameters, or project them out of the problem."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ Array = NDArray[np.float64]
 MAX_ITERATIONS = 40
 FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-3, 0.1, 10.0, 1e12
 SETTLED = 1e-10
-"""Relative decrease of a piece's cost, as its slopes promise it, at which its start counts as found."""
+"""Relative decrease of a piece's cost, predicted by its slopes, below which its start is found."""
 
 
 class Starts(NamedTuple):
-    """Starts, and which of them have settled at an optimum."""
+    """The fitted starts, and which of them have converged."""
 
     starts: Array  # (n_piece, n_states)
     settled: NDArray[np.bool_]  # (n_piece,)
 
 
 def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
-    """Least squares of each piece over its own start, the unknowns held (Levenberg and Marquardt).
+    """Fit each piece's start by least squares with the unknowns held (Levenberg and Marquardt).
 
-    All pieces go together through the engine, each with its own damping; gaps between stretches do not count.
+    The engine integrates all pieces together; each has its own damping. Gaps between stretches do not count.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
     Returns
     -------
     Starts
-        None of them worse than its guess.
+        No start is worse than its guess.
     """
     held = replace(problem.without(dict(zip(problem.names, theta, strict=True))), continuity=None)
     found = np.array(starts)
@@ -54,7 +54,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
         steps = np.zeros_like(found)
         for k in np.flatnonzero(moving):
             steps[k], gain = _step(*blocks[k], damping[k])
-            # where rounding decides, no step is a better one
+            # below this gain, rounding decides and no step improves the start
             moving[k] = gain > SETTLED * _cost(blocks[k]) and damping[k] < MOST_DAMPING
         still = np.flatnonzero(moving)
         if not len(still):
@@ -70,7 +70,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
 
 
 def block_rows(problem: Problem) -> list[slice]:
-    """Rows of each piece in a compressed evaluation."""
+    """Return the rows of each piece in a compressed evaluation."""
     n_own = len(problem.free) + len(problem.model.states)
     sizes = [min(int(np.isfinite(p.measured).sum()), n_own + 1) for p in problem.pieces]
     ends = np.cumsum([0, *sizes])
@@ -78,7 +78,7 @@ def block_rows(problem: Problem) -> list[slice]:
 
 
 class _Block(NamedTuple):
-    """Slopes of a piece's compressed rows by its start, and the rows."""
+    """The compressed rows of a piece, and their slopes by its start."""
 
     jacobian: Array
     rows: Array
@@ -98,7 +98,7 @@ def _cost(block: _Block) -> float:
 
 
 def _step(jacobian: Array, rows: Array, damping: float) -> tuple[Array, float]:
-    """Damped Gauss-Newton step, and the decrease of the cost that the slopes promise without damping."""
+    """Return a damped Gauss-Newton step, and the decrease of the cost predicted without damping."""
     size = np.sqrt(damping) * np.linalg.norm(jacobian, axis=0)
     stacked = np.vstack([jacobian, np.diag(np.maximum(size, 1e-300))])
     right = np.concatenate([-rows, np.zeros(len(size))])
@@ -107,13 +107,13 @@ def _step(jacobian: Array, rows: Array, damping: float) -> tuple[Array, float]:
 
 
 def _own(problem: Problem, evaluation: Evaluation, k: int, here: slice) -> Array:
-    """Slopes of a piece's rows by its own start."""
+    """Return the slopes of a piece's rows by its own start."""
     n, n_free = len(problem.model.states), len(problem.free)
     return evaluation.jacobian[here, n_free + k * n : n_free + (k + 1) * n]
 
 
 def carry_starts(problem: Problem, evaluation: Evaluation, starts: Array, change: Array) -> Array:
-    """Starts that a change of the unknowns asks for, to first order, (n_piece, n_states)."""
+    """Return the starts after a change of the unknowns, to first order, (n_piece, n_states)."""
     found, n_free = np.array(starts), len(problem.free)
     for k, here in enumerate(block_rows(problem)):
         wanted = evaluation.rows[here] + evaluation.jacobian[here, :n_free] @ change
@@ -122,13 +122,13 @@ def carry_starts(problem: Problem, evaluation: Evaluation, starts: Array, change
 
 
 def project_starts_out(problem: Problem, evaluation: Evaluation) -> tuple[Array, Array]:
-    """Rows and slopes by the unknowns, less what changes of the starts can do.
+    """Return rows and slopes by the unknowns, with the directions of the starts projected out.
 
     Parameters
     ----------
     problem
     evaluation
-        With slopes, at starts that are optimal for its unknowns.
+        Evaluation with slopes, at starts that are optimal for its unknowns.
 
     Returns
     -------

@@ -1,18 +1,21 @@
-"""How sure estimates are: covariance with the starts eliminated, intervals, autocorrelated residuals.
+"""Estimate the errors of a fit: covariance with starts eliminated, intervals, autocorrelation.
 
-Everything is in units of the noise that the fit was weighted with. With slopes J = (A, B) of residuals with
-respect to the parameters and the starts, ``H = J'J`` and ``X = H_ss^-1 H_sp``, the slopes that are left
-to the parameters are ``A - B X``, and their information is the Schur complement ``S = H_pp - H_ps X``.
+Everything is in units of the noise that the fit was weighted with. Let J = (A, B) be the slopes of the
+residuals by the parameters and by the starts, ``H = J'J`` and ``X = H_ss^-1 H_sp``. With the starts
+eliminated, the slopes by the parameters are ``A - B X``, and their information is the Schur complement ``S =
+H_pp - H_ps X``.
 
-Residuals of a real rig are autocorrelated: what the model lacks swings with the motion. Taking them as
-independent makes intervals too narrow by the square root of their number per independent one. So, where they
-are found to be autocorrelated, the variance of the scores comes from the scores themselves:
+Residuals of a real rig are autocorrelated, since the model's error oscillates with the motion. If they were
+taken as independent, intervals would be too narrow by the square root of the number of residuals per
+independent one. If residuals are found to be autocorrelated, the variance of the scores is estimated from the
+scores:
 
-- over pieces, which are independent stretches, by the delete-one jackknife (Bell & McCaffrey, Survey
-  Methodology 28, 2002, 169, "CR3"; one step from the optimum, exact for a linear model), with Student's t of
-  one less than their number, where there are at least `FEWEST_PIECES`;
-- along time else, after Newey & West (Econometrica 55, 1987, 703), with the critical values for a bandwidth
-  that is a share of the sample (Kiefer & Vogelsang, Econometric Theory 21, 2005, 1130, Table 1).
+- with at least `FEWEST_PIECES` independent pieces, over pieces by the delete-one jackknife (Bell & McCaffrey,
+  Survey Methodology 28, 2002, 169, "CR3"; one step from the optimum, exact for a linear model), with
+  Student's t for one degree of freedom less than their number;
+- otherwise along time after Newey & West (Econometrica 55, 1987, 703), with critical values for a bandwidth
+that
+  is a fixed fraction of the sample (Kiefer & Vogelsang, Econometric Theory 21, 2005, 1130, Table 1).
 """
 
 from __future__ import annotations
@@ -25,45 +28,45 @@ import numpy as np
 from scipy import signal, stats
 
 FEWEST_PIECES = 8
-"""Pieces below which their scatter says too little of a variance."""
+"""Fewest pieces whose scatter gives a variance."""
 
 LEVEL = 0.95
 WHITE_LEVEL = 0.01
-"""Chance that white residuals are taken for autocorrelated ones."""
+"""Probability that white residuals are taken for autocorrelated ones."""
 
 LAGS = 20
-"""Lags that the test for autocorrelation looks at."""
+"""Largest number of lags in the test for autocorrelation."""
 
 SINGULAR = 1e-12
-"""Share of the largest eigenvalue of the scaled information below which a direction is not determined."""
+"""Ratio to the largest eigenvalue of the scaled information below which a direction is not determined."""
 
 Estimator = Literal["white", "pieces", "newey-west"]
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """The fit near its optimum, the starts eliminated; units of the noise.
+    """A fit near its optimum with the starts eliminated, in units of the noise.
 
     Attributes
     ----------
     information : ndarray (n_free, n_free)
-        Of everything: data, priors, continuity.
+        Information from data, priors and continuity.
     prior : ndarray (n_free,)
         Information of the priors, 1/sd^2; 0 where there is none.
     residuals : tuple of ndarray (n, n_channels)
-        By piece, NaN where nothing was measured.
+        Residuals by piece; NaN where nothing was measured.
     slopes : tuple of ndarray (n, n_channels, n_free)
-        Of the residuals with respect to the parameters, by piece, the starts following.
+        Slopes of the residuals by the parameters, by piece, with the starts eliminated.
     groups : tuple of int
         The independent stretch that each piece belongs to.
     n_starts : int
         Number of fitted components of starts.
     loss : str
-        As `scipy.optimize.least_squares` names it.
+        Name of the loss in `scipy.optimize.least_squares`.
     loss_scale : float
-        Residual from which on a robust loss grows slower than the square.
+        Residual above which a robust loss grows slower than the square.
     following : ndarray (n_piece, n_states, n_free), optional
-        By how much the optimum of the starts moves with the parameters.
+        Derivative of the optimum of the starts by the parameters.
     """
 
     information: np.ndarray
@@ -89,21 +92,22 @@ class Linearised:
 
 @dataclass(frozen=True)
 class Covariance:
-    """Covariance of the estimates, and what it rests on.
+    """The covariance of the estimates, with the method that gave it.
 
     Attributes
     ----------
     matrix : ndarray (n_free, n_free)
-        NaN in rows and columns of what is not determined.
+        NaN in rows and columns of parameters that are not determined.
     estimator : str
+        Name of the method.
     why : str
-        A sentence.
+        A sentence that gives the reason for the method.
     critical : float
         Half width of a 95 % interval in standard errors.
     degrees : float
         Degrees of freedom of Student's t.
     inflation : float
-        Factor by which standard errors exceed those of residuals as large as the noise that is weighted with.
+        Ratio of the standard errors to those of independent residuals as large as the noise.
     """
 
     matrix: np.ndarray
@@ -115,13 +119,13 @@ class Covariance:
 
     @property
     def errors(self) -> np.ndarray:
-        """Standard errors (n_free,); infinite where the data and priors say nothing."""
+        """Standard errors (n_free,); infinite for parameters that are not determined."""
         variance = np.diag(self.matrix)
         return np.where(np.isnan(variance), np.inf, np.sqrt(np.abs(variance)))
 
     @property
     def correlations(self) -> np.ndarray:
-        """Correlation matrix (n_free, n_free), NaN for what is not determined."""
+        """Correlation matrix (n_free, n_free); NaN for parameters that are not determined."""
         errors = np.sqrt(np.abs(np.diag(self.matrix)))
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.clip(self.matrix / np.outer(errors, errors), -1.0, 1.0))
@@ -142,36 +146,36 @@ def eliminate_starts(jacobian: np.ndarray, n_free: int) -> tuple[np.ndarray, np.
     information : ndarray (n_free, n_free)
         Schur complement of the starts' block of ``jacobian.T @ jacobian``.
     following : ndarray (n_starts, n_free)
-        By how much the starts' optimum moves *against* a change of the parameters: X above.
+        The matrix X of the module: minus the derivative of the starts' optimum by the parameters.
     """
     own, starts = jacobian[:, :n_free], jacobian[:, n_free:]
-    # without squaring the condition number; a start that nothing determines follows nothing
+    # lstsq does not square the condition number, and gives 0 for undetermined starts
     following = np.linalg.lstsq(starts, own, rcond=None)[0]
     left = own - starts @ following
     return left.T @ left, following
 
 
 def pooled_autocorrelation(residuals: Sequence[np.ndarray], most: int) -> np.ndarray:
-    """See `pooled_pairs`: the autocorrelation alone."""
+    """Return the autocorrelation of one channel's residuals over all pieces; see `pooled_pairs`."""
     return pooled_pairs(residuals, most)[0]
 
 
 def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Autocorrelation of residuals of one channel about 0, over all pieces together.
+    """Return the autocorrelation about 0 of one channel's residuals over all pieces, and numbers of pairs.
 
     Parameters
     ----------
     residuals
-        (n,) of each piece; NaN counts as not measured.
+        Residuals of each piece, (n,); NaN where nothing was measured.
     most
         Largest lag.
 
     Returns
     -------
     autocorrelation : ndarray (most + 1,)
-        At lags 0, 1, ...; NaN where no piece is as long.
+        At lags 0, 1, ...; NaN where no piece is long enough.
     pairs : ndarray (most + 1,)
-        Number of pairs of residuals that each rests on.
+        Number of pairs of residuals at each lag.
     """
     products, pairs = np.zeros(most + 1), np.zeros(most + 1)
     for r in residuals:
@@ -187,12 +191,12 @@ def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray
 
 
 def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
-    """Whether residuals of any channel are autocorrelated, by a Ljung-Box test over all pieces.
+    """Return whether any channel's residuals are autocorrelated, by a Ljung-Box test over all pieces.
 
     Parameters
     ----------
     residuals
-        (n, n_channels) of each piece.
+        Residuals of each piece, (n, n_channels).
     """
     n_channels = residuals[0].shape[1]
     shortest = min(len(r) for r in residuals)
@@ -207,21 +211,21 @@ def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
 
 
 def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
-    """How long residuals remember.
+    """Return the correlation length of residuals, and their number per independent one.
 
     Parameters
     ----------
     rho
         Autocorrelation at lags 0, 1, ...
     n
-        Number of residuals it comes from.
+        Number of residuals.
 
     Returns
     -------
     lag : int
-        The last lag up to which it leaves the band of white noise again and again.
+        First lag from which on the autocorrelation stays within the band of white noise for a while.
     factor : float
-        ``1 + 2 sum rho`` up to there, at least 1: residuals per independent one.
+        ``1 + 2 sum rho`` up to that lag, at least 1: number of residuals per independent one.
     """
     band = stats.norm.ppf(0.5 + LEVEL / 2) / np.sqrt(max(n, 1))
     outside = np.abs(np.nan_to_num(rho)) > 2.0 * band
@@ -233,7 +237,7 @@ def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
 
 
 def n_effective(residuals: Sequence[np.ndarray]) -> list[float]:
-    """Number of independent residuals that those of each channel count for."""
+    """Return the number of independent residuals of each channel."""
     most = max(1, max(len(r) for r in residuals) // 3)
     found = []
     for c in range(residuals[0].shape[1]):
@@ -244,14 +248,14 @@ def n_effective(residuals: Sequence[np.ndarray]) -> list[float]:
 
 
 def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.ndarray]:
-    """Influence of residuals per residual, and its slope, of a loss of `scipy.optimize.least_squares`.
+    """Return weight and curvature of residuals for a loss of `scipy.optimize.least_squares`.
 
     Returns
     -------
     weight : ndarray
-        The derivative of half the loss, over the residual.
+        Derivative of half the loss, divided by the residual.
     slope : ndarray
-        Of that derivative, at least 0.
+        Second derivative of half the loss, at least 0.
     """
     z = residuals**2
     if loss == "linear":
@@ -266,7 +270,7 @@ def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class _Scores:
-    """Scores along time, and the information, of each piece."""
+    """Scores along time, and information, of each piece."""
 
     scores: list[np.ndarray]
     information: list[np.ndarray]
@@ -288,20 +292,21 @@ def _scores(fit: Linearised) -> _Scores:
 
 
 def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | None = None) -> Covariance:
-    """Covariance of the estimates.
+    """Estimate the covariance of the parameters.
 
     Parameters
     ----------
     fit
         The fit near its optimum.
     scale
-        (n_free,) size of each parameter, for telling what is singular.
+        (n_free,) size of each parameter, to detect singular directions.
     estimator
-        By default what the residuals ask for; see the module.
+        Method; by default chosen by the residuals, see the module.
 
     Returns
     -------
     Covariance
+        Covariance with its method and critical value.
     """
     parts = _scores(fit)
     n_groups = len(set(fit.groups))
@@ -333,7 +338,7 @@ def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | Non
 
 
 def _inverse(information: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse on what is determined, and which parameters are not."""
+    """Return the inverse on determined directions, and which parameters are not determined."""
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     good = values > SINGULAR * max(float(values.max(initial=0.0)), 1e-300)
     inverse = (vectors[:, good] / values[good]) @ vectors[:, good].T
@@ -366,7 +371,7 @@ def _white(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.ndarr
     variance = np.nansum((weight * stacked) ** 2, axis=0) / np.maximum(counts, 1) / share
     data = np.sum(parts.by_channel, axis=0)
     meat = np.einsum("c,cpq->pq", variance, data)
-    # priors, and continuity, are as sure as they say
+    # priors and continuity enter with their stated variance
     meat = meat + (fit.information - data.sum(0))
     return _sandwich(fit, meat, scale), float(degrees), _t(degrees)
 
@@ -406,7 +411,7 @@ def _newey_west(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.
 
 
 def _bartlett(scores: np.ndarray, bandwidth: int) -> np.ndarray:
-    """Long-run covariance of scores along time, times their number, with Bartlett's weights."""
+    """Return the long-run covariance of scores along time, times their number, with Bartlett's weights."""
     n, p = scores.shape
     window = 1.0 - np.abs(np.arange(-bandwidth, bandwidth + 1)) / (bandwidth + 1)
     smoothed = np.stack(

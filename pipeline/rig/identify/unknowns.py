@@ -1,4 +1,4 @@
-"""Which parameters of a model are identified, follow others, or are fixed: checked against each other."""
+"""Check which parameters are identified, tied or fixed, against the model and each other."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from pipeline.spec.problems import problems_of
 from pipeline.spec.tables import Table
 
 _LEAST = 1e-9
-"""Smallest value of a parameter that must be greater than 0, as a share of its start."""
+"""Smallest value of a positive parameter, relative to its start."""
 
 _FRACTION_MARGIN = 1e-6
-"""How near a fraction comes to 0 and 1."""
+"""Distance that a fraction keeps from 0 and 1."""
 
 Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
 class Prior(Table):
-    """What is known of a parameter besides the recordings: its value and standard deviation."""
+    """An independent measurement of a parameter: its value and standard deviation."""
 
     mean: float
     sd: Annotated[float, Field(gt=0)]
 
 
 class Identified(Table):
-    """A parameter that is identified."""
+    """A table ``[identify.NAME]``: a parameter that is identified."""
 
     start: float | None = Field(None, description="First guess; by default the preset's value")
     bounds: Pair | None = Field(None, description="[low, high]; by default those of the model")
@@ -51,7 +51,7 @@ class Identified(Table):
 
 @dataclass(frozen=True)
 class Unknown:
-    """An identified parameter with everything filled in.
+    """An identified parameter with all defaults filled in.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Unknown:
 
 
 def validate(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
-    """Return a validated table, or None after adding its problems."""
+    """Return a validated table; on problems, add them and return None."""
     try:
         return model.model_validate(value)
     except ValidationError as error:
@@ -78,7 +78,7 @@ def validate(model: type[BaseModel], value: Any, path: str, problems: list[str])
 
 
 def table_at(data: Mapping[str, Any], key: str, problems: list[str]) -> Mapping[str, Any]:
-    """Return a table of a table, empty if it is not there, or after adding that it is none."""
+    """Return a table by its key; empty if it is missing, or after adding a problem if it is not a table."""
     table = data.get(key, {})
     if isinstance(table, dict):
         return table
@@ -90,7 +90,7 @@ _TIE = re.compile(r"\s*(?:([+-]?\s*[0-9.]+(?:[eE][+-]?[0-9]+)?)\s*\*\s*|(-)\s*)?
 
 
 class ParameterTables:
-    """Values, unknowns and ties, checked against the model and each other."""
+    """The fixed values, unknowns and ties of a specification, checked together."""
 
     def __init__(
         self, data: Mapping[str, Any], model: Model, preset: str | Path | None, problems: list[str]
@@ -156,7 +156,7 @@ class ParameterTables:
         return Unknown(name, start, max(low, least), min(high, most), one.prior)
 
     def _bounds(self, name: str, start: float) -> tuple[float, float]:
-        """What the model allows; an open bound is kept away from by a little."""
+        """Return the model's bounds; an open bound is approached up to a small margin."""
         return {
             POSITIVE: (_LEAST * start, math.inf),
             NON_NEGATIVE: (0.0, math.inf),
@@ -200,7 +200,7 @@ class ParameterTables:
         return None
 
     def _check_together(self) -> None:
-        """The start must be one that the model allows as a whole, with what is tied put in."""
+        """Check the starts and tied values against the model's relations between parameters."""
         assert self.values is not None
         starts = {u.name: u.start for u in self.unknowns}
         tied = {name: factor * starts[other] for name, (factor, other) in self.tied.items()}
@@ -211,7 +211,7 @@ class ParameterTables:
 
 
 def _number(text: str | None) -> float:
-    """Factor of a tie; NaN for what is no number."""
+    """Return the factor of a tie; NaN if it is not a number."""
     try:
         return 1.0 if text is None else float(text.replace(" ", ""))
     except ValueError:

@@ -1,1 +1,1 @@
-"""The magnet torque: measured curves, their fit, a preset of it."""
+"""Fit the magnet torque to measured curves, and write a preset."""

@@ -1,7 +1,8 @@
-"""Figures of a fit of torque curves, after Figs. 6 to 9 of Wojna et al., J. Sound Vib. 430 (2018).
+"""Draw a fit of torque curves, after Figs. 6 to 9 of Wojna et al., J. Sound Vib. 430 (2018).
 
-6 torque curves with a bump through each; 7 the bumps' numbers over the locked angle; 8 the fitted torque over
-both angles; 9 the fit and point dipoles against what was measured. Outcome in, figure with its data out.
+Fig. 6: torque curves, each with a fitted bump. Fig. 7: parameters of the bumps over the locked angle. Fig. 8:
+the fitted torque over both angles. Fig. 9: the fit and point dipoles against the readings. Each function
+takes an Outcome and returns a figure with its data.
 """
 
 from __future__ import annotations
@@ -23,18 +24,18 @@ from pipeline.rig.magnet.measurement import SAME_ANGLE
 from pipeline.store.provenance import provenance, versions
 
 SHOWN, COMPARED = 5, 3
-"""Locked angles of which curves are drawn, in figure 6 and in figure 9."""
+"""Number of locked angles whose curves are drawn, in figure 6 and in figure 9."""
 
 FINE = 241
 """Points of a computed curve."""
 
 _EDGE = 0.03
-"""What a map shows beyond the readings [rad]."""
+"""Margin of a map beyond the readings [rad]."""
 
 COLOURS = (style.BLUE, style.SKY, style.GREEN, style.ORANGE, style.VERMILLION)
 MARKERS = ("o", "s", "D", "^", "v")
 SIDE_COLOURS = (style.VERMILLION, style.BLUE)
-"""Right, left."""
+"""Colours of the right and the left side."""
 
 _ANGLE, _LOCKED = (f"${laws.SYMBOLS[name]}$ [deg]" for name in (laws.ANGLE, laws.LOCKED))
 _TORQUE = f"${laws.SYMBOLS['torque']}$ [N m]"
@@ -44,11 +45,11 @@ _MODELS: dict[str, tuple[str, Any, str]] = {
     "fit": ("black", "-", "o"),
     "dipoles": (style.VERMILLION, (0, (4, 2)), "x"),
 }
-"""Colour, dash and marker."""
+"""Colour, dash and marker by model."""
 
 
 def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw measured torque curves of some locked angles, with a bump through each (Fig. 6).
+    """Draw measured torque curves of some locked angles, each with a fitted bump (Fig. 6).
 
     Filled points are right of the fixed magnet, open ones left of it.
     """
@@ -85,7 +86,7 @@ def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Data
 def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw height, position and width of the bumps over the locked angle, with their laws (Fig. 7).
 
-    Bars are standard errors; full lines are the laws through the points, dashed ones those of the joint fit.
+    Bars are standard errors. Full lines are the laws through the points; dashed lines are the joint fit's.
     """
     fine = _fine(outcome.measured.locked)
     figure = style.new_figure(3.1, _numbers(outcome, fine), frame)
@@ -120,7 +121,7 @@ def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Dat
 
 
 def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the fitted torque over both angles, where it changes sign, and the readings (Fig. 8)."""
+    """Draw the fitted torque over both angles, with its zero line and the readings (Fig. 8)."""
     m, values = outcome.measured, outcome.joint.values
     angle, locked = (np.linspace(a.min() - _EDGE, a.max() + _EDGE, FINE) for a in (m.angle, m.locked))
     torque = laws.magnet_moment(angle, locked[:, None], values)
@@ -149,7 +150,7 @@ def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFig
 
 
 def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the joint fit and point dipoles against the readings, and what each leaves over (Fig. 9)."""
+    """Draw the joint fit and point dipoles against the readings, with their residuals (Fig. 9)."""
     shown = _spread(outcome, COMPARED)
     figure = style.new_figure(4.4, _comparison(outcome, shown), frame)
     grid = figure.subplots(2, len(shown), sharex="col", sharey="row", height_ratios=[1.5, 1.0], squeeze=False)
@@ -191,11 +192,11 @@ def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.
 FIGURES: dict[str, Callable[..., style.DataFigure]] = {
     "fig6": draw_curves, "fig7": draw_numbers, "fig8": draw_map, "fig9": draw_comparison,
 }  # fmt: skip
-"""By the name of the file."""
+"""Functions that draw, by the name of the file."""
 
 
 def write_figures(outcome: Outcome, folder: Path) -> list[Path]:
-    """Draw all figures and write them, with the data drawn, into a folder that exists."""
+    """Draw all figures and write them with their data into an existing folder."""
     written = []
     for name, draw in FIGURES.items():
         figure = draw(outcome)
@@ -217,7 +218,7 @@ def _spread(outcome: Outcome, n: int) -> list[float]:
 
 
 def _place(shown: Sequence[float], locked: float) -> int | None:
-    """Return the number of a locked angle among those shown."""
+    """Return the index of a locked angle among those shown; None if it is not shown."""
     near = np.flatnonzero(np.abs(np.array(shown) - locked) < SAME_ANGLE)
     return int(near[0]) if near.size else None
 
@@ -250,7 +251,7 @@ def _readings(outcome: Outcome, rows: np.ndarray) -> xr.Dataset:
 
 
 def _numbers(outcome: Outcome, fine: np.ndarray) -> xr.Dataset:
-    """Numbers of each curve, and both laws of them on a fine scale, by side."""
+    """Return the parameters of each curve, and both laws on a fine grid, by side."""
     curves = outcome.curves
     variables: dict[str, Any] = {
         "curve_locked": ("curve", [np.degrees(f.curve.locked) for f in curves], {"units": "deg"}),
@@ -277,7 +278,7 @@ def _laws_at(locked: np.ndarray, values: dict[str, float], i: int) -> dict[str, 
 
 
 def _comparison(outcome: Outcome, shown: Sequence[float]) -> xr.Dataset:
-    """Readings of some locked angles, and both models on a fine scale."""
+    """Return readings at some locked angles, and both models on a fine grid."""
     m = outcome.measured
     own = [np.flatnonzero(np.abs(m.locked - locked) < SAME_ANGLE) for locked in shown]
     fine = np.array([_fine(m.angle[rows]) for rows in own])
@@ -308,7 +309,7 @@ def _points(ax: Axes, angle: np.ndarray, torque: np.ndarray, place: int, side: i
 def _done(
     figure: style.DataFigure, ax: Axes, outcome: Outcome, handles: list[Any], *, short: bool = False
 ) -> style.DataFigure:
-    """Say above what was measured, whether it is synthetic, and finish."""
+    """Add the label and the legend, and finish the figure."""
     text = outcome.measured.label
     if short:
         figure.suptitle(

@@ -1,9 +1,9 @@
-"""Fits of torque curves: each by itself, their numbers over the locked angle, all at once, and point dipoles.
+"""Fit torque curves: single curves, laws over the locked angle, a joint fit, and point dipoles.
 
-Wojna et al., J. Sound Vib. 430 (2018), section 3, Eq. 16-19. Standard errors come from the residuals'
-variance. Where the law and not noise is what is missing, residuals of neighbouring readings are alike, and
-such errors are too small; so the joint fit also has errors from the scatter of whole curves (a jackknife over
-them), which hold whatever the residuals within a curve are like.
+See Wojna et al., J. Sound Vib. 430 (2018), section 3, Eq. 16-19. Standard errors come from the residuals'
+variance. If the law is wrong, residuals of neighbouring readings are correlated and these errors are too
+small. The joint fit therefore also has errors from a jackknife over whole curves. They hold for any
+correlation within a curve.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from pipeline.rig.magnet.measurement import Curve, Measurement
 from pipeline.rig.magnet.solving import Quality, Solution, errors_by_cluster, solve
 
 STEEPNESS = (30.0, 10.0, 100.0, 300.0)
-"""Where the joint fit begins to look for the steepness of the change between the bumps [1/rad]."""
+"""First guesses of the steepness of the change between the bumps, for the joint fit [1/rad]."""
 
 LARGE_ERROR = 0.5
-"""Standard error over the parameter's own scale from which it counts as not determined."""
+"""Ratio of standard error to the parameter's scale above which it is not determined."""
 
 FARTHEST_DIPOLES = 3.0
-"""Farthest fixed dipole that is looked for, in lengths of the stretched pendulum."""
+"""Largest distance at which the fixed dipole is sought, in lengths of the stretched pendulum."""
 
 
 @dataclass(frozen=True)
 class CurveFit:
-    """A bump through one curve (Eq. 17).
+    """A bump fitted to one curve (Eq. 17).
 
     Attributes
     ----------
@@ -51,14 +51,14 @@ class CurveFit:
 
 @dataclass(frozen=True)
 class Laws:
-    """The curves' numbers over the locked angle, by parameter of Eq. 18.
+    """The curves' parameters as functions of the locked angle (Eq. 18).
 
     Attributes
     ----------
     values, errors : dict
-        By the names of `laws.FITTED` but for the steepness.
+        By the names of `laws.FITTED`, without the steepness.
     r2 : dict
-        Of the height and the position by side, ``A1`` ... ``b2``; the width is constant.
+        R squared of height and position by side, ``A1`` ... ``b2``. The width is constant.
     """
 
     values: dict[str, float]
@@ -68,7 +68,7 @@ class Laws:
 
 @dataclass(frozen=True)
 class JointFit:
-    """All readings at once (Eq. 18-19).
+    """A fit to all readings at once (Eq. 18-19).
 
     Attributes
     ----------
@@ -77,15 +77,15 @@ class JointFit:
     values : dict
         All of `laws.FITTED`.
     errors, errors_by_curve : dict
-        Standard errors of `free`: from the residuals' variance, and from the scatter of whole curves; the
+        Standard errors of `free`: from the residuals' variance, and from a jackknife over whole curves. The
         latter are NaN if one curve alone determines a parameter.
     correlation : ndarray
-        Of `free`.
+        Correlation matrix of `free`.
     quality : Quality
     residuals : ndarray
         Measured minus computed [N m].
     neighbours : float
-        Correlation of the residuals of neighbouring readings of a curve; 0 for noise.
+        Correlation of the residuals of neighbouring readings of a curve; 0 for white noise.
     undetermined : dict
         For each parameter that the readings hardly determine, the one with which it correlates most.
     """
@@ -103,12 +103,12 @@ class JointFit:
 
 @dataclass(frozen=True)
 class DipoleFit:
-    """Point dipoles (Eq. 16) at their best.
+    """A fit of point dipoles (Eq. 16).
 
     Attributes
     ----------
     values : dict
-        ``pole1``, ``pole2`` (alike, for their product is what counts) and the place ``h``.
+        ``pole1`` and ``pole2``, which are equal since only their product matters, and the place ``h`` [m].
     quality : Quality
     residuals : ndarray
         Measured minus computed [N m].
@@ -128,9 +128,9 @@ def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
     Parameters
     ----------
     angle, torque
-        Its readings [rad], [N m].
+        Readings of the curve [rad], [N m].
     curve
-        Which it is.
+        Side and locked angle of the curve.
 
     Raises
     ------
@@ -160,12 +160,12 @@ def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
 
 
 def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
-    """Fit every curve by itself.
+    """Fit every curve on its own.
 
     Raises
     ------
     ArithmeticError
-        Naming all curves whose fit is no result.
+        If a fit fails; the message names all such curves.
     """
     found, problems = [], []
     for curve in measured.curves:
@@ -184,7 +184,7 @@ def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
 def fit_laws(curves: Sequence[CurveFit]) -> Laws:
     """Fit height, position and width over the locked angle: a Gaussian, a line, a constant (Eq. 18).
 
-    Each number weighs by its standard error; the laws' own errors come from the scatter about them.
+    Each value is weighted by its standard error. The laws' own errors come from the scatter about them.
 
     Raises
     ------
@@ -214,7 +214,7 @@ def fit_laws(curves: Sequence[CurveFit]) -> Laws:
 
 
 def _weights(errors: np.ndarray) -> np.ndarray:
-    """Weights by standard errors; those of rounding alone say nothing of a curve's worth."""
+    """Return weights by standard errors; errors that are mere rounding are bounded from below."""
     largest = float(errors.max())
     return np.ones(len(errors)) if largest == 0.0 else largest / np.maximum(errors, 1e-3 * largest)
 
@@ -260,14 +260,14 @@ def fit_jointly(
     measured
         The readings.
     start
-        First guess by name; the steepness is looked for from several values.
+        First guess by name; several first guesses of the steepness are tried.
     hold
-        Parameters that stay as they are, by name.
+        Values of parameters that are not fitted, by name.
 
     Raises
     ------
     ArithmeticError
-        If no start leads to a result.
+        If no first guess leads to a result.
     """
     held = dict(hold or {})
     free = tuple(name for name in laws.FITTED if name not in held)
@@ -306,7 +306,7 @@ def fit_jointly(
 
 
 def _upright(values: dict[str, float]) -> dict[str, float]:
-    """Widths count squared; give them positive."""
+    """Make widths positive; only their squares matter."""
     return {n: abs(v) if n.startswith(("gamma", "c")) else v for n, v in values.items()}
 
 
@@ -327,7 +327,7 @@ def _judged(
 
 
 def _scale(name: str, values: Mapping[str, float]) -> float:
-    """Size of a change of a parameter that changes the torque all over."""
+    """Return the size of a parameter's change that changes the torque substantially."""
     if name == "eps_mag":
         return values[name]
     kind, i = name[:-1], name[-1]
@@ -336,7 +336,7 @@ def _scale(name: str, values: Mapping[str, float]) -> float:
 
 
 def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
-    """Correlation of residuals of neighbouring readings, over all curves."""
+    """Return the correlation of residuals of neighbouring readings, over all curves."""
     products = squares = 0.0
     for curve in measured.curves:
         own = residuals[curve.rows[np.argsort(measured.angle[curve.rows])]]
@@ -349,14 +349,14 @@ def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
 
 
 def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
-    """Fit the strength of point dipoles (Eq. 16), and with `place` also where the fixed one stands.
+    """Fit the strength of point dipoles (Eq. 16), and with `place` also the place of the fixed one.
 
-    The torque is linear in the strength; the place is looked for below the stretched pendulum's end.
+    The torque is linear in the strength. The place is sought below the end of the stretched pendulum.
 
     Raises
     ------
     ArithmeticError
-        If the readings have no such torque.
+        If no strength of repelling dipoles fits the readings.
     """
     p: dict[str, Any] = {**measured.parameters, "pole1": 1.0, "pole2": 1.0}
 
@@ -368,7 +368,7 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
     h = float(p["h"])
     if place:
         reach = laws.reach(p)
-        # the sum of squares has several valleys over the place: survey, then descend
+        # the sum of squares has several minima over the place: scan a grid, then descend
         grid = reach * np.geomspace(1.001, FARTHEST_DIPOLES, 400)
         best = int(np.argmin([(r := at(float(g))[1]) @ r for g in grid]))
         low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
@@ -390,7 +390,7 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that is fitted to a measurement.
+    """All fits to a measurement.
 
     Attributes
     ----------
@@ -398,11 +398,11 @@ class Outcome:
     curves : tuple of CurveFit
     laws : Laws
     joint : JointFit
-        With what the header holds.
+        Joint fit with the parameters held that the header names.
     unheld : JointFit or None
-        With nothing held, where something was; None also if that is no result.
+        Joint fit with nothing held; None if the header holds nothing, or if this fit fails.
     dipoles, placed_dipoles : DipoleFit
-        With the fixed dipole where the fixed magnet is, and where it fits best.
+        Fits with the fixed dipole at the fixed magnet, and at its best place.
     """
 
     measured: Measurement
@@ -415,12 +415,12 @@ class Outcome:
 
 
 def fit_measurement(measured: Measurement) -> Outcome:
-    """Fit curves one by one, their numbers over the locked angle, all readings at once, and point dipoles.
+    """Fit single curves, their laws over the locked angle, all readings at once, and point dipoles.
 
     Raises
     ------
     ArithmeticError
-        If a fit is no result.
+        If a fit fails.
     """
     curves = fit_curves(measured)
     over = fit_laws(curves)
@@ -428,7 +428,7 @@ def fit_measurement(measured: Measurement) -> Outcome:
     joint = fit_jointly(measured, over.values, hold)
     unheld = None
     if hold:
-        with contextlib.suppress(ArithmeticError):  # a fit beside the one that was asked for
+        with contextlib.suppress(ArithmeticError):  # only for comparison with the requested fit
             unheld = fit_jointly(measured, over.values)
     dipoles, placed = fit_dipoles(measured), fit_dipoles(measured, place=True)
     return Outcome(measured, curves, over, joint, unheld, dipoles, placed)

@@ -1,7 +1,7 @@
-"""A measurement of the magnets' torque: a table of readings and a header that says what they are.
+"""Read a measurement of the magnets' torque: a table of readings and its header.
 
 The header is a TOML file; ``workflows/magnet/discs.toml`` is an example, docs/magnet.md lists its keys. All
-that is wrong with the header or the table is said at once.
+problems with the header and the table are reported at once.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from pipeline.spec.problems import SpecError, unknown_choice, unknown_name, vali
 from pipeline.spec.tables import Table
 
 MIN_READINGS = 5
-"""Least readings of a curve: a bump has three numbers, and what is left over says how well it fits."""
+"""Fewest readings of a curve. A bump has three parameters; further readings show how well it fits."""
 
 MIN_CURVES = 4
-"""Least curves of a side: the height over the locked angle has three numbers."""
+"""Fewest curves of a side. The height over the locked angle has three parameters."""
 
 MAX_NAMED = 3
 SAME_ANGLE = 1e-6
-"""Locked angles that differ by less are one curve's [rad]."""
+"""Locked angles that differ by less belong to one curve [rad]."""
 
 ANGLE_UNITS = {"deg": math.pi / 180.0, "rad": 1.0}
 TORQUE_UNITS = {"N m": 1.0, "mN m": 1e-3, "N": 1.0}
@@ -53,7 +53,7 @@ class AngleColumn(Table):
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Least and largest allowed angle, in the column's unit."""
+        """Smallest and largest allowed angle, in the column's unit."""
         half = math.pi / ANGLE_UNITS[self.unit]
         return self.range or (-half, half)
 
@@ -74,34 +74,32 @@ class TorqueColumn(Table):
 
     @property
     def scale(self) -> float:
-        """Factor from the file to N m."""
+        """Factor from the file's unit to N m."""
         return self.sign * TORQUE_UNITS[self.unit] * (self.arm_m or 1.0)
 
 
 class SideColumn(Table):
-    """A column that says on which side of the fixed magnet the pendulum was."""
+    """A column that tells on which side of the fixed magnet the pendulum was."""
 
     column: str = Field(description="Its name in the table's first row.")
-    right: str = Field("right", description="What stands there for the right, where torques are positive.")
-    left: str = Field("left", description="What stands there for the left.")
+    right: str = Field("right", description="Entry for the right side, where torques are positive.")
+    left: str = Field("left", description="Entry for the left side.")
 
 
 class Tie(Table):
-    """What hangs on the upper link of the tie that holds it."""
+    """The tie that holds the upper link, with its weight."""
 
     mass_kg: float = Field(ge=0, description="Mass that hangs on the link [kg].")
-    lever_m: float = Field(ge=0, description="From the upper joint along the link to where it hangs [m].")
+    lever_m: float = Field(ge=0, description="Distance from the upper joint along the link to the mass [m].")
 
 
 class Correction(Table):
-    """What readings have besides the magnets' torque."""
+    """The torques in the readings besides the magnets' torque."""
 
-    weights: bool = Field(
-        description="Whether they have the torque of the links' weights, from masses and lengths."
-    )
-    tie: Tie | None = Field(None, description="The tie's weight, if they have that.")
+    weights: bool = Field(description="Whether the readings include the torque of the links' weights.")
+    tie: Tie | None = Field(None, description="Weight of the tie, if the readings include it.")
     without: str | None = Field(
-        None, description="Column of readings without the magnets, taken off in place of all others."
+        None, description="Column of readings without the magnets, subtracted instead of other corrections."
     )
 
     @model_validator(mode="after")
@@ -123,27 +121,27 @@ Columns: Any = create_model("Columns", __base__=Table, **_COLUMNS)
 
 
 class Header(Table):
-    """What a measurement's header says."""
+    """The header of a measurement."""
 
-    title: str = Field(description="What was measured, in a line.")
-    synthetic: bool = Field(False, description="Whether the readings were computed; all results say so.")
-    file: str = Field(description="The table, CSV with names in its first row, seen from the header.")
-    delimiter: Literal[",", ";", "\t"] = Field(
-        ",", description="What stands between two fields of the table."
-    )
+    title: str = Field(description="Title of the measurement, one line.")
+    synthetic: bool = Field(False, description="Whether the readings were computed; all results state this.")
+    file: str = Field(description="Table, CSV with names in its first row, relative to the header.")
+    delimiter: Literal[",", ";", "\t"] = Field(",", description="Separator of the table's fields.")
     decimal: Literal[".", ","] = Field(".", description="Decimal sign of the table.")
     model: str = Field(laws.MODEL, description="Model whose torque is fitted.")
-    preset: str | None = Field(None, description="Preset, or a file of one, with what is not fitted.")
-    columns: Columns = Field(description="Where what stands in the table.")
+    preset: str | None = Field(
+        None, description="Preset, or a preset's file, with the parameters that are not fitted."
+    )
+    columns: Columns = Field(description="Columns of the table.")
     parameters: dict[str, float] = Field(
-        {}, description="What is known of the rig, over the preset's values."
+        {}, description="Known parameters of the rig; they replace the preset's."
     )
-    provenance: dict[str, str] = Field({}, description="Where each of [parameters] comes from.")
-    correction: Correction = Field(description="What the readings have besides the magnets' torque.")
+    provenance: dict[str, str] = Field({}, description="Origin of each value in [parameters].")
+    correction: Correction = Field(description="Torques in the readings besides the magnets' torque.")
     hold: Annotated[tuple[str, ...], Field(strict=False)] = Field(
-        (), description="Parameters that the joint fit leaves as they are."
+        (), description="Parameters that the joint fit does not change."
     )
-    synthesis: dict[str, Any] = Field({}, description="How synthetic readings were made; for people.")
+    synthesis: dict[str, Any] = Field({}, description="Notes on how synthetic readings were made.")
 
     @model_validator(mode="after")
     def _signs(self) -> Header:
@@ -154,16 +152,16 @@ class Header(Table):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """The readings of one locked angle on one side.
+    """The readings at one locked angle on one side.
 
     Attributes
     ----------
     side : int
-        Place in `laws.SIDES`.
+        Index in `laws.SIDES`.
     locked : float
-        [rad].
+        Locked angle [rad].
     rows : ndarray
-        Its readings' places in the measurement.
+        Indices of its readings in the measurement.
     """
 
     side: int
@@ -176,23 +174,23 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Readings in SI units, corrected.
+    """The corrected readings in SI units.
 
     Attributes
     ----------
     header : Header
     path : Path
-        Of the header.
+        Path of the header.
     digest : str
         sha256 of the table.
     parameters : Parameters
-        Of the model: what is known before the fit.
+        Parameters of the model that are known before the fit.
     angle, locked : ndarray
-        [rad], one per reading.
+        Angles [rad], one per reading.
     side : ndarray of int
-        Places in `laws.SIDES`.
+        Indices in `laws.SIDES`.
     reading : ndarray
-        As read [N m].
+        Uncorrected torque [N m].
     torque : ndarray
         Of the magnets alone [N m].
     warnings : tuple of str
@@ -212,12 +210,12 @@ class Measurement:
 
     @cached_property
     def curves(self) -> tuple[Curve, ...]:
-        """The curves: those right of the fixed magnet first, by rising locked angle."""
+        """Curves in the order of side (right first) and rising locked angle."""
         return curves_of(self.locked, self.side)
 
     @property
     def label(self) -> str:
-        """What a figure or a preset calls it."""
+        """Title for figures and presets; it marks synthetic readings."""
         return ("SYNTHETIC: " if self.header.synthetic else "") + self.header.title
 
 
@@ -235,7 +233,7 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
 
 
 def find_measurement(name: str | Path) -> Path:
-    """Return the path of a header: a file, or the bare name of a measurement that ships.
+    """Return the path of a header, given as a path or as the name of a measurement that ships.
 
     Raises
     ------
@@ -257,13 +255,13 @@ def read_measurement(path: str | Path) -> Measurement:
     Parameters
     ----------
     path
-        Of the header; see `find_measurement`.
+        Path of the header; see `find_measurement`.
 
     Raises
     ------
     SpecError
-        With all that is wrong at once: unknown or missing keys and columns, what is no number, angles out of
-        range, curves with too few readings, sides with too few curves.
+        With all problems at once: unknown or missing keys and columns, fields that are not numbers, angles
+        out of range, curves with too few readings, sides with too few curves.
     """
     path = Path(path)
     header = validated(Header, read_toml(path))
@@ -291,7 +289,7 @@ def _besides(
     locked: np.ndarray,
     columns: Mapping[str, np.ndarray],
 ) -> np.ndarray:
-    """Torque in the readings that is not the magnets' [N m]."""
+    """Return the torque in the readings that does not come from the magnets [N m]."""
     if correction.without is not None:
         return columns["without"]
     found = laws.weight_torque(angle, locked, p) if correction.weights else np.zeros_like(angle)
@@ -301,7 +299,7 @@ def _besides(
 
 
 def _known(header: Header, folder: Path) -> tuple[Parameters | None, list[str]]:
-    """Parameters before the fit, and what is wrong with them."""
+    """Return the parameters before the fit, and problems with them."""
     problems = [
         f"parameters.{name}: has no provenance; say in [provenance] where the value comes from."
         for name in header.parameters
@@ -362,7 +360,7 @@ def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, lis
 
 
 def _wanted(header: Header) -> dict[str, str]:
-    """Names of columns in the file by what they are."""
+    """Return the names of the needed columns by their meaning."""
     found = {name: getattr(header.columns, name).column for name in type(header.columns).model_fields}
     if header.correction.without is not None:
         found["without"] = header.correction.without
@@ -389,7 +387,7 @@ def _but_for_units(
 
 
 def _numbers(header: Header, table: Mapping[str, list[str]], problems: list[str]) -> dict[str, np.ndarray]:
-    """Return the columns in SI units, or nothing after adding what is wrong with them."""
+    """Return the columns in SI units; on problems, add them and return nothing."""
     before, found = len(problems), {}
     where = header.file
     for key in (name for name in table if name != "side"):
@@ -426,7 +424,7 @@ def _number(text: str, decimal: str) -> float:
 
 
 def _places(rows: Any) -> str:
-    """Name rows of the table, the first reading being 1."""
+    """Format row numbers of the table; the first reading is row 1."""
     named = ", ".join(str(i) for i in rows[:MAX_NAMED])
     more = f" and {len(rows) - MAX_NAMED} more" if len(rows) > MAX_NAMED else ""
     return f"row{'s' if len(rows) > 1 else ''} {named}{more}"

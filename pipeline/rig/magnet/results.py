@@ -1,4 +1,4 @@
-"""What a fit of torque curves leaves: ``fit.json``, presets with the provenance of every value, a summary."""
+"""Write the results of a fit of torque curves: ``fit.json``, presets with provenance, a summary."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from pipeline.store.provenance import provenance, versions
 REPORT, PRESET, DIPOLE_PRESET = "fit.json", "preset.toml", "preset-dipoles.toml"
 
 ALIKE = 0.3
-"""Correlation of neighbouring residuals from which the law is what is missing; noise alone stays below."""
+"""Correlation of neighbouring residuals above which the law is wrong; white noise stays below."""
 
 
 def report_of(outcome: Outcome) -> dict[str, Any]:
-    """Return all numbers of a fit as plain data, angles in degrees where the key says so, else SI."""
+    """Return all numbers of a fit as plain data; SI units, or degrees where the key says so."""
     m = outcome.measured
     curves = [
         {
@@ -78,7 +78,7 @@ def _dipoles(fit: DipoleFit) -> dict[str, Any]:
 
 
 def write_results(outcome: Outcome, folder: Path) -> list[Path]:
-    """Write report and presets into a folder that exists; returns their paths."""
+    """Write report and presets into an existing folder; return their paths."""
     report = folder / REPORT
     text = json.dumps(report_of(outcome), indent=1, allow_nan=False, ensure_ascii=False)
     write_atomically(report, text + "\n")
@@ -86,7 +86,7 @@ def write_results(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def write_presets(outcome: Outcome, folder: Path) -> list[Path]:
-    """Write the preset of the fitted torque, and that of point dipoles for comparison."""
+    """Write the preset of the fitted torque, and one of point dipoles for comparison."""
     m, joint = outcome.measured, outcome.joint
     kind = "SYNTHETIC readings, " if m.header.synthetic else ""
     origin = f"{len(outcome.curves)} torque curves ({kind}{m.header.file}, sha256 {m.digest[:12]})"
@@ -110,7 +110,7 @@ def write_presets(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def _base(measured: Measurement, model: str) -> str | Preset:
-    """Preset with all that is not fitted; of one from a file, what the model knows."""
+    """Return the preset of the parameters that are not fitted; a preset's file is limited to the model's."""
     name = measured.header.preset
     if name is None:
         return load_model(model).presets[0].name
@@ -122,7 +122,7 @@ def _base(measured: Measurement, model: str) -> str | Preset:
 
 
 def _error(fit: JointFit, name: str, measured: Measurement) -> str:
-    """Standard error of a value, the larger of the two, in words."""
+    """Format the standard error of a value, the larger of the two."""
     error, unit = np.fmax(fit.errors[name], fit.errors_by_curve[name]), _unit(name, measured)
     return f"standard error {error:.2g} {unit}".rstrip()
 
@@ -136,7 +136,7 @@ def _unit(name: str, measured: Measurement) -> str:
 
 
 def summary_of(outcome: Outcome) -> list[str]:
-    """Return what a person wants to read of a fit, line by line."""
+    """Return the lines of a fit's printed summary."""
     m, joint = outcome.measured, outcome.joint
     r2 = [fit.quality.r2 for fit in outcome.curves]
     line = laws.transition(joint.values)

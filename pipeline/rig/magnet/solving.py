@@ -1,4 +1,4 @@
-"""Least squares to rounding, and what its residuals say of the numbers found."""
+"""Solve least squares to rounding, with standard errors of the estimates."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ MAX_EVALUATIONS = 4000
 
 @dataclass(frozen=True)
 class Solution:
-    """A converged fit by least squares.
+    """A converged least-squares fit.
 
     Attributes
     ----------
     x : ndarray
+        Estimates, (n_free,).
     errors : ndarray
-        Standard errors.
+        Standard errors, (n_free,).
     jacobian : ndarray
-        Of the residuals, (n, n_free).
+        Derivatives of the residuals, (n, n_free).
     residuals : ndarray
         Measured minus computed (n,).
     """
@@ -35,7 +36,7 @@ class Solution:
 
     @property
     def correlation(self) -> np.ndarray:
-        """Correlation of the numbers, as far as the readings' noise is even."""
+        """Correlation matrix of the estimates, for readings of equal noise."""
         normal = _inverse(self.jacobian)
         size = np.sqrt(np.diag(normal))
         return np.asarray(normal / size[:, None] / size)
@@ -43,14 +44,14 @@ class Solution:
 
 @dataclass(frozen=True)
 class Quality:
-    """How well a fit meets the readings.
+    """The quality of a fit: R squared and root mean square.
 
     Attributes
     ----------
     r2 : float
         1 - residual over total sum of squares about the mean.
     rms : float
-        Of the residuals [N m].
+        Root mean square of the residuals [N m].
     """
 
     r2: float
@@ -58,7 +59,7 @@ class Quality:
 
     @classmethod
     def of(cls, measured: np.ndarray, residuals: np.ndarray) -> Quality:
-        """Compare residuals with what was measured."""
+        """Return the quality of a fit from readings and residuals."""
         total = float(((measured - measured.mean()) ** 2).sum())
         left = float(residuals @ residuals)
         return cls(1.0 - left / total if total > 0.0 else math.nan, math.sqrt(left / len(residuals)))
@@ -70,7 +71,7 @@ def solve(
     start: Sequence[float],
     what: str,
 ) -> Solution:
-    """Least squares by Levenberg and Marquardt, to rounding.
+    """Solve least squares by Levenberg and Marquardt, to rounding.
 
     Parameters
     ----------
@@ -79,12 +80,12 @@ def solve(
     start
         First guess.
     what
-        Name of the fit, for its error.
+        Name of the fit, for error messages.
 
     Raises
     ------
     ArithmeticError
-        If it did not converge, or the readings do not determine all that is free.
+        If it does not converge, or the readings do not determine all free parameters.
     """
     with np.errstate(all="ignore"):
         found = least_squares(
@@ -106,7 +107,7 @@ def solve(
 
 
 def _inverse(jacobian: np.ndarray) -> np.ndarray:
-    """Inverse of the normal matrix, with columns of one size on the way."""
+    """Return the inverse of the normal matrix; columns are scaled to one size on the way."""
     size = np.linalg.norm(jacobian, axis=0)
     _, s, right = np.linalg.svd(jacobian / size, full_matrices=False)
     if not s[-1] > len(jacobian) * _EPS * s[0]:
@@ -116,23 +117,23 @@ def _inverse(jacobian: np.ndarray) -> np.ndarray:
 
 
 def errors_by_cluster(found: Solution, clusters: Sequence[np.ndarray]) -> np.ndarray:
-    """Standard errors that allow for any likeness of residuals within a cluster.
+    """Return standard errors that allow for any correlation of residuals within a cluster.
 
-    The jackknife over clusters, about the fit to all (CR3): what leaving out each of them does to the
-    numbers, to first order. Unlike the plain sandwich it is not too small with few clusters: MacKinnon,
+    This is the jackknife over clusters about the fit to all readings (CR3): each cluster is left out in turn,
+    to first order. Unlike the plain sandwich, its errors are not too small with few clusters: MacKinnon,
     Nielsen & Webb, J. Econometrics 232 (2023) 272-299.
 
     Parameters
     ----------
     found
-        The fit.
+        Solution of the fit.
     clusters
-        Rows of each cluster; together all of them, each once.
+        Rows of each cluster; every row belongs to one cluster.
 
     Returns
     -------
     ndarray
-        One for each number; NaN if one cluster alone determines some of them.
+        One error for each parameter; all NaN if one cluster alone determines some of them.
     """
     normal = _inverse(found.jacobian)
     squares = np.zeros(len(found.x))

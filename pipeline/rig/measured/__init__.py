@@ -1,1 +1,1 @@
-"""Measured diagrams: sections at the edges of the drive, beside and over computed ones."""
+"""Measure diagrams on a rig: sections at the edges of the drive, compared with computed ones."""

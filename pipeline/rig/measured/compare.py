@@ -1,4 +1,4 @@
-"""Measured beside computed: distances of section points, agreement of regimes, shifts of window edges."""
+"""Compare measured with computed diagrams: distances of sections, regimes, shifts of window edges."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ NOBODY = -1
 def compare(
     measured: xr.Dataset, run: AnalysedRun, *, at: Mapping[str, float] | None = None, seed: int = 0
 ) -> xr.Dataset:
-    """Hold a measured diagram against the attractors of a run.
+    """Compare a measured diagram with the attractors of a run.
 
     Parameters
     ----------
     measured
         Result of `pipeline.rig.measured.measuring.measure`.
     run
-        Of the same model, with the drive frequency as an axis.
+        Run of the same model, with the drive frequency as an axis.
     at
         Values of the run's other axes.
     seed
-        Of the samples drawn of sets that do not close.
+        Seed of the samples drawn from sets that do not close.
 
     Returns
     -------
     Dataset
-        `measured`, and by step ``noise_floor``: Wasserstein-1 between the halves of the step's sections;
-        ``winner``: id of the nearest attractor, -1 where the run's axis does not reach; ``distance`` from it
-        and ``runner_up`` from the next (NaN if there is no other), both in units of the states' scales, and
-        ``distance_in_noise`` in units of the floor; ``computed_period`` (0: a set that does not close) and
-        ``computed_side`` of the winner; ``same_period``, ``same_side``: 1 if they agree, 0 if not, -1
-        unknown; and (step, attractor) ``distances``. Of each window's end, dim ``edge``:
+        `measured` with further variables. By step: ``noise_floor``, Wasserstein-1 between the halves of the
+        step's sections; ``winner``, id of the nearest attractor, -1 outside the run's axis; ``distance`` from
+        it and ``runner_up`` from the next (NaN if there is no other), in units of the states' scales;
+        ``distance_in_noise``, the distance in units of the floor; ``computed_period`` (0: a set that does not
+        close) and ``computed_side`` of the winner; ``same_period`` and ``same_side``: 1 if they agree, 0 if
+        not, -1 if unknown. By step and attractor: ``distances``. By window edge, dim ``edge``:
         ``edge_measured_hz``, ``edge_measured_error_hz``, ``edge_computed_hz``, ``edge_computed_error_hz``,
         ``edge_shift_hz``, ``edge_shift_error_hz``, ``edge_direction``, ``edge_before_period``,
         ``edge_before_side``, ``edge_after_period``, ``edge_after_side``, ``edge_note``.
@@ -60,7 +60,7 @@ def compare(
 
 
 def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> xr.Dataset:
-    """As `compare`, with what is known of the run; `measured` has its sides already."""
+    """Compare a measured diagram that has sides with computed attractors; see `compare`."""
     f = measured["frequency"].values
     if not any(computed.place(float(x)) >= 0 for x in f):
         own = computed.frequencies
@@ -100,7 +100,7 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
 def _step(
     measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray, seed: int
 ) -> dict[str, float]:
-    """Numbers of one step; fills its row of `distances`."""
+    """Return the comparison of one step; fill its row of `distances`."""
     states = [str(s) for s in measured["state"].values]
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))
     points, noise = measured["section"].values[step], measured["section_noise"].values[step]

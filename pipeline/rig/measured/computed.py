@@ -1,4 +1,4 @@
-"""Attractors of a run at the frequencies of a rig: their points, periods and sides."""
+"""Read a run's attractors at the frequencies of a rig: their points, periods and sides."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ Floats = npt.NDArray[np.float64]
 def cube_and_parameters(
     run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None
 ) -> tuple[xr.Dataset, Parameters]:
-    """Return a run's cells over the drive's frequency, and its parameters there.
+    """Return a run's cells over the drive frequency, and its parameters there.
 
     Raises
     ------
     SpecError
-        If it is of another model, sweeps no frequency, or another axis has more than one value.
+        If the run is of another model, sweeps no frequency, or has another axis with several values.
     """
     where = run.name
     model = load_model(model)
@@ -67,7 +67,7 @@ def cube_and_parameters(
 
 @dataclass(frozen=True)
 class Computed:
-    """What a run knows along its frequency axis, at one value of every other axis.
+    """The attractors of a run along its frequency axis, at one value of every other axis.
 
     Attributes
     ----------
@@ -76,7 +76,9 @@ class Computed:
     cube : Dataset
         Cells of the run, for the points of sets that do not close and the diagram.
     parameters : Parameters
+        Parameters at the chosen values of the other axes.
     title, digest : str
+        Title and digest of the run.
     """
 
     attractors: xr.Dataset
@@ -87,12 +89,12 @@ class Computed:
 
     @classmethod
     def of(cls, run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None) -> Computed:
-        """Read a run and find its attractors, kept as every analysis.
+        """Read a run and its attractors, which are computed if they are not kept.
 
         Raises
         ------
         SpecError
-            If it is of another model, sweeps no frequency, or another axis has more than one value.
+            If the run is of another model, sweeps no frequency, or has another axis with several values.
         """
         cube, parameters = cube_and_parameters(run, model, at)
         with refused(run.name):
@@ -104,16 +106,16 @@ class Computed:
 
     @property
     def model(self) -> Model:
-        """What was integrated."""
+        """Model that was integrated."""
         return self.parameters.model
 
     @property
     def frequencies(self) -> Floats:
-        """Rising [Hz]."""
+        """Frequencies in rising order [Hz]."""
         return np.asarray(self.attractors[FREQUENCY_DIM].values, np.float64)
 
     def place(self, frequency_hz: float) -> int:
-        """Place of the nearest frequency; -1 if the axis does not reach within half a step."""
+        """Return the index of the nearest frequency; -1 if it is outside the axis by over half a step."""
         f = self.frequencies
         i = int(np.abs(f - frequency_hz).argmin())
         near = np.abs(np.delete(f, i) - f[i])
@@ -121,9 +123,9 @@ class Computed:
         return i if abs(f[i] - frequency_hz) <= reach or f[0] < frequency_hz < f[-1] else -1
 
     def regime(self, place: int, attractor: int) -> tuple[int, int] | None:
-        """Period (0 of a set that does not close) and side of a set at a frequency; None if it is not there.
+        """Return period and side of a set at a frequency; period 0 if it does not close.
 
-        A rig does not show what is unstable, so that is not there either.
+        None if the set does not exist there or is unstable, since a rig does not show unstable sets.
         """
         one = self.attractors.isel({FREQUENCY_DIM: place}).sel(attractor=attractor)
         kind = int(one["kind"])
@@ -133,10 +135,10 @@ class Computed:
         return period, int(one["side"]) if "side" in one else 0
 
     def candidates(self, frequency_hz: float, states: Sequence[str]) -> list[Candidate]:
-        """Attractors at a frequency, with their points in the chosen states.
+        """Return the attractors at a frequency, with their points in the chosen states.
 
-        Points of a closed orbit are interpolated between neighbouring frequencies at which the id has the
-        same period; else, and for sets that do not close, they are those of the nearest frequency.
+        Points of a closed orbit are interpolated between neighbouring frequencies if the attractor has the
+        same period there. Otherwise, and for sets that do not close, they are those at the nearest frequency.
         """
         i = self.place(frequency_hz)
         if i < 0:
@@ -161,7 +163,7 @@ class Computed:
         return np.asarray(points[np.isfinite(points).all(axis=1)], np.float64)
 
     def _set(self, place: int, attractor: int) -> Floats:
-        """Sections of all cells on a bounded set."""
+        """Return the sections of all cells on a set that does not close."""
         frequency = self.frequencies[place]
         dims = start_dims(self.attractors)
         ids = self.attractors["attractor_id"].isel({FREQUENCY_DIM: place}).transpose(*dims).values

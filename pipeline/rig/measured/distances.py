@@ -1,11 +1,11 @@
-"""Distances between sets of section points: Wasserstein-1, and what of it is noise.
+"""Compute Wasserstein-1 distances between sets of section points, and their noise floor.
 
-Wasserstein-1 of two sets of equally many points is the mean way of the cheapest pairing, found by
+For two sets of equally many points, Wasserstein-1 is the mean distance in the cheapest pairing, found by
 `scipy.optimize.linear_sum_assignment` (a shortest augmenting path: Crouse, IEEE Trans. Aerosp. Electron.
-Syst. 52, 2016, p. 1679). Of unequal numbers it is the cheapest transport, a linear programme that
-`scipy.optimize.linprog` solves by HiGHS (Huangfu and Hall, Math. Prog. Comp. 10, 2018, p. 119). The way
-between two states is the largest difference of a component in units of the model's scales, angles on their
-circle, as everywhere in `pipeline.analysis`.
+Syst. 52, 2016, p. 1679). For unequal numbers it is the cost of the cheapest transport, a linear programme
+that `scipy.optimize.linprog` solves by HiGHS (Huangfu and Hall, Math. Prog. Comp. 10, 2018, p. 119). The
+distance of two states is the largest difference of a component in units of the model's scales, with angles on
+their circle, as everywhere in `pipeline.analysis`.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from pipeline.analysis.sets import Geometry
 Floats = npt.NDArray[np.float64]
 
 _DRAWS = 8
-"""Samples whose distances are averaged."""
+"""Number of samples whose distances are averaged."""
 
 
 def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
-    """Wasserstein-1 between two sets of section points.
+    """Return the Wasserstein-1 distance between two sets of section points.
 
     Parameters
     ----------
     a, b
-        Shapes (m, state) and (n, state). Every point of a set has the same weight.
+        Points, shapes (m, state) and (n, state). Every point of a set has the same weight.
     geometry
         Scales and circles of the states.
 
     Returns
     -------
     float
-        In units of the scales.
+        Distance in units of the scales.
     """
     ways = geometry.distance(a[:, None], b[None])
     if len(a) != len(b):
@@ -49,12 +49,12 @@ def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
 
 
 def _transport(ways: Floats) -> float:
-    """Mean way of the cheapest transport between points of equal weights in each of two sets."""
+    """Return the mean distance in the cheapest transport between two sets of equally weighted points."""
     m, n = ways.shape
     if min(m, n) == 1:
         return float(ways.mean())
     leaving, coming = kron(eye_array(m), np.ones((1, n))), kron(np.ones((1, m)), eye_array(n))
-    # the last of the sums follows from the others
+    # one constraint is dropped: it follows from the others
     sums = vstack([leaving, coming]).tocsr()[:-1]
     totals = np.concatenate([np.full(m, 1.0 / m), np.full(n, 1.0 / n)])[:-1]
     found = linprog(ways.ravel(), A_eq=sums, b_eq=totals, method="highs")
@@ -70,9 +70,9 @@ class Candidate:
     Attributes
     ----------
     attractor : int
-        Its id.
+        Id of the attractor.
     orbit_period : int
-        0 for a set that does not close.
+        Period of the orbit; 0 for a set that does not close.
     side : int
         Code of the model's classifier.
     points : ndarray
@@ -87,14 +87,14 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Sections of one step.
+    """The sections of one step, with their noise.
 
     Attributes
     ----------
     points, noise : ndarray
         (n, state): states, and the standard deviation of each.
     orbit_period : int
-        0 for none.
+        Period of the orbit; 0 if it does not close.
     """
 
     points: Floats
@@ -103,25 +103,25 @@ class Cloud:
 
     @property
     def cycle(self) -> int:
-        """Sections after which a closed motion repeats; 1 for one that does not."""
+        """Number of sections after which a closed motion repeats; 1 if it does not close."""
         return max(self.orbit_period, 1)
 
     @property
     def size(self) -> int:
-        """Sections of a half, whole cycles if there is room for any.
+        """Number of sections of a half, in whole cycles if the half is long enough.
 
-        The halves of a motion that closes after k sections would otherwise hold its points in unequal
-        numbers, which costs a way from one point of the orbit to another.
+        Otherwise the halves would hold the points of an orbit in unequal numbers, which adds a distance from
+        one point of the orbit to another.
         """
         half = len(self.points) // 2
         return half // self.cycle * self.cycle or half
 
     def halves(self) -> tuple[Floats, Floats]:
-        """First and second half."""
+        """Return the first and the second half."""
         return self.points[-2 * self.size : -self.size], self.points[-self.size :]
 
     def shuffled(self, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Two halves of cycles drawn at random."""
+        """Return two halves of randomly drawn cycles."""
         both = self.points[-2 * self.size :]
         length = self.cycle if self.size % self.cycle == 0 else 1
         cycles = both.reshape(-1, length, both.shape[-1])
@@ -131,7 +131,7 @@ class Cloud:
 
 
 def cloud_of(points: Floats, noise: Floats, orbit_period: int) -> Cloud:
-    """Return the sections of a step; a cycle of which one is missing (NaN) is left out as a whole."""
+    """Return the sections of a step; cycles with a missing section (NaN) are left out."""
     known = np.asarray(np.isfinite(points).all(axis=1), np.bool_)
     last = int(np.flatnonzero(known)[-1]) + 1
     cycle = max(orbit_period, 1)
@@ -143,7 +143,7 @@ def cloud_of(points: Floats, noise: Floats, orbit_period: int) -> Cloud:
 
 
 def _scatter(points: Floats, noise: Floats, orbit_period: int) -> Floats:
-    """Noise of sections, or how far a closed motion is seen to scatter: its drive may jitter."""
+    """Return the noise of sections, or the observed scatter of a closed motion if that is larger."""
     k = orbit_period
     if not k or len(points) <= 2 * k:
         return noise
@@ -153,30 +153,29 @@ def _scatter(points: Floats, noise: Floats, orbit_period: int) -> Floats:
 
 
 def floor_of(cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> float:
-    """Wasserstein-1 between the halves of one recording: what noise, and being a sample, amount to.
+    """Return the noise floor of a recording: Wasserstein-1 between halves of its sections.
 
-    The mean over halves drawn at random, or that of the first and second half if that is more: then the
-    recording itself drifted.
+    It is the mean over randomly drawn halves. If the first and the second half differ more, as in a recording
+    that drifted, it is their distance.
     """
     drawn = [wasserstein(*cloud.shuffled(rng), geometry) for _ in range(_DRAWS)]
     return max(float(np.mean(drawn)), wasserstein(*cloud.halves(), geometry))
 
 
 def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> float:
-    """Mean Wasserstein-1 of the halves of a recording from an attractor.
+    """Return the mean Wasserstein-1 distance of the halves of a recording from an attractor.
 
     Parameters
     ----------
     candidate
-        The attractor. As many of its points as a half has are drawn, and blurred by the noise of the
-        sections, several times, so that a model that is right is as far away as the halves are from each
-        other.
+        The attractor. For each half, as many of its points are drawn, and the noise of the sections is added.
+        The distance from a correct model then equals that between the halves.
     cloud
         The recording's sections.
     geometry
         Scales and circles of the states.
     rng
-        Draws the samples.
+        Generator of the samples.
     """
     parts, blur = cloud.halves(), np.median(cloud.noise, axis=0)
     ways = []
@@ -188,7 +187,7 @@ def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.
 
 
 def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
-    """At least `size` points of an attractor: of a closed orbit whole turns, so that all weigh alike."""
+    """Draw at least `size` points of an attractor; an orbit is repeated as a whole."""
     points = candidate.points
     if candidate.orbit_period:
         return np.tile(points, (max(1, -(-size // len(points))), 1))
@@ -196,6 +195,6 @@ def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
 
 
 def geometry_of(names: Sequence[str], model_names: Sequence[str], whole: Geometry) -> Geometry:
-    """Geometry of those states that a recording knows."""
+    """Return the geometry of the states that a recording has."""
     at = [list(model_names).index(n) for n in names]
     return Geometry(tuple(whole.is_angle[i] for i in at), tuple(whole.scales[i] for i in at))

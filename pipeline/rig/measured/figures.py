@@ -1,4 +1,4 @@
-"""Figures of measured diagrams: beside and over computed ones on shared axes, and how far apart they are."""
+"""Draw measured diagrams beside and over computed ones, and the distances between them."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def plot_measured(
     measured
         Result of `pipeline.rig.measured.measuring.measure`.
     cube
-        Of a run of the same model, one value of every axis but the frequency.
+        Cube of a run of the same model, with one value on every axis but the frequency.
     state
         Name of the state; by default the first that is measured.
     degrees
-        Degrees instead of radians.
+        Whether to use degrees instead of radians.
     layout
-        ``side``: measured left, computed right. ``over``: measured as open triangles over the computed
-        points, pointing the way of the sweep.
+        ``side``: measured left, computed right. ``over``: measured points as open triangles over the computed
+        points; the triangles show the direction of the sweep.
     frame
         Width of the figure and ranges of its axes.
 
@@ -104,7 +104,7 @@ def _rig(measured: xr.Dataset) -> str:
 def _ranges(
     measured: xr.Dataset, values: np.ndarray, cube: xr.Dataset | None, frame: style.Frame
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
-    """Ranges that hold both diagrams; heights are left to the computed one where it is alone to know."""
+    """Return ranges of the axes that hold both diagrams; None for heights that the computed one sets."""
     own = measured["frequency"].values
     f = own if cube is None else np.concatenate([own, np.atleast_1d(cube[FREQUENCY_DIM].values)])
     margin = 0.02 * float(np.ptp(f)) or 0.02 * float(f[0])
@@ -133,7 +133,7 @@ def _dress(ax: Axes, measured: xr.Dataset, measure: labels.Measure, ranges: Any)
 
 
 def _draw_steps(ax: Axes, measured: xr.Dataset, values: np.ndarray, over: bool) -> None:
-    """Draw the sections of all steps, by direction and motion; upwards above downwards."""
+    """Draw the sections of all steps by direction and class of motion, upward sweeps on top."""
     motions = motions_of(measured)
     codes = measured["side"].values if "side" in measured else np.zeros(measured.sizes["step"], int)
     f, ways = measured["frequency"].values, measured["direction"].values.astype(str)
@@ -178,28 +178,29 @@ def plot_comparison(
     compared: xr.Dataset, computed: Computed, *, state: str = "", degrees: bool = False,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:  # fmt: skip
-    """Draw measured points over the attractors, their distance in units of noise, and both regimes.
+    """Draw measured points over the attractors, their distances in units of noise, and both regimes.
 
     Parameters
     ----------
     compared
         Result of `pipeline.rig.measured.compare.compare`.
     computed
-        What it was compared with.
+        Attractors that it was compared with.
     state
         Name of the state; by default the first that is measured.
     degrees
-        Degrees instead of radians.
+        Whether to use degrees instead of radians.
     frame
         Width of the figure and ranges of its axes.
 
     Returns
     -------
     DataFigure
-        Three panels over one axis of frequency: the attractors, those in colours that were nearest anywhere,
-        with the measured sections as open triangles; the distance from the nearest attractor in units of the
-        noise floor, in its colour and pointing the way of the sweep; strips of the regimes of rig and model,
-        coloured by side, with their periods (a cross: unclosed). Its `data` are `compared`.
+        Three panels over one frequency axis. Top: the attractors, coloured if they are nearest at some step,
+        with the measured sections as open triangles. Middle: the distance from the nearest attractor in units
+        of the noise floor, in its colour; triangles show the direction of the sweep. Bottom: strips of the
+        regimes of rig and model, coloured by side, with their periods (a cross: unclosed). Its `data` are
+        `compared`.
 
     Raises
     ------
@@ -237,7 +238,7 @@ def plot_comparison(
 
 @dataclass(frozen=True)
 class _Met:
-    """Attractors that were nearest to the rig anywhere: their colours and names; whether there are others."""
+    """The attractors that were nearest to the rig at some step, with colours and names."""
 
     colours: dict[int, str]
     names: dict[int, str]
@@ -245,7 +246,7 @@ class _Met:
 
 
 def _met(compared: xr.Dataset, computed: Computed) -> _Met:
-    """Give the first attractor of each side that side's colour, so that all panels say the same."""
+    """Return the nearest attractors; the most frequent one of each side gets that side's colour."""
     cast, motions = palette.cast_of(computed.attractors), motions_of(compared)
     winners, sides = compared["winner"].values, compared["computed_side"].values
     ids = [int(i) for i in np.unique(winners) if i >= 0]
@@ -261,7 +262,7 @@ def _met(compared: xr.Dataset, computed: Computed) -> _Met:
 
 
 def _draw_attractors(ax: Axes, computed: Computed, measure: labels.Measure, met: _Met) -> None:
-    """Draw the points of all attractors, those that the rig did not meet in grey."""
+    """Draw the points of all attractors; grey ones were nowhere nearest to the rig."""
     found = computed.attractors
     points = found["attractor_points"].sel(state=measure.name).transpose(FREQUENCY_DIM, "attractor", "point")
     values = measure.shown(points.values, wrap=True)

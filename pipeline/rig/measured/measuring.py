@@ -1,4 +1,4 @@
-"""Measured diagrams: from recordings of a sweep to sections, period and kind of motion per step."""
+"""Measure a diagram: sections, period and class of motion at each step of recorded sweeps."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from pipeline.rig.measured.steps import LEAST, TRANSIENT, Stretch, cut
 from pipeline.spec.problems import SpecError
 
 _MEMORY = 3.0
-"""By how much a shaken motion scatters more than one edge moves it: a period has two, and it remembers."""
+"""Scatter of a jittered motion relative to the effect of one edge: each period has two, and effects last."""
 _PARTS = ("section", "section_noise", "kink")
 DIRECTIONS = {1: "up", -1: "down", 0: "none"}
 
 
 @dataclass(frozen=True)
 class Way:
-    """How recordings are cut, sectioned and judged.
+    """The settings for cutting, sectioning and judging recordings.
 
     Attributes
     ----------
@@ -37,11 +37,11 @@ class Way:
     window : int, optional
         Drive periods of a window of a slow sweep; see `pipeline.rig.measured.steps.cut`.
     window_s, order
-        Of the local polynomials; see `pipeline.rig.measured.sections.find_sections`.
+        Window and order of the local polynomials; see `pipeline.rig.measured.sections.find_sections`.
     hysteresis : float, optional
-        Of the drive's edges; see `pipeline.rig.edges.find_edges`.
+        Band that the drive's edges must cross; see `pipeline.rig.edges.find_edges`.
     limit, max_period
-        Of the period; see `pipeline.rig.measured.regimes.find_period`.
+        Settings for the period; see `pipeline.rig.measured.regimes.find_period`.
     """
 
     transient: int = TRANSIENT
@@ -55,7 +55,7 @@ class Way:
 
 @dataclass(frozen=True)
 class _Step:
-    """One row of a measured diagram."""
+    """A row of a measured diagram."""
 
     stretch: Stretch
     recording: int
@@ -68,26 +68,26 @@ class _Step:
 def measure(
     recordings: Sequence[xr.Dataset], way: Way | None = None, *, parameters: Parameters | None = None
 ) -> xr.Dataset:
-    """Sections and regimes of each step of one sweep or more.
+    """Return sections and regimes at each step of one or more recorded sweeps.
 
     Parameters
     ----------
     recordings
-        As `pipeline.rig.recordings.read_recording` gives them, all of one model, each with a drive.
+        Recordings from `pipeline.rig.recordings.read_recording`, all of one model, each with a drive.
     way
-        How they are cut and judged.
+        Settings for cutting and judging them.
     parameters
-        Of the model, which its classifier needs to tell motions apart; without them no words are given. The
-        model's forcing says where in the drive's period sections are.
+        Parameters of the model, which its classifier needs; without them motions are not classified. The
+        model's forcing gives the phase of the sections in the drive period.
 
     Returns
     -------
     Dataset
         Dims ``step``, ``period_index`` (NaN beyond a step's own), ``state``. ``section`` and
         ``section_noise`` (step, period_index, state), angles not wrapped; by step ``frequency_error_hz``,
-        ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``instant_error_s`` (of all its sections in
-        common: it moves angles by their rates and is no part of ``section_noise``), ``n_sections``,
-        ``orbit_period`` (0: closes at no period that was looked at), ``confidence``, ``closure``, ``margin``
+        ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``instant_error_s`` (shared by all its
+        sections: it shifts angles by their rates and is not included in ``section_noise``), ``n_sections``,
+        ``orbit_period`` (0: does not close at any tested period), ``confidence``, ``closure``, ``margin``
         (`regimes.Regime`), ``side`` (codes of the model's classifier; absent without one or without
         parameters). Coordinates of ``step``: ``frequency`` [Hz], ``direction`` (up, down, none),
         ``recording``, ``start_s``, ``end_s``.
@@ -139,15 +139,15 @@ def _steps(recording: xr.Dataset, number: int, way: Way, parameters: Parameters)
 
 
 def _instants(edges: Edges, stretches: Sequence[Stretch], phase: float) -> Edges:
-    """Instants of the sections of all stretches: their rising edges, or a share of the period later."""
+    """Return the times of the sections of all stretches: rising edges, or a fixed phase later."""
     later = [s.edges.rising + phase / s.timing.frequency_hz for s in stretches]
-    # windows end at the drive's other edges; where sections are elsewhere, at all of them
+    # windows end at the other edges of the drive; for sections at another phase, at all edges
     others = np.sort(np.concatenate([edges.rising, edges.falling])) if phase else edges.falling
     return Edges(np.concatenate(later), others, edges.resolution_s)
 
 
 def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
-    """Sections at the places of their edges, NaN where an edge has none: what follows counts periods."""
+    """Return sections at the indices of their edges, NaN for edges without one: later code counts periods."""
     values = np.full((n, sections.sizes["state"]), np.nan)
     values[sections["number"].values] = sections[name].values
     return values
@@ -156,7 +156,7 @@ def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
 def _with_instants(
     points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, scatter_s: float
 ) -> np.ndarray:
-    """Noise of sections, the scatter of their instants included where the rate is known."""
+    """Return the noise of sections, with the scatter of their times where the rate is known."""
     both = noise.copy()
     for i, name in enumerate(names):
         rate = model.state(name).rate
@@ -173,10 +173,10 @@ def _shaken(
     model: Model,
     shake_s: float,
 ) -> np.ndarray:
-    """Scatter to be expected of a closed motion whose drive truly jitters.
+    """Return the expected scatter of a closed motion whose drive itself jitters.
 
-    An edge that is late by a time lets an angle go on by its rate, and changes a rate by the jump of its
-    derivative, times that time.
+    A late edge lets an angle advance by its rate times the delay. It changes a rate by the jump of the rate's
+    derivative times the delay.
     """
     if not shake_s:
         return noise
@@ -261,7 +261,7 @@ def _about(units: str, text: str) -> dict[str, str]:
 
 
 def with_sides(measured: xr.Dataset, parameters: Parameters) -> xr.Dataset:
-    """Add what the model's classifier says of each step, for the parameters that are taken to hold.
+    """Add the class of motion of each step, by the model's classifier with given parameters.
 
     Without a classifier, or with a state unknown, nothing is added.
     """

@@ -1,4 +1,4 @@
-"""Recording and model from the same state: time series over time series, phase portraits over each other."""
+"""Draw a recording and the model from the same state: time series and phase portraits."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ SUFFIX = "_computed"
 def plot_series(
     ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the series of `pipeline.rig.measured.series.series_of` over each other, and their portraits.
+    """Draw the series of `pipeline.rig.measured.series.series_of` over each other, and phase portraits.
 
     Parameters
     ----------
     ds
         States and, with the suffix ``_computed``, those of the model, over ``time`` [s].
     degrees
-        Degrees instead of radians.
+        Whether to use degrees instead of radians.
     frame
         Width of the figure, and the range of time.
 
     Returns
     -------
     DataFigure
-        A panel for each state, with the root mean square of the difference, and for each pair that portraits
-        show. Its `data` are `ds`.
+        A panel for each state with the root mean square of the difference, and one for each phase portrait.
+        Its `data` are `ds`.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def _draw_portrait(ax: Axes, ds: xr.Dataset, pair: list[labels.Measure]) -> None
 
 
 def _looks(name: str) -> tuple[tuple[str, dict[str, Any]], ...]:
-    """Look of the measured line and of the computed one, which lies above and is thinner."""
+    """Return the looks of the measured line and of the computed one, which is thinner and on top."""
     return (
         (name, {"color": RIG, "linewidth": 1.3, "zorder": 2.0}),
         (name + SUFFIX, {"color": MODEL, "linewidth": 0.8, "zorder": 3.0}),

@@ -1,4 +1,4 @@
-"""Where in the drive's period a model takes its sections, seen from the rising edge that a rig shows."""
+"""Find the phase of a model's sections in the drive period, from the rising edge."""
 
 from __future__ import annotations
 
@@ -10,24 +10,23 @@ from pipeline.spec.problems import SpecError
 
 _SAMPLES = 4096
 _SNAP = 2e-3
-"""Shares of a period below this are none: a flank is as wide."""
+"""Fraction of a period below which a phase counts as 0, since a flank is as wide."""
 
 
 def section_phase(parameters: Parameters, frequency_hz: float) -> float:
-    """Share of the period from the drive's rising edge to the model's section.
+    """Return the phase of the model's section after the drive's rising edge, as a fraction of the period.
 
     Parameters
     ----------
     parameters
-        Of the model; its forcing is looked at.
+        Parameters of the model, for its forcing.
     frequency_hz
         Drive frequency [Hz].
 
     Returns
     -------
     float
-        In [0, 1): 0 where sections are taken at the rising edge, 0.25 at the maximum of a sine; 0, too, for a
-        drive that does nothing.
+        In [0, 1): 0 for sections at the rising edge, 0.25 at the maximum of a sine. Also 0 without a drive.
     """
     from magpend_core.pointwise import drive_level
 

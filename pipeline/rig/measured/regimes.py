@@ -1,11 +1,11 @@
-"""Periods of measured motions: which one, among noise and what is left of a transient, and how sure that is.
+"""Estimate the periods of measured motions from noisy sections, with a confidence.
 
-A motion of period k repeats every k sections. What differs after k sections is noise, and the rest of a
-transient; a second difference at lag k, x[n + 2k] - 2 x[n + k] + x[n], keeps of a decay by a factor m per k
-sections the share (1 - m)^2 alone, where a first difference keeps 1 - m. In units of the sections' own noise
-its root mean square is 1 for a motion of period k, and as large as the motion for any other. The least k with
-a small one is the period; how sure that is, is the share of resampled sections, and of limits between half
-and twice the chosen one, that give the same answer.
+A motion of period k repeats every k sections, up to noise and the rest of a transient. Second differences at
+lag k, x[n + 2k] - 2 x[n + k] + x[n], suppress a transient: if it decays by a factor m per k sections, they
+keep the fraction (1 - m)^2 of it, while first differences keep 1 - m. In units of the sections' own noise
+their root mean square is 1 for a motion of period k, and as large as the motion for any other. The least k
+with a small value is the period. Its confidence is the fraction of resampled sections, with limits between
+half and twice the chosen one, that give the same period.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 
 LIMIT = 2.5
-"""Second differences below so many units of noise are a closed motion's."""
+"""Root mean square of second differences, in units of noise, below which a motion is closed."""
 MAX_PERIOD = 16
 _LEAST = 6
-"""Second differences that a period needs at least."""
+"""Fewest second differences that decide on a period."""
 _RESAMPLES = 200
 
 
 @dataclass(frozen=True)
 class Regime:
-    """What sections say of a motion's period.
+    """The estimated period of a motion, with its confidence.
 
     Attributes
     ----------
     orbit_period : int
-        In drive periods; 0 if it closes at none that was looked at.
+        Period in drive periods; 0 if the motion closes at no tested period.
     confidence : float
-        Share of resamples that give the same period, 0 to 1.
+        Fraction of resamples that give the same period, 0 to 1.
     closure : float
-        Root mean square of the second differences at that period, in units of noise; at the best if there is
-        none.
+        Root mean square of the second differences at that period, in units of noise. Without a period, the
+        least over all tested periods.
     margin : float
-        By how much the nearest rival misses: the least of closure over the limit of shorter periods and limit
-        over closure of this one; for no period, the best closure over the limit.
+        Ratio by which the decision clears the limit: the least of closure/limit over all shorter periods, and
+        of limit/closure at this period. Without a period, the least closure/limit.
     max_period : int
-        Longest that was looked at.
+        Longest tested period.
     """
 
     orbit_period: int
@@ -55,26 +55,26 @@ class Regime:
 def find_period(
     points: Floats, noise: Floats, *, limit: float = LIMIT, max_period: int = MAX_PERIOD, seed: int = 0
 ) -> Regime:
-    """Find the period of a motion from its sections.
+    """Estimate the period of a motion from its sections.
 
     Parameters
     ----------
     points
-        Consecutive sections, shape (n, component); angles run on, no wraps. A turn per period is a trend,
-        which second differences do not see.
+        Consecutive sections, shape (n, component), angles not wrapped. A full turn per period is a trend,
+        which cancels in second differences.
     noise
-        Standard deviation of each, same shape, above 0.
+        Standard deviation of each section, same shape, above 0.
     limit
-        Of the closure, in units of noise.
+        Largest closure of a closed motion, in units of noise.
     max_period
-        Longest looked for; a period k needs 2 k + 6 sections.
+        Longest tested period; a period k needs 2 k + 6 sections.
     seed
-        Of the resampling.
+        Seed of the resampling.
 
     Returns
     -------
     Regime
-        With fewer than 8 sections no period is looked for: period 0 with confidence 0.
+        With fewer than 8 sections, period 0 with confidence 0.
     """
     n = len(points)
     periods = [k for k in range(1, max_period + 1) if n - 2 * k >= _LEAST]
@@ -95,19 +95,19 @@ def find_period(
 
 
 def _second(points: Floats, noise: Floats, k: int) -> Floats:
-    """Mean square over components of the second differences at lag k, in units of their own noise."""
+    """Return mean squares over components of the second differences at lag k, in units of their noise."""
     difference = points[2 * k :] - 2 * points[k:-k] + points[: -2 * k]
     variance = noise[2 * k :] ** 2 + 4 * noise[k:-k] ** 2 + noise[: -2 * k] ** 2
     return np.asarray((difference**2 / variance).mean(axis=1))
 
 
 def _closure(squares: Floats) -> Floats:
-    """Root mean square by lag, of all sections or of the later half if that is less: a motion may settle."""
+    """Return root mean squares by lag, over all sections or the later half, whichever is less."""
     known = np.isfinite(squares)
     values = np.where(known, squares, 0.0)
     later = np.zeros(squares.shape[1], bool)
     later[squares.shape[1] // 2 :] = True
-    # a lag whose later half is too short is judged by all
+    # a lag whose later half is too short is judged by all sections
     found = []
     for chosen in (np.ones_like(later), later):
         count = (known & chosen).sum(axis=1)
@@ -117,17 +117,17 @@ def _closure(squares: Floats) -> Floats:
 
 
 def _least(closure: Floats, limit: float) -> int:
-    """Row of the least period that closes; -1 if none does."""
+    """Return the row of the least period that closes; -1 if none does."""
     closed = np.flatnonzero(closure <= limit)
     return int(closed[0]) if closed.size else -1
 
 
 def _share(squares: Floats, found: int, limit: float, rng: np.random.Generator) -> float:
-    """Share of resamples that give the same row.
+    """Return the fraction of resamples that give the same row.
 
-    Sections are drawn in blocks as long as the second differences overlap, all lags together; the limit is
-    drawn between half and twice of what was chosen, evenly on a scale of ratios, since the noise is known to
-    such a factor only.
+    Sections are drawn in blocks as long as second differences overlap, for all lags together. The limit is
+    drawn log-uniformly between half and twice the chosen one, since the noise is known only to about a factor
+    of two.
     """
     n = squares.shape[1]
     block = min(max(4, squares.shape[0]), n)

@@ -1,10 +1,10 @@
-"""Sections of a recording: the states, and their rates, at the instants at which the drive rises.
+"""Compute sections of a recording: states and rates at the times when the drive rises.
 
-A recording has noisy angles at a sampling rate that knows nothing of the drive. Around each edge a polynomial
-is fitted on either side; what the edge cannot change joins both. A torque that jumps bends an angle's rate,
-but the angle and its rate go on: both sides share them, and differ from the curvature on. A rate that was
-measured itself shares its value alone. So the fit is as good as one across the edge, without the bias of one
-that knows of no edge.
+A recording has noisy angles, and its samples are not synchronous with the drive. A polynomial is fitted on
+either side of each edge, with the continuous quantities in common. When the torque jumps, an angle and its
+rate are continuous, so both sides share value and slope and differ from the curvature on. For a measured rate
+both sides share only the value. The fit is as precise as one polynomial across the edge, without the bias of
+ignoring it.
 """
 
 from __future__ import annotations
@@ -28,22 +28,23 @@ WINDOW_S = 0.08
 """Width of the window about an edge [s]."""
 ORDER = 3
 _LEAST_SPARE = 3
-"""Samples on either side beyond what its own coefficients need."""
+"""Fewest samples on either side beyond the number of its own coefficients."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A measured state, and the state that its slope is, if that is not measured.
+    """A measured state, and the state that its slope gives if that is not measured.
 
     Attributes
     ----------
     name : str
+        Name of the state.
     place : int
-        Among the model's states.
+        Index among the model's states.
     slope : int
-        Place of the rate's state; -1 if the slope is nobody's or is measured.
+        Index of the rate's state; -1 if the slope is no state or is measured.
     smooth : bool
-        Whether the slope goes on across an edge.
+        Whether the slope is continuous across an edge.
     """
 
     name: str
@@ -53,7 +54,7 @@ class Channel:
 
 
 def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
-    """Return the states that a recording holds, with the rates that are to be found of them.
+    """Return the states that a recording holds, each with the rate that its slope gives.
 
     Raises
     ------
@@ -83,14 +84,14 @@ def name_of(recording: xr.Dataset) -> str:
 def find_sections(
     recording: xr.Dataset, edges: Edges, *, window_s: float = WINDOW_S, order: int = ORDER
 ) -> xr.Dataset:
-    """States at the rising edges by local polynomials with a kink at the edge.
+    """Return states at the rising edges, by local polynomials with a kink at the edge.
 
     Parameters
     ----------
     recording
-        As `pipeline.rig.recordings.read_recording` gives it; its attribute ``model`` names the states.
+        Recording from `pipeline.rig.recordings.read_recording`; its attribute ``model`` names the states.
     edges
-        Edges of its drive; windows end at neighbouring ones.
+        Edges of its drive; windows end at neighbouring edges.
     window_s
         Width of the window about an edge [s]. Long windows average noise, short ones follow the motion.
     order
@@ -99,12 +100,11 @@ def find_sections(
     Returns
     -------
     Dataset
-        Dims ``edge``, ``state`` (those that are known). ``section`` (edge, state): in the units of the model,
-        angles not wrapped; ``section_noise`` (edge, state): standard deviation that the channels' noise
-        leaves in it; ``kink`` (edge, state): by how much the state's derivative jumps at the edge, NaN where
-        a channel cannot tell. Coordinates ``time`` (edge) [s]. An edge with too few samples on a side (a gap,
-        an end) is left out. The attribute ``noise`` tells the noise of a sample by channel, from the
-        residuals, as JSON.
+        Dims ``edge``, ``state`` (the known ones). ``section`` (edge, state): states in the units of the
+        model, angles not wrapped; ``section_noise`` (edge, state): their standard deviation from the
+        channels' noise; ``kink`` (edge, state): jump of the state's derivative at the edge, NaN if unknown.
+        Coordinates ``time`` (edge) [s]. An edge with too few samples on a side (at a gap or an end) is left
+        out. The attribute ``noise`` holds the noise of a sample by channel, from the residuals, as JSON.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def find_sections(
             if place >= 0:
                 section[:, place] = values[:, i, column]
                 blur[:, place] = spread[:, i, column] * noise[i]
-        # an angle's rate goes on, and bends; a rate that was measured bends itself
+        # the kink of an angle's slope belongs to its rate, that of a measured rate to itself
         kink[:, c.slope if c.smooth else c.place] = jumps[:, i] if c.slope >= 0 or not c.smooth else np.nan
     units = [model.states[i].unit for i in known]
     about = {"long_name": "state at the rising edge", "units": "see state_units"}
@@ -168,7 +168,7 @@ def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
 def _fits(
     recording: xr.Dataset, edges: Edges, channels: list[Channel], window_s: float, order: int
 ) -> list[tuple[int, Floats, Floats, Floats, Floats]]:
-    """For edges with enough samples: number, and what `_fit` gives."""
+    """Return index and fit of each edge with enough samples; see `_fit`."""
     time = recording["time"].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
     data = np.stack([recording[c.name].values for c in channels], axis=1)
@@ -186,9 +186,9 @@ def _fits(
 
 
 def _nearest(instants: Floats, at: float, beyond: float) -> float:
-    """Distance of the nearest instant that is more than `beyond` away, infinite without one.
+    """Return the distance of the nearest edge that is more than `beyond` away; infinite if there is none.
 
-    An edge that was placed by a line differs a little from the one that was seen.
+    An edge placed by a fitted line differs slightly from the detected one.
     """
     low, high = np.searchsorted(instants, [at - beyond, at + beyond])
     before = at - instants[low - 1] if low else math.inf
@@ -199,7 +199,7 @@ def _nearest(instants: Floats, at: float, beyond: float) -> float:
 def _fit(
     t: Floats, data: Floats, channels: list[Channel], half: float, order: int
 ) -> tuple[Floats, Floats, Floats, Floats] | None:
-    """Value and slope (channel, 2) at t = 0, spread per unit noise; residual variance, kink (channel,)."""
+    """Return value and slope (channel, 2) at t = 0, spread per unit noise, variance and kink (channel,)."""
     if min((t < 0).sum(), (t >= 0).sum()) < order + _LEAST_SPARE or not np.isfinite(data).all():
         return None
     values, spread = np.empty((len(channels), 2)), np.empty((len(channels), 2))
@@ -214,14 +214,14 @@ def _fit(
         values[which] = coefficients[:2].T * scale
         spread[which] = np.sqrt((inverse[:2] ** 2).sum(axis=1)) * scale
         variance[which] = (residual**2).sum(axis=0) / (len(t) - basis.shape[1])
-        # of the curvature, or of the slope: the first pair of coefficients that both sides do not share
+        # the first pair of coefficients that both sides do not share: of curvature, or of slope
         first = basis.shape[1] - 2 * (order - 1) if smooth else 1
         jumps[which] = (coefficients[first + 1] - coefficients[first]) * (2 / half**2 if smooth else 1 / half)
     return values, spread, variance, jumps
 
 
 def _basis(x: Floats, order: int, smooth: bool) -> Floats:
-    """Columns: value, slope, then what differs on both sides."""
+    """Return columns of the fit: value, slope, then terms of each side."""
     left, right = np.where(x < 0, x, 0.0), np.where(x < 0, 0.0, x)
     first = 2 if smooth else 1
     shared = [np.ones_like(x), x] if smooth else [np.ones_like(x)]

@@ -1,4 +1,4 @@
-"""Time series over time series: a recording, and the model from the same state at a rising edge on."""
+"""Compare time series: a recording, and the model from the same state at a rising edge."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pipeline.spec.problems import SpecError
 PERIODS = 10
 RTOL = 1e-9
 _LEAST = 3
-"""Edges by which a frequency is known."""
+"""Fewest edges that determine a frequency."""
 
 
 def series_of(
@@ -32,38 +32,37 @@ def series_of(
     order: int = ORDER,
     hysteresis: float | None = None,
 ) -> xr.Dataset:
-    """Part of a recording from a rising edge on, and the model's motion from the same state.
+    """Return a part of a recording from a rising edge on, and the model's trajectory from the same state.
 
-    The model starts at the section that local polynomials find at the edge, and is driven at the frequency of
-    the line through the edges of the stretch that the part lies in.
+    Local polynomials give the model's initial state at the edge. The drive frequency is that of a line
+    through the edges of the stretch of constant frequency.
 
     Parameters
     ----------
     recording
-        As `pipeline.rig.recordings.read_recording` gives it, with all states or the angles whose rates they
-        are.
+        Recording from `pipeline.rig.recordings.read_recording`, with every state or the angle whose rate it
+        is.
     parameters
-        Of the recording's model.
+        Parameters of the recording's model.
     start_s
-        The first rising edge at or after it [s] is taken; by default the recording's begin.
+        Time from which on the first rising edge is taken [s]; by default the recording's begin.
     n_periods
-        Drive periods of the part; it ends sooner where the drive's frequency changes.
+        Drive periods of the part; it ends earlier if the drive frequency changes.
     window_s, order, hysteresis
-        As for `pipeline.rig.measured.sections.find_sections` and `pipeline.rig.edges.find_edges`.
+        See `pipeline.rig.measured.sections.find_sections` and `pipeline.rig.edges.find_edges`.
 
     Returns
     -------
     Dataset
-        Over ``time`` [s since the edge]: the measured states under their names, smoothed rates where they are
-        not measured, and the computed ones with the suffix ``_computed``. Attributes: ``frequency_hz``,
-        ``start_s`` of the edge, ``start`` and ``rms`` (JSON by state; of angles on their circle),
-        ``duty_cycle``.
+        Over ``time`` [s since the edge]: the measured states under their names, smoothed rates if rates are
+        not measured, and the computed states with the suffix ``_computed``. Attributes: ``frequency_hz``,
+        ``start_s`` of the edge, ``start`` and ``rms`` (JSON by state; angles on their circle).
 
     Raises
     ------
     SpecError
-        If the parameters are of another model, a state is not known, no edge follows `start_s` with samples
-        around it, or no period of one frequency does.
+        If the parameters are of another model, a state is unknown, or no edge after `start_s` has samples
+        around it and periods of one frequency after it.
     ArithmeticError
         If the model diverges.
     """
@@ -91,7 +90,7 @@ def series_of(
     period = (own[-1] - own[0]) / (own.size - 1)
     part = int(np.flatnonzero(sections["number"].values == first)[0])
     start = sections["section"].values[part]
-    # the section was taken at the edge that was seen; the line through many knows its instant better
+    # the start is placed at the detected edge; the frequency comes from the line through many edges
     start_time = float(edges.rising[first]) + later
     return _dataset(recording, parameters, edges, start, start_time, 1 / period, last - first)
 
@@ -99,12 +98,12 @@ def series_of(
 def _part(
     recording: xr.Dataset, edges: Edges, sections: xr.Dataset, start_s: float | None, n_periods: int
 ) -> tuple[int, int]:
-    """First and last edge of the part."""
+    """Return the first and the last edge of the part."""
     begin = -math.inf if start_s is None else start_s
     known = [int(n) for n in sections["number"].values if edges.rising[int(n)] >= begin]
     for first in known:
         for a, b in constant_spans(edges):
-            # a stretch of a few periods is where the drive changes
+            # the drive changes its frequency within stretches of a few periods
             if a <= first < b and b - a >= _LEAST:
                 return first, min(b, first + n_periods)
     raise SpecError([
@@ -115,14 +114,14 @@ def _part(
 
 
 def _first_timing(edges: Edges) -> float:
-    """Frequency of the drive, roughly [Hz]."""
+    """Return a rough frequency of the drive [Hz]."""
     if edges.rising.size < _LEAST:
         raise SpecError([f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them."])
     return 1 / float(np.median(np.diff(edges.rising)))
 
 
 def _fitted(edges: Edges, first: int, last: int) -> np.ndarray:
-    """Edges of the stretch that the part lies in."""
+    """Return the part's edges, placed on the line through all edges of its stretch."""
     a, b = next((a, b) for a, b in constant_spans(edges) if a <= first < b)
     rising = edges.rising[a : b + 1]
     n = np.arange(rising.size, dtype=np.float64)
@@ -153,7 +152,7 @@ def _dataset(
     variables, rms = {}, {}
     for i, s in enumerate(model.states):
         source = recording[s.name].values[chosen] if s.name in recording else smoothed[s.name].values[inner]
-        # the recording counts turns from its own begin
+        # the recording and the model may differ by full turns
         shift = 2 * np.pi * np.round((source[0] - states[0, i]) / (2 * np.pi)) if s.on_circle else 0.0
         off = source - shift - states[:, i]
         off = off - 2 * np.pi * np.round(off / (2 * np.pi)) if s.on_circle else off

@@ -1,4 +1,4 @@
-"""Stretches of a sweep: where the drive kept one frequency, or windows of a drive that was swept slowly."""
+"""Cut a sweep into stretches of constant frequency, or a slow sweep into windows."""
 
 from __future__ import annotations
 
@@ -14,33 +14,36 @@ from pipeline.spec.problems import SpecError
 Floats = npt.NDArray[np.float64]
 
 TRANSIENT, WINDOW, LEAST = 20, 40, 8
-"""Periods dropped after a step; periods of a window of a slow sweep; least periods of a stretch."""
+"""Default numbers of periods: dropped after a step; in a window of a slow sweep; at least in a stretch."""
 _OFF = 5.0
-"""An edge so many standard deviations off the line through those before it, and the next as well: a step."""
+"""Deviation from the line through earlier edges, in standard deviations, that marks a step.
+
+Two successive edges must deviate.
+"""
 _TRUE_JITTER = 1.5
-"""A scatter of so many times what measuring explains is the drive's."""
+"""Ratio of an edge's scatter to the error of measuring above which the drive itself jitters."""
 _BENT = 4.0
-"""Curvature of a stretch, in standard errors, that is no chance."""
+"""Curvature of a stretch, in standard errors, above which it is significant."""
 _AROUND = 16
-"""Edges on either side of a step by which it is placed."""
+"""Number of edges on either side of a step that determine its place."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive periods of one frequency.
+    """Consecutive drive periods of one frequency.
 
     Attributes
     ----------
     edges : Edges
-        Those at which sections are taken, transient dropped. Where their scatter is that of measuring, rising
-        ones are those of the line through all edges of the stretch, which is nearer the drive's instants.
+        Edges at which sections are taken, without the transient. If they scatter only by the error of
+        measuring, rising edges are placed on the line through all edges of the stretch, which is more exact.
     timing : Timing
-        Of all edges of the stretch.
+        Timing of all edges of the stretch.
     start_s, end_s : float
-        Its first and last edge [s], the transient included.
+        First and last edge [s], with the transient.
     instant_scatter_s, instant_error_s : float
-        Standard error of a rising edge [s]: what differs from edge to edge, and what all have in common,
-        which is up to half a sample where edges fall on the same place between two samples.
+        Standard errors of a rising edge [s]: the part that differs from edge to edge, and the part that all
+        edges share. The latter is up to half a sample if edges fall on the same place between two samples.
     direction : int
         1 if the frequency rose to this stretch, -1 if it fell, 0 if there is no other.
     """
@@ -55,7 +58,7 @@ class Stretch:
 
     @property
     def shake_s(self) -> float:
-        """Jitter of the drive itself [s]: what measuring does not explain."""
+        """Jitter of the drive itself [s]; 0 if the error of measuring explains the scatter."""
         own = self.timing.jitter_s**2 - self.edges.error_s**2
         return math.sqrt(own) if self.timing.jitter_s > _TRUE_JITTER * self.edges.error_s else 0.0
 
@@ -66,17 +69,18 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
     Parameters
     ----------
     edges
-        Of a recording.
+        Edges of a recording.
     transient
-        Periods that are dropped at the begin of each constant stretch.
+        Periods that are dropped at the beginning of each constant stretch.
     window
-        Periods of a window of a slow sweep, of which none are dropped; 0 never cuts into windows. By default
-        windows of 40 are taken if stretches are a few periods long or bend all the same way.
+        Periods of a window of a slow sweep; none are dropped. 0 never cuts into windows. By default windows
+        of 40 periods are used if stretches have only a few periods, or if most of them are curved the same
+        way.
 
     Returns
     -------
     list of Stretch
-        In the order of time, each with at least 8 periods left.
+        Stretches in the order of time, each with at least 8 periods without the transient.
 
     Raises
     ------
@@ -112,7 +116,7 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
 
 
 def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
-    """Whether the frequency changes all along: stretches are a few periods long, or most bend one way."""
+    """Return whether the frequency changes all the time: short stretches, or most curved the same way."""
     if len(spans) > 3 and np.median([b - a for a, b in spans]) < LEAST:
         return True
     bends = np.array([_bend(edges.rising[a : b + 1], _noise(edges)) for a, b in spans if b - a >= LEAST])
@@ -121,14 +125,14 @@ def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
 
 
 def _bend(rising: Floats, noise: float) -> float:
-    """Curvature of edges against their number, in units of its standard error."""
+    """Return the curvature of edge times against their number, in units of its standard error."""
     n = np.arange(rising.size) - 0.5 * (rising.size - 1)
     square = n**2 - (n**2).mean()
     return float(square @ rising / (noise * math.sqrt(square @ square)))
 
 
 def constant_spans(edges: Edges) -> list[tuple[int, int]]:
-    """First and last rising edge of each stretch in which edges lie on a line; neighbours share an edge."""
+    """Return first and last rising edge of each stretch of constant frequency; neighbours share an edge."""
     t = edges.rising
     noise = _noise(edges)
     spans, first = [], 0
@@ -143,7 +147,7 @@ def constant_spans(edges: Edges) -> list[tuple[int, int]]:
 
 
 def _noise(edges: Edges) -> float:
-    """Standard deviation of an edge [s]: from second differences, which steps rarely touch."""
+    """Estimate the standard deviation of an edge [s] from second differences, which steps rarely affect."""
     second = np.diff(edges.rising, 2)
     own = 1.4826 * float(np.median(np.abs(second))) / math.sqrt(6) if second.size else 0.0
     period = float(np.median(np.diff(edges.rising)))
@@ -151,7 +155,7 @@ def _noise(edges: Edges) -> float:
 
 
 def _reach(t: Floats, first: int, noise: float) -> int:
-    """Last edge that lies on the line through those before it."""
+    """Return the last edge that lies on the line through the edges before it."""
     if first + 2 >= t.size:
         return int(t.size - 1)
     period = t[first + 1] - t[first]
@@ -177,7 +181,7 @@ def _reach(t: Floats, first: int, noise: float) -> int:
 
 
 def _placed(t: Floats, first: int, last: int) -> int:
-    """Place a step at the edge where two lines, through those before and those after, fit best."""
+    """Return the edge of a step: where two lines, through the edges before and after, fit best."""
     low, high = max(first, last - _AROUND), min(t.size - 1, last + _AROUND)
     choices = range(max(low + 2, first + 1), min(last + 2, high - 1))
     costs = {k: _misfit(t[low : k + 1]) + _misfit(t[k : high + 1]) for k in choices}
@@ -185,21 +189,21 @@ def _placed(t: Floats, first: int, last: int) -> int:
 
 
 def _misfit(t: Floats) -> float:
-    """Sum of squares about the line through instants."""
+    """Return the sum of squares about the line through times."""
     n = np.arange(t.size) - 0.5 * (t.size - 1)
     x = t - t.mean()
     return float(((x - n * (n @ x) / (n @ n)) ** 2).sum())
 
 
 def _constant(edges: Edges, first: int, last: int, transient: int) -> Stretch:
-    """Stretch between two edges; sections from `transient` periods on."""
+    """Return the stretch between two edges, with sections after the transient."""
     rising = edges.rising[first : last + 1]
     own = edges.between(rising[0], math.nextafter(rising[-1], math.inf))
     return _stretch(own, np.zeros(rising.size), transient)
 
 
 def _windows(edges: Edges, window: int) -> list[Stretch]:
-    """Windows of a slow sweep: the frequency is that of their middle, once the edges' bend is taken out."""
+    """Return windows of a slow sweep; the frequency is that of their middle, with curvature removed."""
     found = []
     for first in range(0, edges.rising.size - window, window):
         rising = edges.rising[first : first + window + 1]
@@ -219,9 +223,9 @@ def _windows(edges: Edges, window: int) -> list[Stretch]:
 
 
 def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
-    """Judge the edges of a stretch once `curve` [s] is taken out of them."""
+    """Return a stretch from its edges, with the times `curve` [s] subtracted for the fit."""
     rising = own.rising
-    # a falling edge is shifted as its place between rising ones says
+    # a falling edge is shifted by interpolation between its rising ones
     falling = own.falling - np.interp(own.falling, rising, curve)
     timing = replace(own, rising=rising - curve, falling=falling).frequency()
     line = _line(rising - curve) + curve
@@ -235,7 +239,7 @@ def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
 
 
 def _line(rising: Floats) -> Floats:
-    """Instants on the line through edges; one that is missing does not shift the others."""
+    """Return times on the line through edges; a missing edge does not shift the others."""
     gaps = np.diff(rising)
     n = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(gaps / np.median(gaps)), 1.0))])
     centred = n - n.mean()
@@ -244,7 +248,7 @@ def _line(rising: Floats) -> Floats:
 
 
 def _directed(stretches: list[Stretch]) -> list[Stretch]:
-    """Tell each stretch whether the frequency rose or fell to it; the first is told by the second."""
+    """Set the direction of each stretch from the change of frequency; the first follows the second."""
     f = np.array([s.timing.frequency_hz for s in stretches])
     error = np.array([s.timing.frequency_error_hz for s in stretches])
     signs = [0] * len(stretches)

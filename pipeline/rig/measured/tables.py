@@ -1,4 +1,4 @@
-"""Tables of measured diagrams: a row per step, and a row per window's edge."""
+"""Make tables of measured diagrams: a row per step, and a row per window edge."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pipeline.products.product import Table
 from pipeline.rig.measured.windows import CONFIDENT, words_for
 
 FAR = 5.0
-"""Noise floors beyond which an attractor is not the rig's."""
+"""Distance in noise floors above which the nearest attractor is not the rig's."""
 
 
 def steps_table(measured: xr.Dataset) -> Table:
-    """Table of the steps: frequency, jitter, duty cycle, period, how sure it is; compared ones have more."""
+    """Return the table of steps: frequency, jitter, duty cycle, period, confidence, and any comparison."""
     rows = [_row(measured, i) for i in range(measured.sizes["step"])]
     plural = "s" * (len(rows) != 1)
     return Table(rows, [f"{len(rows)} step{plural}", *aligned([_words(r) for r in rows])])
@@ -51,7 +51,7 @@ def _row(measured: xr.Dataset, step: int) -> Row:
 
 
 def words_of(measured: xr.Dataset) -> tuple[str, ...]:
-    """Words of the model's classifier; none without one."""
+    """Return the labels of the model's classifier; empty without one."""
     classifier = model_of(measured).classifier
     return classifier.words if classifier is not None else ()
 
@@ -83,7 +83,7 @@ def _words(row: Row) -> dict[str, str]:
 
 
 def edges_table(compared: xr.Dataset) -> Table:
-    """Table of the ends of windows, on the rig and in the model."""
+    """Return the table of window edges on the rig and in the model."""
     words = words_of(compared)
     rows: list[Row] = []
     for k in range(compared.sizes.get("edge", 0)):
@@ -117,7 +117,7 @@ def _between(row: Row, name: str) -> str:
 
 
 def summary_lines(compared: xr.Dataset) -> list[str]:
-    """Return what the comparison comes to, in a few lines."""
+    """Return a summary of the comparison in a few lines."""
     covered = compared["winner"].values >= 0
     sure = covered & (compared["confidence"].values >= CONFIDENT)
     d = compared["distance_in_noise"].values[covered]

@@ -1,4 +1,4 @@
-"""Windows of a sweep: where a motion's regime ends on the rig and in the model, and how far apart."""
+"""Find windows of a sweep, and compare where their regimes end on the rig and in the model."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ import xarray as xr
 from pipeline.rig.measured.computed import Computed
 
 CONFIDENT = 0.8
-"""A step whose period is less sure has no part in the windows."""
+"""Least confidence of a step's period; other steps do not enter windows."""
 
 Regime = tuple[int, int]
-"""Period, 0 for none, and code of the side."""
+"""Period, 0 if unclosed, and code of the side."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """Neighbouring steps of one recording and direction with the same regime."""
+    """Successive steps of one recording and direction with the same regime."""
 
     regime: Regime
     steps: tuple[int, ...]
@@ -37,16 +37,16 @@ class WindowEdge:
     Attributes
     ----------
     direction : str
-        Of the sweep.
+        Direction of the sweep.
     before, after : tuple of int
         Regimes on the rig.
     measured_hz, measured_error_hz : float
-        Middle between the last step before and the first after, and half their distance.
+        Middle between the last step before and the first after the edge, and half their distance.
     computed_hz, computed_error_hz : float
-        The same in the model, for the attractor that is nearest within the window; NaN if there is none with
-        that regime, or it goes on to the end of the run's axis.
+        The same in the model, for the attractor that is nearest within the window. NaN if none has that
+        regime, or if the regime continues to the end of the run's axis.
     note : str
-        Why there is no number, or what it is worth.
+        Reason for a missing number, or a caveat.
     """
 
     direction: str
@@ -60,29 +60,29 @@ class WindowEdge:
 
     @property
     def shift_hz(self) -> float:
-        """Measured less computed [Hz]."""
+        """Measured minus computed frequency [Hz]."""
         return self.measured_hz - self.computed_hz
 
     @property
     def shift_error_hz(self) -> float:
-        """Sum of both halves of a step [Hz]: a bound, not a standard error."""
+        """Sum of both half steps [Hz]: a bound, not a standard error."""
         return self.measured_error_hz + self.computed_error_hz
 
 
 def regime_of(measured: xr.Dataset, step: int) -> Regime:
-    """Period and side of a step."""
+    """Return period and side of a step."""
     side = int(measured["side"].values[step]) if "side" in measured else 0
     return int(measured["orbit_period"].values[step]), side
 
 
 def words_for(regime: Regime, words: tuple[str, ...]) -> str:
-    """Say a regime."""
+    """Return a regime in words."""
     period = f"period {regime[0]}" if regime[0] else "unclosed"
     return f"{period}, {words[regime[1]]}" if regime[1] and words else period
 
 
 def windows_of(measured: xr.Dataset, *, confident: float = CONFIDENT) -> list[Window]:
-    """Windows of all recordings; steps that are not sure of their period are passed over."""
+    """Return the windows of all recordings; steps with an uncertain period are skipped."""
     keys = list(
         zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True)
     )
@@ -94,18 +94,18 @@ def windows_of(measured: xr.Dataset, *, confident: float = CONFIDENT) -> list[Wi
 def window_edges(
     measured: xr.Dataset, winners: np.ndarray, computed: Computed, *, confident: float = CONFIDENT
 ) -> list[WindowEdge]:
-    """Ends of the measured windows, each with the end of the same regime in the model.
+    """Return the edges of the measured windows, each with the end of the same regime in the model.
 
     Parameters
     ----------
     measured
-        Result of `pipeline.rig.measured.measuring.measure`, with sides if the model tells any.
+        Result of `pipeline.rig.measured.measuring.measure`, with sides if the model has a classifier.
     winners
         Id of the nearest attractor of each step, -1 for none.
     computed
-        The model's attractors.
+        Attractors of the model.
     confident
-        Least confidence of a step.
+        Least confidence of a step's period.
     """
     windows = windows_of(measured, confident=confident)
     found = []
@@ -129,7 +129,7 @@ def window_edges(
 def _computed_end(
     window: Window, measured: xr.Dataset, winners: np.ndarray, computed: Computed
 ) -> tuple[float, float, str]:
-    """Where the regime of a measured window ends in the model, in the direction of the sweep."""
+    """Return where a measured window's regime ends in the model, in the direction of the sweep."""
     f = measured["frequency"].values
     with_side = "side" in measured
     chosen = {}
@@ -150,7 +150,7 @@ def _computed_end(
 def _walk(
     place: int, sign: int, computed: Computed, holds: Callable[[int], bool]
 ) -> tuple[float, float, str]:
-    """Go along the run's axis while something holds; middle of the last with it and the first without."""
+    """Follow the run's axis while a condition holds; return where it ends, half a step, and a note."""
     f = computed.frequencies
     while 0 <= place + sign < f.size:
         if not holds(place + sign):

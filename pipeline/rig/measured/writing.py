@@ -1,4 +1,4 @@
-"""A comparison as files: figures, tables, data."""
+"""Write a comparison as files: figures, tables, data."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def write_comparison(
     compared
         Result of `pipeline.rig.measured.compare.compare_with`.
     computed
-        What it was compared with.
+        Attractors that it was compared with.
     folder
-        Made if absent; files of an earlier comparison are replaced.
+        Folder, which is made if necessary; files of an earlier comparison are replaced.
     state, degrees, frame
-        As for the figures.
+        Options of the figures.
 
     Returns
     -------

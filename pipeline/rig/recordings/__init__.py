@@ -1,4 +1,4 @@
-"""Recordings of a rig: files, their mapping to states, what is wrong with them, their rates."""
+"""Read recordings of a rig: files, mapping to states, findings, smoothed rates."""
 
 from pipeline.rig.recordings.findings import Finding, findings_of, summary
 from pipeline.rig.recordings.mapping import Mapping, load_mapping, parse_mapping

@@ -1,4 +1,4 @@
-"""What is wrong with the readings of one channel, found in the file's own units."""
+"""Check the readings of one channel, in the file's own units."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from pipeline.rig.recordings.findings import Finding, runs
 from pipeline.rig.recordings.mapping import ChannelMap
 
 CLIPPED_SAMPLES = 5
-"""Fewest equal readings at the extreme that are looked at as a cut-off top."""
+"""Fewest equal readings at the extreme that may be a clipped peak."""
 
 CLIPPED_RISE = 8.0
-"""A top is cut off if it lasts so long that the slope before it would have led this many grains further."""
+"""Rise, in grains of the reading, that the slope before a clipped peak would have added at least."""
 
 JUMP_TURNS = 0.6
-"""A step between neighbouring samples of an angle that is a wrap [turns]."""
+"""Step between neighbouring samples of an angle above which it is a wrap [turns]."""
 
 LEAP_TURNS = 0.1
-"""Deviation of a step between neighbouring samples from those around it that is no motion [turns]."""
+"""Deviation of a step from the steps around it above which it is no motion [turns]."""
 
 LEAP_AROUND = 9
-"""Steps of which the median is what a step should be."""
+"""Number of steps whose median is the usual step."""
 
 
 class Signal:
-    """One channel on the recording's clock.
+    """A channel on the recording's clock.
 
     Parameters
     ----------
     name
-        In the dataset.
+        Name in the dataset.
     raw
-        (n,) readings [the file's unit].
+        Readings, (n,) [the file's unit].
     time
-        (n,) [s].
+        Times, (n,) [s].
     piece
-        (n,).
+        Index of the piece, (n,).
     """
 
     def __init__(self, name: str, raw: np.ndarray, time: np.ndarray, piece: np.ndarray) -> None:
@@ -50,7 +50,7 @@ class Signal:
 
 
 def missing(signal: Signal) -> list[Finding]:
-    """Find samples that are no numbers."""
+    """Find samples that are not numbers."""
     return [
         signal.found("missing", i, k, "warning", f"{k - i} samples are no numbers.")
         for i, k in runs(~np.isfinite(signal.raw), signal.piece)
@@ -58,7 +58,7 @@ def missing(signal: Signal) -> list[Finding]:
 
 
 def constant(signal: Signal, severity: str = "warning") -> list[Finding]:
-    """Find out whether a channel does not move at all."""
+    """Return a finding if a channel never changes."""
     known = signal.raw[np.isfinite(signal.raw)]
     if known.size and np.ptp(known) > 0.0:
         return []
@@ -71,10 +71,9 @@ def constant(signal: Signal, severity: str = "warning") -> list[Finding]:
 
 
 def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
-    """Find samples at the ends of the sensor's range; without one, tops that look cut off.
+    """Find samples at the ends of the sensor's range; without a range, peaks that look clipped.
 
-    The dead band is no saturation: where the mapping states one that reaches the range's end, its samples
-    are left to `in_dead_band`.
+    Samples in a dead band at the end of the range are not saturated; `in_dead_band` finds them.
     """
     if entry.range is None:
         return _cut_off(signal)
@@ -82,7 +81,7 @@ def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
     at_end = (signal.raw <= low) | (signal.raw >= high)
     if entry.dead_band is not None:
         at_end &= ~_within(signal.raw, entry.dead_band)
-    if entry.wraps:  # a reading that wraps passes both ends
+    if entry.wraps:  # a wrapping reading passes both ends of the range
         at_end &= ~_beside_wraps(signal, 0.5 * (high - low))
     return [
         signal.found(
@@ -94,7 +93,7 @@ def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
 
 
 def _beside_wraps(signal: Signal, least: float) -> np.ndarray:
-    """Samples next to a jump of at least this size."""
+    """Return the samples next to a jump of at least a given size."""
     jump = np.abs(np.diff(signal.raw)) > least
     beside = np.zeros(len(signal.raw), dtype=bool)
     beside[1:] |= jump
@@ -105,8 +104,8 @@ def _beside_wraps(signal: Signal, least: float) -> np.ndarray:
 def _cut_off(signal: Signal) -> list[Finding]:
     """Find equal readings at the extremes that last longer than a turning point can.
 
-    Near a turning point of acceleration a, a reading of grain q stays for about 2*sqrt(2*q/a): the slope
-    before it, times half of that, is a few grains. Where it is many, the top is cut off.
+    Near a turning point with acceleration a, a reading of grain q stays constant for about 2*sqrt(2*q/a). The
+    slope before it, times half that time, is a few grains. If it is many grains, the peak is clipped.
     """
     raw, piece = signal.raw, signal.piece
     values = np.unique(raw[np.isfinite(raw)])
@@ -136,7 +135,7 @@ def _within(raw: np.ndarray, band: tuple[float, float]) -> np.ndarray:
 
 
 def in_dead_band(signal: Signal, entry: ChannelMap) -> tuple[np.ndarray, list[Finding]]:
-    """Return which samples lie in the dead band, and the findings."""
+    """Return the samples in the dead band, and the findings."""
     if entry.dead_band is None:
         return np.zeros(len(signal.raw), dtype=bool), []
     mask = _within(signal.raw, entry.dead_band)
@@ -151,21 +150,21 @@ def in_dead_band(signal: Signal, entry: ChannelMap) -> tuple[np.ndarray, list[Fi
 
 
 def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarray, list[Finding]]:
-    """Unwrap an angle within its pieces if that is asked for; else find the jumps of a turn.
+    """Unwrap an angle within its pieces if the mapping asks for it; otherwise find jumps of a turn.
 
     Parameters
     ----------
     signal
         The channel.
     angle
-        (n,) [rad], NaN where it is not measured.
+        Angle, (n,) [rad], NaN where it is not measured.
     wraps
-        Whether the mapping says that the reading wraps.
+        Whether the reading wraps, according to the mapping.
 
     Returns
     -------
     ndarray, list of Finding
-        The angle, continuous from one measured sample to the next of a piece where `wraps`.
+        The angle, with `wraps` continuous from one measured sample of a piece to the next; the findings.
     """
     result = angle.copy()
     findings = []
@@ -192,16 +191,16 @@ def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarra
 
 
 def leaps(signal: Signal, angle: np.ndarray) -> list[Finding]:
-    """Find steps of an angle that are no motion and no wrap.
+    """Find steps of an angle that are neither a motion nor a wrap.
 
-    Such as a wrap whose flank was sampled: it cannot be told from a motion any more, and a turn is lost.
+    An example is a wrap whose flank was sampled: it looks like a motion, and a turn is lost.
 
     Parameters
     ----------
     signal
         The channel.
     angle
-        (n,) [rad], unwrapped if that was asked for; NaN where it is not measured.
+        Angle, (n,) [rad], unwrapped if the mapping asks for it; NaN where it is not measured.
     """
     from scipy.ndimage import median_filter
 

@@ -1,4 +1,4 @@
-"""From the clocks of a file's channels to one uniform time, in pieces between gaps."""
+"""Put the channels of a file on one uniform clock, in pieces between gaps."""
 
 from __future__ import annotations
 
@@ -13,42 +13,43 @@ from pipeline.rig.recordings.raw import Channel
 from pipeline.spec.problems import SpecError
 
 MIXED = 1e-3
-"""Relative difference of two sampling intervals from which on they are two rates."""
+"""Relative difference of sampling intervals above which channels have different rates."""
 
 GAP_STEPS = 1.5
-"""Distance of two time stamps from which on there is a gap [sampling intervals]."""
+"""Distance of two time stamps above which there is a gap [sampling intervals]."""
 
 SHAKY = 0.05
-"""Median deviation of neighbouring time stamps from even steps from which on a late one may be no gap."""
+"""Median deviation of time stamps from even steps above which a late stamp may be jitter, not a gap."""
 
 AROUND = 8
-"""Time stamps on either side of a late one that tell jitter from a gap."""
+"""Number of time stamps on either side of a late one that distinguish jitter from a gap."""
 
 REPEATING = 0.01
-"""Share of equal neighbouring time stamps from which on they are coarser than the sampling."""
+"""Fraction of equal neighbouring time stamps above which they are coarser than the sampling."""
 
 EVEN = 0.01
-"""Deviation of a time stamp from even steps that is not worth a word [sampling intervals]."""
+"""Deviation of a time stamp from even steps that is not reported [sampling intervals]."""
 
 UNEVEN = 0.5
-"""Deviation from which on samples are not where even steps put them [sampling intervals]."""
+"""Deviation from even steps above which samples are misplaced [sampling intervals]."""
 
 
 @dataclass(eq=False)
 class Clock:
-    """Where the samples of a recording are in time, and in the channels of its stretches.
+    """The times of a recording's samples, and the samples that are used of each channel.
 
     Attributes
     ----------
     time : ndarray
-        (n,) [s since the first sample], even within a piece.
+        Times, (n,) [s since the first sample], even within a piece.
     piece : ndarray
-        (n,) 0, 1, ...
+        Index of the piece, (n,): 0, 1, ...
     step_s : float
         Sampling interval [s].
     taken : list of mappings
-        For each stretch the first sample, and the one after the last, by channel.
+        For each stretch, by channel, the first sample and the one after the last.
     findings : list of Finding
+        Findings about times.
     """
 
     time: np.ndarray
@@ -71,21 +72,21 @@ def clock_of(
     Parameters
     ----------
     stretches
-        The channels that are used, by name, with time stamps or sampling intervals.
+        Channels that are used, by name, with time stamps or sampling intervals.
     sampling_rate_hz
-        Stated by the mapping; goes before what the file states.
+        Rate from the mapping, which takes precedence over the file's.
     source
         Name of the file, for messages.
     numbers
-        (n,) of the samples of the first channel, one stretch after the other: a new piece begins where it
-        changes.
+        Piece numbers of the first channel's samples, (n,), one stretch after the other. A new piece begins
+        where the number changes.
     apart
-        Whether each stretch is a piece, even one that follows on the one before.
+        Whether each stretch is a piece, even if it continues the stretch before.
 
     Returns
     -------
     Clock
-        Channels that begin later than others, or end earlier, decide; what is left out is a finding.
+        All channels begin at the latest start and end at the earliest end; samples left out are findings.
 
     Raises
     ------
@@ -119,7 +120,7 @@ def _changes(
     stretches: Sequence[Mapping[str, Channel]],
     taken: Sequence[Mapping[str, tuple[int, int]]],
 ) -> np.ndarray:
-    """Samples on the clock from which on a file numbers a new piece."""
+    """Return the samples at which the file's piece number changes."""
     parts, first = [], 0
     for channels, where in zip(stretches, taken, strict=True):
         name, channel = next(iter(channels.items()))
@@ -131,7 +132,7 @@ def _changes(
 
 
 def _stamps(channel: Channel, stated: float | None) -> np.ndarray:
-    """Instants of a channel's samples [s]; they begin at NaN where the file does not say when."""
+    """Return the times of a channel's samples [s]; NaN if the file states no start."""
     if channel.time is not None and stated is None:
         return channel.time
     step = channel.step_s if stated is None else stated
@@ -139,14 +140,14 @@ def _stamps(channel: Channel, stated: float | None) -> np.ndarray:
 
 
 def step_of(channel: Channel) -> float:
-    """Sampling interval of one channel [s]: the usual distance of its stamps, or what is stated."""
+    """Return the sampling interval of one channel [s]: from its time stamps, or as stated."""
     if channel.time is None or len(channel.time) < 2:
         return channel.step_s
     steps = np.diff(channel.time)
     usual = float(np.median(steps))
     if usual > 0.0 and np.mean(steps == 0.0) < REPEATING:
         return usual
-    # stamps coarser than the sampling repeat: their mean, without the gaps
+    # stamps coarser than the sampling repeat: take the mean step without gaps
     mean = float(steps.mean())
     grain = float(steps[steps > 0.0].min(initial=np.inf))
     short = steps[steps <= GAP_STEPS * mean + grain]
@@ -183,7 +184,7 @@ def _refuse_mixed(steps: Mapping[str, float], source: str) -> None:
 
 
 def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | None) -> list[Finding]:
-    """Say where the file states another rate than the mapping."""
+    """Return findings if the file states another rate than the mapping."""
     if stated is None:
         return []
     findings = []
@@ -202,7 +203,7 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
 def _aligned(
     channels: Mapping[str, Channel], step: float, source: str
 ) -> tuple[dict[str, tuple[int, int]], list[Finding]]:
-    """Let all channels of a stretch begin at the latest start and end at the earliest end."""
+    """Align the channels of a stretch: from the latest start to the earliest end."""
     starts = {
         n: float(c.time[0]) if c.time is not None and len(c) else c.start_s for n, c in channels.items()
     }
@@ -256,7 +257,7 @@ def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> 
 
 
 def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[np.ndarray]:
-    """Return stamps that are numbers and rise; count from 0 where the file does not say when it began."""
+    """Return time stamps that are numbers and rise; count from 0 if the file states no start."""
     if all(np.isnan(s).all() for s in stamps):
         return [step * np.arange(len(s)) for s in stamps]
     for s in stamps:
@@ -272,7 +273,7 @@ def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[
 def _cut(
     time: np.ndarray, forced: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
-    """Cut the samples at gaps and where it is asked for, and make time even within each piece."""
+    """Cut the samples at gaps and at given places, and make time even within each piece."""
     is_gap = _missing(time, step) > 0
     piece = np.cumsum(is_gap | np.concatenate([[False], forced[1:]])).astype(np.int64)
     even, own_step, residual = _even(time, piece, step, stated)
@@ -287,15 +288,15 @@ def _cut(
 
 
 def _missing(time: np.ndarray, step: float) -> np.ndarray:
-    """Samples that are missing before each.
+    """Return the number of samples that are missing before each sample.
 
-    Where stamps jitter, a late one is no gap if those after it are in time again: their mean phase tells.
+    With jitter, a late stamp is no gap if the stamps after it are in time again, by their mean phase.
     """
     result = np.zeros(len(time), dtype=np.int64)
     distance = np.diff(time)
     if not distance.size:
         return result
-    # stamps coarser than the sampling repeat, and then leap by a grain of theirs
+    # stamps coarser than the sampling repeat, then jump by their own resolution
     repeats = bool(np.mean(distance == 0.0) >= REPEATING)
     grain = float(distance[distance > 0.0].min(initial=np.inf)) if repeats else 0.0
     late = np.flatnonzero(distance > GAP_STEPS * step + grain) + 1
@@ -307,10 +308,10 @@ def _missing(time: np.ndarray, step: float) -> np.ndarray:
 
 
 def _skipped(time: np.ndarray, step: float, late: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
-    """Samples missing at late stamps that may be jitter: by how much those after are later than those before.
+    """Return the samples missing at late stamps, by how much the stamps after are later than those before.
 
-    Stamps beyond another gap say nothing; of two doubtful ones side by side the one with the larger shift is
-    taken.
+    Stamps beyond another gap are not used. Of neighbouring doubtful stamps the one with the largest shift
+    counts.
     """
     phase = np.concatenate([[0.0], np.cumsum(time / step - np.arange(len(time)))])
     walls = np.concatenate([[0], late[is_sure], [len(time)]])
@@ -344,7 +345,7 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
 def _one_after_another(
     stamps: list[np.ndarray], step: float, findings: list[Finding]
 ) -> tuple[list[np.ndarray], bool]:
-    """Shift stretches whose clock begins anew behind the one before, a step apart; say whether any was."""
+    """Shift stretches whose clock restarts behind the stretch before; return whether any was shifted."""
     placed = [stamps[0]]
     moved = 0
     for s in stamps[1:]:
@@ -364,7 +365,7 @@ def _one_after_another(
 def _even(
     time: np.ndarray, piece: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Fit lines of one slope through the stamps of all pieces; return the lines, the slope, the residuals."""
+    """Fit lines of one slope through the stamps of all pieces; return lines, slope and residuals."""
     count = np.bincount(piece)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     index = np.arange(len(time)) - first[piece]
@@ -384,7 +385,7 @@ def _even(
 
 
 def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> list[Finding]:
-    """Say how far stamps are from even steps, and where it is so far that samples change places."""
+    """Return a finding on stamps that deviate from even steps, with a warning if samples are misplaced."""
     worst, spread = float(np.abs(residual).max()), float(residual.std())
     if worst <= EVEN * step:
         return []

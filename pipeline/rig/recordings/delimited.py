@@ -1,4 +1,4 @@
-"""CSV files: delimiter, header and decimal comma, stated or found out."""
+"""Read CSV files; delimiter, header and decimal comma are stated or detected."""
 
 from __future__ import annotations
 
@@ -17,27 +17,29 @@ from pipeline.rig.recordings.text import instants, number, read_text, split, tab
 from pipeline.spec.problems import SpecError
 
 SIMULATED = "# simulated"
-"""First line of a file that nobody measured."""
+"""First line of a file with simulated readings."""
 
 DELIMITERS = (";", "\t", ",", " ")
 LOOKED_AT = 50
-"""Lines from which the form of a file is found out."""
+"""Number of lines from which the form of a file is detected."""
 
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 
 
 @dataclass(frozen=True)
 class _Form:
-    """How a text is to be read.
+    """The delimiter, decimal sign, header and columns of a CSV text.
 
     Attributes
     ----------
     delimiter, decimal : str
+        Separator of fields, and decimal sign.
     n_columns : int
+        Number of columns.
     n_head : int
-        Rows before the numbers.
+        Number of rows before the numbers.
     texts : tuple of int
-        Columns without numbers.
+        Indices of columns without numbers.
     """
 
     delimiter: str
@@ -51,21 +53,21 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
     """Read all columns of a CSV file.
 
     Lines that begin with ``#`` are comments. The first row with names, if there is one, gives the channels'
-    names; a second one their units, as do brackets after a name: ``angle [V]``. Without names the columns are
-    ``1``, ``2``, ... What is empty, or no number, is NaN; after the last number of a column it is nothing.
-    Dates and times of day become seconds since the first; other texts are left out.
+    names. A second row of names gives their units, as do brackets after a name: ``angle [V]``. Without names
+    the columns are ``1``, ``2``, ... Empty fields and texts are NaN, and are dropped after the last number of
+    a column. Dates and times of day become seconds since the first. Other texts are left out.
 
     Parameters
     ----------
     path
         The file.
     stated
-        What need not be found out.
+        Properties of the file that need not be detected.
 
     Raises
     ------
     SpecError
-        If it is no table of numbers, or can be read in two ways.
+        If the file is not a table of numbers, or can be read in two ways.
     """
     lines = read_text(path).splitlines()
     is_simulated = bool(lines) and lines[0].startswith(SIMULATED)
@@ -90,7 +92,7 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
 
 
 def _columns(body: list[str], form: _Form) -> dict[int, np.ndarray]:
-    """Columns of numbers, and those of dates or times of day [s since the first]; no other texts."""
+    """Return columns of numbers, and of dates or times of day [s since the first]."""
     numbers = [j for j in range(form.n_columns) if j not in form.texts]
     values = table(body, numbers, form.delimiter, form.decimal)
     found = {j: values[:, k] for k, j in enumerate(numbers)}
@@ -104,7 +106,7 @@ def _columns(body: list[str], form: _Form) -> dict[int, np.ndarray]:
 
 
 def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
-    """Find the one way to read the rows as numbers."""
+    """Detect the form in which the rows are numbers."""
     delimiters = (stated.delimiter,) if stated.delimiter else DELIMITERS
     decimals = (stated.decimal,) if stated.decimal else (".", ",")
     found = []
@@ -138,7 +140,7 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
 
 
 def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> _Form | None:
-    """Return the form with this delimiter and decimal point, None if it does not fit."""
+    """Return the form with a given delimiter and decimal sign; None if it does not fit."""
     sample = rows[:LOOKED_AT]
     parsed = [[number(part, decimal) for part in split(row, delimiter)] for row in sample]
     late = parsed[len(parsed) // 2 :]
@@ -167,7 +169,7 @@ def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> 
 
 
 def _names(head: list[list[str]], n_columns: int) -> tuple[list[str], list[str]]:
-    """Names and units of the columns from the rows before the numbers."""
+    """Return names and units of the columns from the rows before the numbers."""
     whole = [[part.strip().strip('"').strip() for part in row] for row in head if len(row) == n_columns]
     if not whole:
         return [str(j + 1) for j in range(n_columns)], [""] * n_columns

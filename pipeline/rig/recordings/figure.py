@@ -1,4 +1,4 @@
-"""The figure of a recording: what was measured over time, and what was found."""
+"""Draw a recording: its quantities over time, with the findings marked."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from pipeline.rig.recordings.findings import findings_of
 from pipeline.rig.recordings.mapping import DRIVE
 
 MOST_DOTS = 6000
-"""Samples of a line that are drawn one by one; of more, the least and the greatest of each column."""
+"""Most samples of a line that are drawn singly; of more, the minima and maxima by column."""
 
 LINES = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE)
 MARKS = {
     "gap": "0.7", "dead-band": style.ORANGE, "saturated": style.VERMILLION, "missing": style.PURPLE,
     "wrap": "0.25", "start": style.GREEN, "leap": style.BLUE,
 }  # fmt: skip
-"""Colour by kind of finding; kinds that concern a whole recording are in the caption."""
+"""Colour by kind of finding; other kinds concern a whole recording and stand in the caption."""
 
 INSTANTS = ("wrap", "start", "leap")
-"""Kinds that happen at an instant: lines, which are seen beside a shaded stretch."""
+"""Kinds of findings at one time; they are drawn as lines, not as shaded stretches."""
 
 SHADE = 0.4
 
 LEAST_MARK = 0.003
-"""Least width of a mark [width of the axes]."""
+"""Least width of a mark, relative to the width of the axes."""
 
 
 def plot_recording(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
@@ -42,15 +42,15 @@ def plot_recording(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     Parameters
     ----------
     ds
-        As `read_recording` or `smooth` give it.
+        Recording from `read_recording` or `smooth`.
     frame
         Width of the figure, and the range of time [s].
 
     Returns
     -------
     DataFigure
-        A panel for each unit and one for the drive. Findings are coloured stretches of the panels that they
-        concern; ends of pieces are thin lines. Its `data` are `ds`.
+        A panel for each unit and one for the drive. Findings are coloured stretches in their channels'
+        panels; ends of pieces are thin lines. Its `data` are `ds`.
     """
     rows = _rows(ds)
     fig = style.new_figure(1.0 + 1.45 * len(rows), ds, frame)
@@ -73,7 +73,7 @@ def plot_recording(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
 
 
 def _rows(ds: xr.Dataset) -> list[tuple[str, ...]]:
-    """Quantities that share a panel: those of one unit; the drive has its own."""
+    """Return the quantities of each panel: one panel per unit, and one for the drive."""
     units: dict[str, tuple[str, ...]] = {}
     for name in map(str, ds.data_vars):
         if name != DRIVE:
@@ -109,7 +109,7 @@ def _draw(ax: Axes, ds: xr.Dataset, name: str, span: tuple[float, float], colour
 
 
 def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest of neighbouring samples, in their order; NaN where none is known."""
+    """Return minimum and maximum of neighbouring samples, in their order; NaN if none is known."""
     n = len(time) // (MOST_DOTS // 2) + 1
     whole = len(time) // n * n
     blocks = values[:whole].reshape(-1, n)
@@ -129,7 +129,7 @@ def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _mark(
     axes: Sequence[Axes], rows: Sequence[Sequence[str]], ds: xr.Dataset, span: tuple[float, float]
 ) -> list[str]:
-    """Shade what was found, and draw the ends of pieces; return the kinds that are marked."""
+    """Shade the findings and draw the ends of pieces; return the kinds that are marked."""
     least = LEAST_MARK * (span[1] - span[0])
     kinds: dict[str, None] = {}
     for f in findings_of(ds):
@@ -157,7 +157,7 @@ def _mark_handle(kind: str) -> Any:
 
 
 def _line_handles(ds: xr.Dataset, rows: Sequence[Sequence[str]]) -> list[Any]:
-    """Legend of the panels with more than one line; colours are the same in all panels."""
+    """Return the legend of panels with more than one line; colours are the same in all panels."""
     return [
         Line2D([], [], color=colour, linewidth=1.2, label=_symbol(ds, name))
         for names in rows if len(names) > 1 for colour, name in zip(LINES, names, strict=False)
@@ -165,7 +165,7 @@ def _line_handles(ds: xr.Dataset, rows: Sequence[Sequence[str]]) -> list[Any]:
 
 
 def _caption(ds: xr.Dataset) -> str:
-    """File, rate, pieces, and what has no place in time."""
+    """Return the caption: file, rate, pieces, and findings without a place in time."""
     n_pieces = len(np.unique(ds["piece"].values))
     parts = [
         Path(str(ds.attrs.get("file", ""))).name,

@@ -1,4 +1,4 @@
-"""What is wrong with a recording, or was done to it: told, never silently mended."""
+"""Define the findings of a recording: faults and corrections that are always reported."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ SEVERITIES: tuple[Severity, ...] = ("note", "warning", "error")
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that a recording's user must know.
+    """A fault of a recording, or a correction that was made.
 
     Attributes
     ----------
     kind : str
-        One word, such as ``gap``; `KINDS` says what each means.
+        One word, such as ``gap``; `KINDS` describes each.
     channel : str
-        Name in the dataset, or in the file before it is mapped; empty if it concerns all of them.
+        Name in the dataset, or in the file before it is mapped; empty if it concerns all channels.
     start_s, end_s : float
-        Where in the recording [s since its first sample]; NaN if that is not known.
+        Place in the recording [s since its first sample]; NaN if it is unknown.
     severity : str
-        ``note``: done as asked, nothing is lost. ``warning``: some samples cannot be used, or are less than
-        they seem. ``error``: what is computed from this recording will be wrong unless it is mended.
+        ``note``: a correction as requested, nothing is lost. ``warning``: some samples cannot be used, or are
+        less exact. ``error``: results from this recording will be wrong unless it is corrected.
     text : str
         A sentence with the remedy, if there is one.
     """
@@ -72,7 +72,7 @@ def findings_of(ds: xr.Dataset) -> list[Finding]:
 
 
 def to_json(findings: Iterable[Finding]) -> str:
-    """Return findings as a JSON list; instants that are not known are null."""
+    """Return findings as a JSON list; unknown times are null."""
     rows = [
         {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(f).items()}
         for f in findings
@@ -81,7 +81,7 @@ def to_json(findings: Iterable[Finding]) -> str:
 
 
 def summary(findings: Iterable[Finding]) -> list[str]:
-    """Lines for people: the gravest first, those of one kind and channel in one line.
+    """Return lines about findings, the most severe first; each kind and channel has one line.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def summary(findings: Iterable[Finding]) -> list[str]:
 
 
 def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) -> str:
-    """How often, where first, and what the first says."""
+    """Return the line of a group: number, place and text of the first finding."""
     first = own[0]
     where = "" if math.isnan(first.start_s) else f" at {first.start_s:.6g} s"
     often = f" ({len(own)} times, first{where})" if len(own) > 1 else where
@@ -103,19 +103,19 @@ def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) 
 
 
 def runs(mask: np.ndarray, piece: np.ndarray | None = None) -> np.ndarray:
-    """Stretches of true entries.
+    """Return the stretches of true entries.
 
     Parameters
     ----------
     mask
-        (n,).
+        Mask, (n,).
     piece
-        (n,); no stretch goes from one piece into another.
+        Index of the piece, (n,); stretches end where a piece does.
 
     Returns
     -------
     ndarray
-        (n_runs, 2): the first index of each, and the one after its last.
+        First index of each stretch, and the one after its last, (n_runs, 2).
     """
     inside = np.concatenate([[False], np.asarray(mask, dtype=bool), [False]])
     change = inside[1:] != inside[:-1]

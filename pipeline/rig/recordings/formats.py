@@ -1,4 +1,4 @@
-"""The formats of recordings, by name and by suffix."""
+"""Select the reader of a recording by its format or suffix."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def read_raw(path: Path, stated: str | None = None, csv: CsvMap | None = None) -
     path
         The file.
     stated
-        Its format, by default by the suffix.
+        Format; by default given by the suffix.
     csv
-        How a text is read.
+        Form of a CSV file.
 
     Raises
     ------
     SpecError
-        If there is no such file, or it is not what its format says.
+        If the file does not exist, or does not have the format.
     """
     name = format_of(path, stated)
     if not path.is_file():

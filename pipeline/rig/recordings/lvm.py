@@ -1,7 +1,7 @@
-"""LVM files, LabVIEW's text format: one header of the file, and one for each segment.
+"""Read LVM files, LabVIEW's text format: a header of the file, and a header of each segment.
 
 Written from National Instruments' description "Specification for the LabVIEW Measurement File (.lvm)".
-Nothing of a file is evaluated; what is no number is NaN.
+No text in a file is evaluated. Fields that are not numbers are NaN.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SEPARATORS = {"Tab": "\t", "Comma": ",", "Space": " ", "Semicolon": ";"}
 
 @dataclass
 class _Style:
-    """What the file's header says of all segments."""
+    """Settings from the file's header that hold for all segments."""
 
     separator: str
     decimal: str
@@ -47,13 +47,13 @@ class _Segment:
 def read_lvm(path: Path) -> Raw:
     """Read all channels of all segments.
 
-    Segments whose instants follow on one another are one recording; the instants are those of their headers
-    (``Date``, ``Time``, ``X0``, ``Delta_X``) and of the X columns. Comments are left out.
+    Segments with successive times are one recording. The times come from their headers (``Date``, ``Time``,
+    ``X0``, ``Delta_X``) and the X columns. Comments are left out.
 
     Raises
     ------
     SpecError
-        If it is no LVM file, with the line where reading ended.
+        If it is not an LVM file; the message names the line where reading ended.
     """
     lines = read_text(path).splitlines()
     if not lines or not lines[0].strip().startswith(MAGIC):
@@ -70,7 +70,7 @@ def read_lvm(path: Path) -> Raw:
 
 
 def _file_header(path: Path, lines: list[str]) -> tuple[_Style, int]:
-    """Read the keys of the file; return what they say and the line after."""
+    """Read the file's header; return its settings and the next line."""
     keys: dict[str, str] = {}
     for i, line in enumerate(lines[1:], 1):
         if line.strip().startswith(END):
@@ -113,7 +113,7 @@ def _segments(path: Path, lines: list[str], at: int, style: _Style) -> list[_Seg
 
 
 def _skip(lines: list[str], i: int) -> int:
-    """Line after empty lines and special blocks."""
+    """Return the index of the line after empty lines and special blocks."""
     while i < len(lines):
         if lines[i].startswith(SPECIAL):
             while i < len(lines) and not lines[i].startswith(END_SPECIAL):
@@ -125,7 +125,7 @@ def _skip(lines: list[str], i: int) -> int:
 
 
 def _columns(segment: _Segment) -> dict[int, int | None]:
-    """Columns of channels, each with its X column if it has one."""
+    """Return the columns of channels, each with its X column if it has one."""
     last_x: int | None = None
     found: dict[int, int | None] = {}
     for j, name in enumerate(segment.names):
@@ -137,7 +137,7 @@ def _columns(segment: _Segment) -> dict[int, int | None]:
 
 
 def _key(segment: _Segment, name: str, column: int) -> str:
-    """Value of a header's key for a column; the label stands where the first X column does."""
+    """Return a header key's value for a column; the key's label stands in the first X column."""
     values = segment.keys.get(name, [])
     place = column - 1 if segment.names[0] == X_NAME else column
     return values[place] if 0 <= place < len(values) else ""
@@ -149,7 +149,7 @@ def _number(segment: _Segment, name: str, column: int, style: _Style) -> float:
 
 
 def _instants(segment: _Segment, style: _Style) -> dict[int, float]:
-    """Start of the segment by column [s since year 1], as far as it is stated."""
+    """Return the segment's start by column [s since year 1], if it is stated."""
     found = {}
     for j in _columns(segment):
         try:
@@ -166,7 +166,7 @@ def _instants(segment: _Segment, style: _Style) -> dict[int, float]:
 def _channels(segment: _Segment, style: _Style, zero: float) -> dict[str, Channel]:
     columns = _columns(segment)
     names = dict(zip(columns, unique([segment.names[j] for j in columns]), strict=True))
-    # a name alone at the end of a line is a comment's
+    # columns after the last channel, such as comments, are not read
     values = table(segment.lines, range(max(columns, default=-1) + 1), style.separator, style.decimal)
     starts = _instants(segment, style)
     found = {}
@@ -189,7 +189,7 @@ def _channels(segment: _Segment, style: _Style, zero: float) -> dict[str, Channe
 
 
 def _truncations(segment: _Segment, channels: dict[str, Channel], style: _Style) -> list[Finding]:
-    """Say where a segment has fewer samples than its header states."""
+    """Return findings on segments with fewer samples than their header states."""
     findings = []
     for j, channel in zip(_columns(segment), channels.values(), strict=True):
         stated = _number(segment, "Samples", j, style)

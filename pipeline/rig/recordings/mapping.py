@@ -1,4 +1,4 @@
-"""The mapping of a recording: which channel of the file is which quantity, and how it is scaled."""
+"""Define the mapping of a recording: the quantity and the scaling of each channel."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Scaled(Table):
-    """A channel and how its numbers become SI units: ``sign*scale*unit*(raw - zero) + offset``."""
+    """A channel and its conversion to SI units: ``sign*scale*unit*(raw - zero) + offset``."""
 
     channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
-    unit: str = Field(default="", description="Unit in the file; by default that of the quantity.")
+    unit: str = Field(default="", description="Unit in the file; by default the quantity's.")
     scale: float | None = Field(
-        default=None, description="Of a unit that is not the quantity's: SI units per unit."
+        default=None, description="SI units per unit of the file, for a unit that is not the quantity's."
     )
-    zero: float = Field(default=0.0, description="Reading that is 0 [the file's unit].")
+    zero: float = Field(default=0.0, description="Reading at which the quantity is 0 [the file's unit].")
     offset: float = Field(default=0.0, description="Added after scaling [SI units].")
-    sign: Literal[-1, 1] = Field(default=1, description="-1 if it counts the other way round.")
+    sign: Literal[-1, 1] = Field(default=1, description="-1 if the channel counts in the other direction.")
 
 
 class ChannelMap(Scaled):
-    """``[channels.NAME]``: a measured quantity, under the name of the model's state."""
+    """A table ``[channels.NAME]``: a measured quantity, under the name of the model's state."""
 
     range: Pair | None = Field(default=None, description="Ends of the sensor's range [the file's unit].")
     wraps: bool = Field(default=False, description="Whether the reading jumps back once a turn.")
     dead_band: Pair | None = Field(
-        default=None, description="Readings where it does not measure [the file's unit]."
+        default=None, description="Range of readings in which the sensor does not measure [the file's unit]."
     )
     relative_to: str | None = Field(
-        default=None, description="Channel to which this angle is relative; it is added."
+        default=None, description="Channel to which this angle is relative; its angle is added."
     )
 
     @model_validator(mode="after")
@@ -62,37 +62,37 @@ class ChannelMap(Scaled):
 
 
 class DriveMap(Scaled):
-    """``[drive]``: a torque, or a signal that switches with it."""
+    """The table ``[drive]``: a torque, or a signal that switches with it."""
 
     kind: Literal["torque", "signal"] = Field(description="A torque [N m], or the level of a signal.")
 
 
 class TimeMap(Table):
-    """``time``: the channel with a time stamp for each sample."""
+    """The key ``time``: the channel with a time stamp for each sample."""
 
     channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
     unit: str = Field(default="s", description="Unit in the file.")
 
 
 class PieceMap(Table):
-    """``piece``: a channel that changes where a new piece begins."""
+    """The key ``piece``: a channel that changes where a new piece begins."""
 
     channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
 
 
 class CsvMap(Table):
-    """``[csv]``: how the text is to be read where it is not to be found out."""
+    """The table ``[csv]``: the form of a text, where it should not be detected."""
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
-        default=None, description="Between fields."
+        default=None, description="Separator of fields."
     )
-    decimal: Literal[".", ","] | None = Field(default=None, description="Decimal point.")
+    decimal: Literal[".", ","] | None = Field(default=None, description="Decimal sign.")
     header: bool | None = Field(default=None, description="Whether the first row has names.")
     skip_rows: int = Field(default=0, ge=0, description="Rows before the names.")
 
 
 class Mapping(Table):
-    """What the channels of a recording are.
+    """The meaning of a recording's channels.
 
     The keys are those of the TOML file; `load_mapping` reads and checks one.
     """
@@ -101,36 +101,38 @@ class Mapping(Table):
         description="Model whose states are measured, as in a specification: a name, a file or a table."
     )
     format: Literal["tdms", "lvm", "csv", "matlab"] | None = Field(
-        default=None, description="By default by the suffix."
+        default=None, description="Format; by default given by the suffix."
     )
     time: TimeMap | None = Field(default=None, description="Channel of time stamps.")
     piece: PieceMap | None = Field(default=None, description="Channel with a number for each piece.")
     sampling_rate_hz: Positive | None = Field(
-        default=None, description="Where the file does not state it [Hz]."
+        default=None, description="Sampling rate, if the file does not state it [Hz]."
     )
-    window_s: Pair | None = Field(default=None, description="Part to be read [s since the first sample].")
-    csv: CsvMap = Field(default=CsvMap(), description="How a text is read.")
-    channels: dict[str, ChannelMap] = Field(min_length=1, description="By name of a state.")
+    window_s: Pair | None = Field(
+        default=None, description="Start and end of the part to read [s since the first sample]."
+    )
+    csv: CsvMap = Field(default=CsvMap(), description="Form of a CSV file.")
+    channels: dict[str, ChannelMap] = Field(min_length=1, description="Channels by name of a state.")
     drive: DriveMap | Literal["none"] = Field(default="none", description="Channel of the drive.")
 
     @property
     def system(self) -> Model:
-        """The model."""
+        """Model whose states are measured."""
         return load_model(self.model)
 
     @property
     def drive_map(self) -> DriveMap | None:
-        """The drive's channel, None if there is none."""
+        """Channel of the drive; None if there is none."""
         return None if isinstance(self.drive, str) else self.drive
 
     def unit_of(self, name: str) -> str:
-        """SI unit of a quantity of the recording."""
+        """Return the SI unit of a quantity of the recording."""
         if name == DRIVE:
             return "N m" if self.drive_map is not None and self.drive_map.kind == "torque" else "1"
         return _units(self.system)[name]
 
     def factor_of(self, name: str) -> float:
-        """What a number of the file is in SI units, with its sign."""
+        """Return the factor from the file's numbers to SI units, with its sign."""
         entry: Scaled = self.drive_map if name == DRIVE and self.drive_map else self.channels[name]
         known = units.factor(entry.unit, self.unit_of(name))
         return entry.sign * (1.0 if entry.scale is None else entry.scale) * (1.0 if known is None else known)
@@ -171,16 +173,16 @@ def load_mapping(path: str | Path) -> Mapping:
 def parse_mapping(
     data: AnyMapping[str, Any] | str, source: str = "", folder: str | Path | None = KEPT
 ) -> Mapping:
-    """Check a mapping given as plain data, or as the text of a TOML file.
+    """Validate a mapping given as plain data, or as the text of a TOML file.
 
     Parameters
     ----------
     data
         Tables, or their text.
     source
-        What they are called in messages.
+        Name of the data in messages.
     folder
-        From where the file of a model counts; None for what was kept: no file is read, nothing is imported.
+        Folder that a model's file is relative to; None for kept data: no file is read, nothing is imported.
 
     Raises
     ------
@@ -207,7 +209,7 @@ def parse_mapping(
 
 
 def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
-    """Check the keys that stand for themselves, one by one, so that none hides another's problems."""
+    """Validate the other keys one by one, so that none hides another's problems."""
     found = {}
     for key, value in rest.items():
         if key not in Mapping.model_fields:
@@ -268,7 +270,7 @@ def _units(model: Model) -> dict[str, str]:
 
 
 def _quantity_problems(model: Model, channels: dict[str, ChannelMap], drive: DriveMap | None) -> list[str]:
-    """Problems of names and units with the model."""
+    """Return problems with names and units of quantities."""
     problems = []
     known = _units(model)
     for name, entry in channels.items():

@@ -1,4 +1,4 @@
-"""MATLAB files, version 7 and older: numeric arrays, cells, structures."""
+"""Read MATLAB files, version 7 and older: numeric arrays, cells, structures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipeline.rig.recordings.raw import Channel, Raw, digest
 from pipeline.spec.problems import SpecError
 
 STEP = "dt"
-"""Variable with the sampling interval [s]."""
+"""Name of the variable with the sampling interval [s]."""
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PRIVATE = "__"
@@ -21,15 +21,16 @@ _PRIVATE = "__"
 def read_matlab(path: Path) -> Raw:
     """Read all real arrays of a MATLAB file.
 
-    A variable of one row or column is the channel ``NAME``, the rows of others are ``NAME[0]``, ``NAME[1]``,
-    ...: samples run along the longer side. Fields of a structure are ``STRUCTURE.FIELD``. The elements of
-    cells, and of structure arrays, are stretches: the first of each variable are one recording, the second
-    the next; what is no cell belongs to all. A scalar ``dt``, if there is one, is the sampling interval [s].
+    A variable of one row or column is the channel ``NAME``. The rows of others are ``NAME[0]``, ``NAME[1]``,
+    ...; samples lie along the longer side. Fields of a structure are ``STRUCTURE.FIELD``. The elements of
+    cells and of structure arrays are stretches: the first elements of all variables form one stretch, the
+    second elements the next. A variable that is not a cell belongs to all stretches. A scalar ``dt`` is the
+    sampling interval [s].
 
     Raises
     ------
     SpecError
-        If it is no MATLAB file, one of version 7.3, or its cells differ in number.
+        If it is not a MATLAB file, has version 7.3, or its cells differ in number.
     """
     from scipy.io import loadmat
 
@@ -84,7 +85,7 @@ def _gather(name: str, value: Any, leaves: dict[str, list[np.ndarray]]) -> None:
 
 
 def _cell(value: Any) -> Any:
-    """What a cell holds, through cells of one element."""
+    """Return the content of a cell; cells of one element are opened."""
     while isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
         value = value.flat[0]
     return value
@@ -99,7 +100,7 @@ def _plain(value: np.ndarray) -> np.ndarray:
 
 
 def _step(leaves: dict[str, list[np.ndarray]]) -> float:
-    """Sampling interval that the file states [s]; NaN if it does not."""
+    """Return the sampling interval that the file states [s]; NaN if it does not."""
     for name, arrays in leaves.items():
         if name.rpartition(".")[2] == STEP and all(a.size == 1 for a in arrays):
             return float(arrays[0].flat[0])
@@ -127,7 +128,7 @@ def _stretches(
 
 
 def _channels(name: str, array: np.ndarray, step: float) -> list[Channel]:
-    """Rows of an array along its longer side."""
+    """Return the rows of an array along its longer side as channels."""
     rows = array if array.shape[1] >= array.shape[0] else array.T
     if rows.shape[1] == 1:
         return []

@@ -1,4 +1,4 @@
-"""What a file or a recording holds, as tables."""
+"""Describe a file or a recording by tables."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from pipeline.rig.recordings.raw import Raw
 
 
 def describe_file(raw: Raw) -> Table:
-    """Return a row for each channel of a file, as it is before any mapping.
+    """Return a row for each channel of a file, before any mapping.
 
     Parameters
     ----------
     raw
-        The file, read.
+        Channels of the file.
     """
     rows = [_channel_row(raw, name) for name in raw.names]
     head = f"{raw.path.name}: {raw.format}, {len(raw.names)} channels"
@@ -70,12 +70,12 @@ def describe_recording(ds: xr.Dataset) -> tuple[Table, Table]:
     Parameters
     ----------
     ds
-        As `read_recording` gives it. The noise in the first table is that of `smooth`.
+        Recording from `read_recording`. The noise in the first table is from `smooth`.
 
     Returns
     -------
     Table, Table
-        Findings of one kind and channel share a line; each has its own row.
+        Quantities, and findings. Each finding has its own row; printed lines group them by kind and channel.
     """
     from pipeline.rig.recordings.smoothing import smooth
 
@@ -132,7 +132,7 @@ def _number(value: float) -> str:
 
 
 def _aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table: the first column to the left, the others to the right."""
+    """Return the lines of a table: first column left-aligned, others right-aligned."""
     table = [list(head), *(list(row) for row in rows)]
     widths = [max(len(row[j]) for row in table) for j in range(len(head))]
     return [

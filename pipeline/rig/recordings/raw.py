@@ -1,4 +1,4 @@
-"""What the readers of all formats give: named channels, each with its own clock, before any mapping."""
+"""Define the result of all readers: named channels, each with its own clock, before any mapping."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from pipeline.rig.recordings.findings import Finding
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """One channel of one stretch of a file.
+    """A channel in one stretch of a file.
 
     Attributes
     ----------
     name : str
-        As a mapping names it.
+        Name as a mapping gives it.
     values : ndarray
-        (n,) float64, as in the file; what is no number there is NaN.
+        Readings as in the file, (n,) float64; NaN for fields that are not numbers.
     unit : str
-        As the file states it; empty if it does not.
+        Unit that the file states; empty if it does not.
     start_s : float
-        Instant of the first sample on a clock that the file's channels share [s]; NaN if it is not stated.
+        Time of the first sample on a clock that the file's channels share [s]; NaN if it is not stated.
     step_s : float
         Sampling interval that the file states [s]; NaN if it does not.
     time : ndarray, optional
-        (n,) time stamps [s] where the file has one for each sample.
+        Time stamps, (n,) [s], if the file has one for each sample.
     """
 
     name: str
@@ -46,23 +46,24 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class Raw:
-    """A file as it was read.
+    """The content of a file before any mapping.
 
     Attributes
     ----------
     path : Path
+        Path of the file.
     format : str
         Name of its format.
     sha256 : str
-        Of its bytes.
+        Digest of its bytes.
     stretches : tuple of mappings
-        Channels by name; more than one where the file keeps recordings apart, such as the cells of MATLAB.
+        Channels by name; several if the file separates recordings, such as the cells of MATLAB.
     findings : tuple of Finding
-        What was wrong with the file itself.
+        Faults of the file itself.
     simulated : bool
-        Whether the file says that nobody measured it.
+        Whether the file states that its readings are simulated.
     apart : bool
-        Whether the stretches are pieces even if one follows on another.
+        Whether each stretch is a piece, even if it continues another.
     """
 
     path: Path
@@ -80,6 +81,6 @@ class Raw:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal digits."""
+    """Return the SHA-256 of a file's bytes, in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,4 +1,4 @@
-"""A file and its mapping to one labelled dataset: what the other parts of the rig work with."""
+"""Read a file through its mapping into one labelled dataset, which the rest of the rig works with."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ def read_recording(
     path
         A TDMS, LVM, CSV or MATLAB file.
     mapping
-        What its channels are: a mapping, or the path of its file.
+        Mapping of its channels, or the path of the mapping's file.
     window_s
-        Part to be kept [s since the first sample]; goes before the mapping's.
+        Start and end of the part to keep [s since the first sample]; takes precedence over the mapping's.
 
     Returns
     -------
     Dataset
         Over the dim ``sample``: the coords ``time`` [s since the recording's first sample] and ``piece``, a
         number for each stretch without a gap; the mapped quantities in SI units, under the names of the
-        model's states; ``drive``, if there is one. NaN is what was not measured. Its attributes say what was
-        read, with which mapping, and what was found (see `findings_of`); nothing is mended in silence.
+        model's states; ``drive``, if there is one. NaN marks samples that were not measured. The attributes
+        hold the file, the mapping and the findings (see `findings_of`); every correction is a finding.
 
     Raises
     ------
     SpecError
-        If the file or the mapping cannot be read, a channel is not there, the channels have different
-        sampling rates, or nothing is in the window.
+        If the file or the mapping cannot be read, a channel is missing, the channels have different sampling
+        rates, or the window is empty.
     """
     chosen = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
     raw = formats.read_raw(Path(path), chosen.format, chosen.csv)
@@ -67,21 +67,21 @@ def read_recording(
 
 
 def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | None = None) -> xr.Dataset:
-    """Return what `read_recording` makes of a file that is read already.
+    """Return the recording from a file that was already read; see `read_recording`.
 
     Parameters
     ----------
     raw
         All channels of a file.
     mapping
-        What they are.
+        Mapping of the channels.
     window_s
-        Part to be kept [s since the first sample]; goes before the mapping's.
+        Start and end of the part to keep [s since the first sample]; takes precedence over the mapping's.
 
     Raises
     ------
     SpecError
-        As `read_recording` does.
+        See `read_recording`.
     """
     columns = _resolved(raw, mapping)
     findings = list(raw.findings)
@@ -101,19 +101,19 @@ def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | 
 
 
 def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
-    """Return a part of a recording, with the findings in it; time goes on counting from its first sample.
+    """Return a part of a recording with its findings; times still count from the recording's first sample.
 
     Parameters
     ----------
     ds
         A recording.
     window_s
-        First and last instant [s since the recording's first sample].
+        First and last time [s since the recording's first sample].
 
     Raises
     ------
     SpecError
-        If fewer than two samples are in it.
+        If the window holds fewer than two samples.
     """
     time = ds["time"].values
     low, high = window_s
@@ -136,7 +136,7 @@ def _entries(mapping: Mapping) -> dict[str, Scaled]:
 
 
 def _resolved(raw: Raw, mapping: Mapping) -> dict[str, str]:
-    """Name in the file of each mapped channel, and of ``time`` and ``piece`` if there are any."""
+    """Return the name in the file of each mapped channel, and of ``time`` and ``piece``."""
     wanted: dict[str, Scaled | TimeMap | PieceMap] = dict(_entries(mapping))
     for name, axis in (("time", mapping.time), ("piece", mapping.piece)):
         if axis is not None:
@@ -168,12 +168,12 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
-    """Return the one name that has a unit in brackets besides, if the mapping gives the unit."""
+    """Return the only name that equals the mapping's plus a unit in brackets, if the mapping has a unit."""
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
         return None
     name, stated = near[0]
-    # the unit of time stamps has a default: only where the file agrees is it given
+    # the unit of time stamps has a default, so it must agree with the file's
     if isinstance(entry, TimeMap) and units.factor(units.spelled(stated), "s") != units.factor(
         entry.unit, "s"
     ):
@@ -187,7 +187,7 @@ def _names_with_unit(channel: str | int, names: Sequence[str]) -> list[tuple[str
 
 
 def _unit_hint(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str:
-    """Say that a unit in the mapping would do, where the name lacks one."""
+    """Return a hint to add the unit to the mapping, if the name lacks one."""
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap):
         return ""
@@ -195,7 +195,7 @@ def _unit_hint(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str:
 
 
 def _name_findings(mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
-    """Say which channels have a unit in their names that the mapping's names lack."""
+    """Return findings on channels whose names in the file have a unit that the mapping's lack."""
     given: dict[str, str | int] = {name: entry.channel for name, entry in _entries(mapping).items()}
     if mapping.time is not None:
         given["time"] = mapping.time.channel
@@ -212,9 +212,9 @@ def _name_findings(mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
 def _timed(
     stretch: AnyMapping[str, Channel], mapping: Mapping, columns: dict[str, str], findings: list[Finding]
 ) -> tuple[dict[str, Channel], np.ndarray]:
-    """Channels of a stretch by their names in the dataset, with the mapping's time stamps; piece numbers.
+    """Return a stretch's channels by their names in the dataset, with time stamps, and piece numbers.
 
-    What is longer than the time stamps or the numbers is cut, and said in `findings`.
+    Channels longer than the time stamps or the piece numbers are cut, with a finding.
     """
     chosen = {name: replace(stretch[columns[name]], name=name) for name in _entries(mapping)}
     axes = {name: stretch[columns[name]].values for name in ("time", "piece") if name in columns}
@@ -238,7 +238,7 @@ def _timed(
 
 
 def _joined(stretches: Sequence[AnyMapping[str, Channel]], name: str, clock: Clock) -> np.ndarray:
-    """Readings of a channel on the clock."""
+    """Return the readings of a channel on the clock."""
     return np.concatenate(
         [s[name].values[slice(*taken[name])] for s, taken in zip(stretches, clock.taken, strict=True)]
     )
@@ -263,7 +263,7 @@ def _converted(signal: checks.Signal, mapping: Mapping) -> tuple[np.ndarray, lis
 
 
 def _make_absolute(variables: dict[str, np.ndarray], mapping: Mapping) -> None:
-    """Add to relative angles what they are relative to."""
+    """Add to each relative angle the angle that it is relative to."""
     own = dict(variables)
     for name, entry in mapping.channels.items():
         if entry.relative_to is not None:
@@ -271,7 +271,7 @@ def _make_absolute(variables: dict[str, np.ndarray], mapping: Mapping) -> None:
 
 
 def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
-    """Say where the file states a unit that is not the mapping's."""
+    """Return findings on channels whose unit in the file differs from the mapping's."""
     findings = []
     for name, entry in _entries(mapping).items():
         stated = units.spelled(raw.stretches[0][columns[name]].unit)
@@ -287,7 +287,7 @@ def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[
 def _labelled(
     variables: AnyMapping[str, np.ndarray], clock: Clock, raw: Raw, mapping: Mapping, findings: list[Finding]
 ) -> xr.Dataset:
-    """Names, units and provenance."""
+    """Return the dataset with names, units and provenance."""
     model = mapping.system
     meanings = {s.name: s.meaning for s in model.states} | {q.name: q.meaning for q in model.quantities}
     data: dict[str, Any] = {}

@@ -1,9 +1,10 @@
-"""Smooth states and rates by local polynomials without lag, and the noise that they leave.
+"""Smooth states and estimate rates by local polynomials without lag, with their noise.
 
 A polynomial of low order is fitted by least squares to the samples of a window (Savitzky and Golay, Anal.
-Chem. 36, 1964, 1627). In the middle of a stretch the window is centred, which shifts no phase; at its ends
-it is the last whole window, evaluated off its centre. A stretch ends where a piece does, where samples are
-not measured, and where the drive switches: there the acceleration jumps, and no polynomial spans that.
+Chem. 36, 1964, 1627). In the middle of a stretch the window is centred, so the phase is not shifted. At the
+ends of a stretch the last whole window is evaluated off its centre. A stretch ends where a piece ends, where
+samples are not measured, and where the drive switches: the acceleration jumps there, and no polynomial can
+follow a jump.
 """
 
 from __future__ import annotations
@@ -22,28 +23,28 @@ from pipeline.rig.recordings.mapping import DRIVE
 from pipeline.spec.problems import SpecError
 
 LEAP, LEAP_SAMPLES = 0.4, 5
-"""A drive leaps if it changes by this share of its range within so many samples."""
+"""Change of the drive, relative to its range, that counts as a switch, and its most samples."""
 
 QUIET = 10.0
-"""Least range of a drive whose leaps are looked for, in units of its change from sample to sample."""
+"""Least range of a drive whose switches are sought, in units of its change between samples."""
 
 GROWTH = 1.25
-"""Ratio of neighbouring windows that are tried."""
+"""Ratio of successive windows that are tried."""
 
 ENOUGH = 1.5
-"""A window whose score is so many times the least ends the search for a longer one."""
+"""Ratio of a window's score to the least one above which no longer window is tried."""
 
 SHORT = (0.7, 0.2)
-"""Shares of the window below which a stretch has polynomials of an order less.
+"""Lengths relative to the window; a stretch shorter than each has polynomials of one order less.
 
-On swings of the paper's pendulum with noise of 1 and 11 mrad this halves the error of the rates there.
+On free swings of the paper's pendulum with noise of 1 and 11 mrad this halves the error of the rates there.
 """
 
 LONG = 63
-"""Windows longer than this go through Fourier transforms [samples]."""
+"""Length above which windows are convolved by Fourier transforms [samples]."""
 
 MOST_SAMPLES = 200_000
-"""Samples from which the window is chosen; of longer recordings, the first."""
+"""Most samples from which the window is chosen: the first of a longer recording."""
 
 
 def smooth(
@@ -53,32 +54,29 @@ def smooth(
     order: int = 3,
     edges_s: Sequence[float] | np.ndarray | None = None,
 ) -> xr.Dataset:
-    """Smooth the measured quantities and add the rates that are not measured.
+    """Smooth the measured quantities, and add the rates that are not measured.
 
     Parameters
     ----------
     ds
         A recording.
     window_s
-        Length of the windows [s]. By default it is chosen for each quantity: of windows that grow by a
-        quarter, the one whose polynomials predict samples best that they have not seen (leave-one-out
-        cross-validation, which for these fits is the mean square of residual/(1 - leverage)). It balances
-        noise against distortion if the noise of neighbouring samples is independent; if it is not, state a
-        window.
+        Length of the windows [s]. By default it is chosen for each quantity by leave-one-out cross-validation
+        (the mean square of residual/(1 - leverage)) among windows that grow by a quarter. This balances noise
+        against distortion if the noise of neighbouring samples is independent; otherwise state a window.
     order
-        Of the polynomials, 1 or more.
+        Order of the polynomials, 1 or more.
     edges_s
-        Instants at which the drive switches [s]; by default those at which ``drive`` leaps from one level to
-        another, if it is there.
+        Times at which the drive switches [s]; by default the jumps of ``drive``, if the recording has it.
 
     Returns
     -------
     Dataset
-        As `ds`, with the measured quantities smoothed and the rates of the model's states added by name; NaN
-        where nothing was measured, or a stretch has no more than `order` samples. Attributes of the
+        Copy of `ds` with the measured quantities smoothed and the rates of the model's states added by name;
+        NaN where nothing was measured, or where a stretch has no more than `order` samples. Attributes of the
         quantities: ``noise``, the standard deviation of a raw sample [SI units], from the residuals and the
-        degrees of freedom that the polynomials take; ``noise_smoothed``, what is left of it in the middle of
-        a stretch (of rates, too); ``window_s``.
+        polynomials' degrees of freedom; ``noise_smoothed``, the standard deviation in the middle of a stretch
+        after smoothing (for rates, too); ``window_s``.
 
     Raises
     ------
@@ -102,12 +100,12 @@ def smooth(
 
 
 def _least(order: int) -> int:
-    """Samples of the shortest window: odd, and more than a polynomial takes."""
+    """Return the samples of the shortest window: odd, and more than a polynomial has coefficients."""
     return order + 2 + (order + 1) % 2
 
 
 def _checked(window_s: float | None, order: int, step: float) -> int | None:
-    """Return the samples of a window that is asked for, an odd number."""
+    """Return the samples of a requested window, an odd number."""
     problems = []
     if order < 1:
         problems.append(f"order = {order}: must be 1 or more, so that there is a rate.")
@@ -123,10 +121,10 @@ def _checked(window_s: float | None, order: int, step: float) -> int | None:
 
 
 def _switches(ds: xr.Dataset) -> np.ndarray:
-    """Instants at which the drive leaps between any of its levels [s].
+    """Return the times at which the drive jumps between any of its levels [s].
 
-    A drive that is switched off has three levels, so that these are not the edges about one middle that
-    `pipeline.rig.edges` finds.
+    A drive that is switched off has three levels, so edges about one middle, as in `pipeline.rig.edges`, do
+    not suffice.
     """
     if DRIVE not in ds:
         return np.empty(0)
@@ -145,7 +143,7 @@ def _switches(ds: xr.Dataset) -> np.ndarray:
 
 
 def _parts(ds: xr.Dataset, name: str, edges: np.ndarray) -> np.ndarray:
-    """First and last-plus-one sample of each stretch that polynomials may span; (n, 2)."""
+    """Return first and last-plus-one sample of each stretch that polynomials may span, (n, 2)."""
     values, piece, time = ds[name].values, ds["piece"].values, ds["time"].values
     known = np.isfinite(values)
     number = piece + 0.0
@@ -164,9 +162,9 @@ class _Basis(NamedTuple):
     Attributes
     ----------
     values, slopes : ndarray
-        (width, order + 1); slopes per sample.
+        Values, and slopes per sample, (width, order + 1).
     leverage : ndarray
-        (width,) weight of a sample in its own fitted value.
+        Weight of a sample in its own fitted value, (width,).
     """
 
     values: np.ndarray
@@ -186,20 +184,20 @@ def _basis(width: int, order: int) -> _Basis:
 
 
 class _Fit:
-    """Values, rates and noise of one quantity with one window."""
+    """The smoothed values, rates and noise of one quantity with one window."""
 
     def __init__(self, values: np.ndarray, rates: np.ndarray, noise: float, width: int, score: float) -> None:
         self.values, self.rates, self.noise, self.width, self.score = values, rates, noise, width, score
 
     def attrs(self, order: int, step: float, derivative: int) -> dict[str, Any]:
-        """What the dataset says of the values, or of the rates."""
+        """Return the dataset's attributes of the values, or of the rates."""
         gain = _gain(self.width, order, derivative, step)
         raw = {"noise": self.noise} if derivative == 0 else {}
         return {**raw, "noise_smoothed": self.noise * gain, "window_s": self.width * step}
 
 
 def _gain(width: int, order: int, derivative: int, step: float) -> float:
-    """Standard deviation of a smoothed value, or rate, in the middle of a window over that of a sample."""
+    """Return the noise of a smoothed value or rate, in the middle of a window, over that of a sample."""
     basis = _basis(width, order)
     rows = basis.slopes / step if derivative else basis.values
     return float(np.linalg.norm(rows[width // 2]))
@@ -212,7 +210,7 @@ def _fit(values: np.ndarray, parts: np.ndarray, width: int | None, order: int, s
 
 
 def _first_samples(parts: np.ndarray, count: int) -> np.ndarray:
-    """Stretches up to a number of samples; the last is cut."""
+    """Return stretches with a given number of samples in total; the last one is cut."""
     if not len(parts):
         return parts
     lengths = np.diff(parts, axis=1).ravel()
@@ -223,7 +221,7 @@ def _first_samples(parts: np.ndarray, count: int) -> np.ndarray:
 
 
 def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
-    """Window with the least error of prediction."""
+    """Return the window with the least error of prediction."""
     first = _least(order)
     used = _first_samples(parts, MOST_SAMPLES)
     if len(used):
@@ -241,7 +239,7 @@ def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
 
 
 def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, step: float) -> _Fit:
-    """Fit all stretches with one window, or a shorter one where a stretch is shorter."""
+    """Fit all stretches with one window; short stretches get a shorter one."""
     fitted, slopes, leverage = (np.full(len(values), np.nan) for _ in range(3))
     lengths = np.diff(parts, axis=1).ravel()
     own = np.minimum(width, lengths - 1 + lengths % 2)
@@ -260,14 +258,14 @@ def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, ste
 
 
 def _order_of(own: int, width: int, order: int) -> int:
-    """Order in a window that a short stretch makes shorter: what noise adds there outweighs what curves."""
+    """Return the order for a short window, lower since noise outweighs curvature there."""
     return max(order - sum(own < share * width for share in SHORT), 1)
 
 
 def _fit_ends(
     values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]
 ) -> None:
-    """Fill in the first and the last half of a window, and its middle, from the whole window there."""
+    """Fill in the first and the last half of each stretch from the window at its end."""
     basis, half = _basis(width, order), width // 2
     for begins, rows in ((parts[:, 0], slice(0, half + 1)), (parts[:, 1] - width, slice(half, width))):
         window = values[begins[:, None] + np.arange(width)]
@@ -282,7 +280,7 @@ def _fit_ends(
 def _fit_middles(
     values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]
 ) -> None:
-    """Fill in what has half a window on either side, by convolution."""
+    """Fill in samples with half a window on either side, by convolution."""
     half = width // 2
     long = parts[np.diff(parts, axis=1).ravel() > width + 1]
     if not len(long):
@@ -293,7 +291,7 @@ def _fit_middles(
     is_middle = np.cumsum(change[:-1]) > 0
     known = np.isfinite(values)
     mean = float(values[known].mean())
-    centred = np.where(known, values - mean, 0.0)  # no window of a middle has one that is not known
+    centred = np.where(known, values - mean, 0.0)  # windows in the middle contain known samples only
     basis = _basis(width, order)
     out[0][is_middle] = mean + _convolved(centred, basis.values @ basis.values[half])[is_middle]
     out[1][is_middle] = _convolved(centred, basis.values @ basis.slopes[half])[is_middle]
@@ -301,7 +299,7 @@ def _fit_middles(
 
 
 def _convolved(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted sums about each sample; the time of Fourier transforms hardly grows with the window."""
+    """Return weighted sums about each sample; long windows use Fourier transforms, which are faster."""
     from scipy.ndimage import correlate1d
     from scipy.signal import oaconvolve
 

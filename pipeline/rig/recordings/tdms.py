@@ -1,4 +1,4 @@
-"""TDMS files of LabVIEW, through npTDMS."""
+"""Read TDMS files of LabVIEW through npTDMS."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from pipeline.rig.recordings.raw import Channel, Raw, digest
 from pipeline.spec.problems import SpecError
 
 SIMULATED = "simulated"
-"""Property of the file that says that nobody measured it."""
+"""Property of a file with simulated readings."""
 
 LEAD_IN = 28
-"""Length of what a segment begins with [bytes]."""
+"""Length of a segment's lead-in [bytes]."""
 
 BIG_ENDIAN = 1 << 6
-"""In the first byte of a segment's table of contents."""
+"""Flag in the first byte of a segment's table of contents."""
 
 _UNITS = ("unit_string", "NI_UnitDescription", "unit")
 
 
 def read_tdms(path: Path) -> Raw:
-    """Read all channels of numbers and of instants; their names are ``GROUP/CHANNEL``.
+    """Read all channels of numbers and of times; their names are ``GROUP/CHANNEL``.
 
-    Waveforms bring their sampling interval and their start, which is read with all its digits; npTDMS by
-    itself cuts it to microseconds. A last segment that is shorter than it says, of which npTDMS only
-    warns, is a finding.
+    Waveforms state their sampling interval and start. The start is read with all its digits, while npTDMS by
+    default rounds it to microseconds. A last segment shorter than stated, for which npTDMS only warns, is a
+    finding.
 
     Raises
     ------
     SpecError
-        If it is no TDMS file.
+        If it is not a TDMS file.
     """
     from nptdms import TdmsFile
 
@@ -76,7 +76,7 @@ def _channel(name: str, values: np.ndarray, properties: Mapping[str, Any], zero:
 
 
 def _numbers(data: Any, zero: int) -> np.ndarray | None:
-    """Return readings as floating-point numbers, instants in seconds; None of what is neither."""
+    """Return readings as floats and times in seconds; None for any other type."""
     array = np.asarray(data)
     names = array.dtype.names or ()
     if "second_fractions" in names:
@@ -86,7 +86,7 @@ def _numbers(data: Any, zero: int) -> np.ndarray | None:
 
 
 def _earliest(file: Any) -> int:
-    """Whole second before all starts, on TDMS's own scale: instants since then keep their digits."""
+    """Return the whole second before all starts on TDMS's scale, so that differences keep their digits."""
     starts = [c.properties.get("wf_start_time") for g in file.groups() for c in g.channels()]
     return min((int(s.seconds) for s in starts if s is not None), default=0)
 
@@ -96,7 +96,7 @@ def _seconds(stamp: Any, zero: int) -> float:
 
 
 def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
-    """Say what npTDMS warned of, with the numbers of samples where it knows them."""
+    """Return findings from npTDMS's warnings, with the numbers of samples if it knows them."""
     status = file.file_status
     remedy = "copy the file again, or take care that the writing program closes it"
     if status.channel_statuses:
@@ -116,10 +116,10 @@ def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
 
 
 def _bytes_after_last_segment(path: Path) -> int:
-    """Bytes of a segment whose lead-in is not whole, which npTDMS leaves out without a word.
+    """Return the bytes of a last segment with an incomplete lead-in, which npTDMS silently skips.
 
-    The lead-in of a segment has 28 bytes: tag, table of contents, version, and the lengths of what follows
-    (National Instruments, "TDMS File Format Internal Structure").
+    The lead-in of a segment has 28 bytes: tag, table of contents, version, and the lengths of the parts that
+    follow (National Instruments, "TDMS File Format Internal Structure").
     """
     size, place = path.stat().st_size, 0
     with path.open("rb") as file:
@@ -137,7 +137,7 @@ def _truncated(text: str) -> Finding:
 
 @contextlib.contextmanager
 def _listening() -> Iterator[list[str]]:
-    """Collect what npTDMS logs, which then goes nowhere else."""
+    """Collect npTDMS's log messages and keep them from other handlers."""
     heard: list[str] = []
 
     def keep(record: logging.LogRecord) -> bool:

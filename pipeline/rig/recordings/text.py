@@ -1,4 +1,4 @@
-"""Numbers in texts: encodings, decimal commas, empty fields."""
+"""Read numbers in texts: encodings, decimal commas, empty fields."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _INSTANT = re.compile(
 
 
 def read_text(path: Path) -> str:
-    """Return a text in UTF-8, or else in the Western encoding of Windows that LabVIEW writes.
+    """Return a text in UTF-8, or in the Western encoding of Windows (cp1252) that LabVIEW writes.
 
     Raises
     ------
     SpecError
-        If it is none.
+        If the file is not a text.
     """
     data = path.read_bytes()
     if b"\x00" in data[:4096]:
@@ -34,7 +34,7 @@ def read_text(path: Path) -> str:
 
 
 def number(field: str, decimal: str) -> float | None:
-    """Return the number in a field, NaN of an empty one, None of another text."""
+    """Return the number in a field; NaN for an empty field, None for any other text."""
     text = field.strip().strip('"').strip()
     if not text:
         return float("nan")
@@ -42,7 +42,7 @@ def number(field: str, decimal: str) -> float | None:
         if "." in text:
             return None
         text = text.replace(",", ".")
-    if "_" in text:  # a number for Python alone
+    if "_" in text:  # only Python takes it for a number
         return None
     try:
         return float(text)
@@ -51,7 +51,7 @@ def number(field: str, decimal: str) -> float | None:
 
 
 def split(line: str, delimiter: str) -> list[str]:
-    """Return the fields of a line; a blank as delimiter stands for any number of them."""
+    """Return the fields of a line; a blank as delimiter stands for any number of blanks."""
     if delimiter == " ":
         return line.split()
     if '"' in line:
@@ -62,19 +62,19 @@ def split(line: str, delimiter: str) -> list[str]:
 
 
 def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal: str) -> np.ndarray:
-    """Return rows of numbers; what is empty, missing or no number is NaN.
+    """Return rows of numbers; NaN for fields that are empty, missing or texts.
 
     Parameters
     ----------
     lines
-        Without their ends.
+        Lines without line ends.
     columns
-        Fields that are wanted, by number from 0.
+        Indices of the wanted fields, from 0.
 
     Returns
     -------
     ndarray
-        (n_lines, n_columns).
+        Numbers, (n_lines, n_columns).
     """
     if not lines or not columns:
         return np.empty((len(lines), len(columns)))
@@ -100,13 +100,13 @@ def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal:
 
 
 def instants(fields: Sequence[str]) -> np.ndarray | None:
-    """Return dates, or times of day, as seconds since the first; None of other texts.
+    """Return dates or times of day as seconds since the first; None for other texts.
 
     Parameters
     ----------
     fields
-        In the order of ISO 8601, with a blank or a T between date and time, and a point or a comma before the
-        parts of a second.
+        Texts in the order of ISO 8601, with a blank or a T between date and time, and a point or a comma
+        before the fraction of a second.
     """
     found = [_INSTANT.fullmatch(f.strip().strip('"').replace("/", "-").replace(",", ".")) for f in fields]
     known = [m for m in found if m is not None]
@@ -114,13 +114,13 @@ def instants(fields: Sequence[str]) -> np.ndarray | None:
         return None
     try:
         stamps = np.array([f"{m['date'] or '1970-01-01'}T{m['time']}" for m in known], dtype="datetime64[ns]")
-    except ValueError:  # the 31st of February
+    except ValueError:  # no such date, as the 31st of February
         return None
     return np.asarray((stamps - stamps[0]).astype(np.float64) * 1e-9)
 
 
 def unique(names: Sequence[str]) -> list[str]:
-    """Return names of which none comes twice: the second ``a`` is ``a (2)``."""
+    """Make names unique: the second ``a`` becomes ``a (2)``."""
     seen: dict[str, int] = {}
     result = []
     for name in names:
@@ -130,6 +130,6 @@ def unique(names: Sequence[str]) -> list[str]:
 
 
 def without_end(values: np.ndarray) -> np.ndarray:
-    """Return a column without the empty fields after its last number."""
+    """Drop the empty fields after a column's last number."""
     known = np.flatnonzero(np.isfinite(values))
     return values[: known[-1] + 1] if known.size else values[:0]

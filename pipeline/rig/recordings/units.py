@@ -1,4 +1,4 @@
-"""Units in which recordings are written, and what they are in SI units."""
+"""Convert the units of recordings to SI units."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ _SPELLINGS = {
 
 
 def spelled(unit: str) -> str:
-    """Return a unit as it is usually written; LabVIEW writes ``Volts``."""
+    """Return a unit in its usual spelling; LabVIEW writes ``Volts``."""
     return _SPELLINGS.get(unit.strip().lower(), unit.strip())
 
 
 def factor(unit: str, wanted: str) -> float | None:
-    """Return what a unit is in another, or None if it is not one of that kind: a volt is no angle.
+    """Return the factor from a unit to another; None if it is a unit of another quantity.
 
     Parameters
     ----------
     unit
-        As a mapping or a file states it; empty for the wanted one.
+        Unit in a mapping or a file; empty for the wanted unit.
     wanted
         SI unit of the quantity.
     """
@@ -50,7 +50,7 @@ def factor(unit: str, wanted: str) -> float | None:
 
 
 def kind_of(unit: str) -> str | None:
-    """Return the SI unit of the quantities that are measured in this unit, None if that is not known."""
+    """Return the SI unit of the quantity that a unit measures; None if the unit is unknown."""
     return next((si for si, known in UNITS.items() if unit in known), None)
 
 

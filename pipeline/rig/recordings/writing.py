@@ -1,4 +1,4 @@
-"""Recordings as files that any program of the laboratory reads: TDMS, CSV, NetCDF."""
+"""Write recordings as files for other programs: TDMS, CSV, NetCDF."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def write_recording(ds: xr.Dataset, path: str | Path) -> Path:
     ds
         A recording.
     path
-        ``.tdms`` or ``.csv``, which `read_recording` reads back to the same numbers with the mapping that
-        `mapping_for` gives; or ``.nc``, the dataset itself as NetCDF.
+        ``.tdms`` or ``.csv``, which `read_recording` reads back to the same numbers with the mapping from
+        `mapping_for`; or ``.nc``, the dataset itself as NetCDF.
 
     Raises
     ------
     SpecError
-        If the suffix is none of these, or there is no such folder.
+        If the suffix is another one, or the folder does not exist.
     """
     target = check_target(path)
     if target.suffix.lower() == ".nc":
@@ -56,7 +56,7 @@ def write_recording(ds: xr.Dataset, path: str | Path) -> Path:
 
 
 def mapping_for(ds: xr.Dataset, path: str | Path) -> Mapping:
-    """Return the mapping of a file that `write_recording` has written."""
+    """Return the mapping of a file that `write_recording` wrote."""
     is_tdms = Path(path).suffix.lower() == ".tdms"
 
     def own(name: str) -> str:
@@ -75,14 +75,14 @@ def mapping_for(ds: xr.Dataset, path: str | Path) -> Mapping:
 
 
 def _is_one_waveform(ds: xr.Dataset) -> bool:
-    """Whether a start and a sampling interval say all of the time."""
+    """Return whether start and sampling interval describe all times."""
     return ds["piece"].size == 0 or (
         int(ds["piece"][0]) == int(ds["piece"][-1]) and float(ds["time"][0]) == 0.0
     )
 
 
 def write_raw(raw: Raw, path: str | Path) -> Path:
-    """Write channels as they are, as TDMS or CSV.
+    """Write channels unchanged, as TDMS or CSV.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def write_raw(raw: Raw, path: str | Path) -> Path:
     Raises
     ------
     SpecError
-        If the suffix is none of these, or there is no such folder.
+        If the suffix is another one, or the folder does not exist.
     """
     target = check_target(path, SUFFIXES[:2])
     (channels,) = raw.stretches
@@ -134,7 +134,7 @@ def _write_tdms(channels: Sequence[Channel], path: Path, is_simulated: bool) -> 
 
 
 def _write_csv(channels: Sequence[Channel], path: Path, is_simulated: bool) -> None:
-    """Write a column for each channel, with as many digits as the numbers have."""
+    """Write a column for each channel, with all digits."""
     columns = [(c.name, c.values) for c in channels]
     step = channels[0].step_s
     if not any(name == "time" for name, _ in columns) and math.isfinite(step):

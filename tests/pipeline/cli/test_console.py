@@ -152,7 +152,7 @@ def test_help__keeps_square_brackets_units_bounds_and_defaults(main):
     assert code == 0
     text = " ".join(out.split())
     assert "[products] lyapunov" in text
-    assert "differs from 0 [1/s]; 0 or more. Default: 0.005." in text
+    assert "counts as nonzero [1/s]; 0 or more. Default: 0.005." in text
     for group in ("analyse", "plot"):
         assert main(group, "--help")[0] == 0
 
