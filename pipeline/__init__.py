@@ -1,7 +1,7 @@
-"""From a specification to a cube and its figures: sweeps and continuations of the pendulum.
+"""From a specification to a cube and its figures: sweeps and continuations of forced and autonomous systems.
 
-`open_run` opens a run directory. It is imported when it is first used, so that
-the command line answers quickly.
+`open_run` opens a run directory. It is imported at its first use, so that the
+command line answers quickly.
 """
 
 from __future__ import annotations
