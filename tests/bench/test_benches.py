@@ -1,10 +1,15 @@
-"""Every benchmark once, in a tiny size, so that none of them rots."""
+"""Benchmarks are no part of the suite: one test looks at their parts and their options.
+
+``MAGPEND_LONG=1`` runs every benchmark once, in a tiny size, so that none of them rots.
+"""
 
 import contextlib
 import importlib
 import io
 import subprocess
 import sys
+from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +26,28 @@ def bench(monkeypatch):
     return importlib.import_module
 
 
+def test_benches__can_be_imported_and_say_their_options(bench, capsys):
+    """An edit of the package that takes away what a benchmark imports, or of its options, is seen here."""
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        if path.stem == "test_benches" or (path.stem == "heyoka_model" and not find_spec("heyoka")):
+            continue
+        module = bench(path.stem)
+        takes_options = hasattr(module, "main") and signature(module.main).parameters
+        if takes_options and "ArgumentParser" in path.read_text("utf-8"):
+            with pytest.raises(SystemExit) as end:
+                module.main(["--help"])
+            assert end.value.code == 0
+            assert "usage:" in capsys.readouterr().out, path.stem
+
+
+@pytest.mark.long
 def test_scalar_twin__agrees_with_the_lanes(bench):
     kernel = bench("kernel")
     case = kernel.case_of(kernel.parse(["--trajectories", "32"]))
     assert kernel.check_agreement(case) < kernel.AGREEMENT
 
 
+@pytest.mark.long
 def test_kernel__prints_all_tables(bench, monkeypatch, capsys):
     kernel = bench("kernel")
     # children would compile everything again: their work is done here
@@ -37,6 +58,7 @@ def test_kernel__prints_all_tables(bench, monkeypatch, capsys):
         assert name in printed
 
 
+@pytest.mark.long
 def test_kernel__limiter_is_back_after_the_run_without(bench):
     kernel = bench("kernel")
     module = importlib.import_module("magpend_core.engine.entry")
@@ -46,6 +68,7 @@ def test_kernel__limiter_is_back_after_the_run_without(bench):
     assert before == module.SLACK
 
 
+@pytest.mark.long
 def test_cheap__prints_all_variants(bench, capsys):
     cheap = bench("cheap")
     cheap.main(TINY)
@@ -54,6 +77,7 @@ def test_cheap__prints_all_variants(bench, capsys):
         assert name in printed
 
 
+@pytest.mark.long
 def test_events__prints_both_tables(bench, capsys):
     bench("events").main([*TINY[:2], "--periods", "2", "--rounds", "1", "--flows", "lorenz"])
     printed = capsys.readouterr().out
@@ -61,11 +85,13 @@ def test_events__prints_both_tables(bench, capsys):
         assert name in printed
 
 
+@pytest.mark.long
 def test_peers__models_are_the_same(bench):
     line = bench("peers").check_models(bench("magpend_core").load_preset(), seed=1)
     assert "scalar model" in line
 
 
+@pytest.mark.long
 def test_work_precision__draws_and_prints(bench, monkeypatch, tmp_path, capsys):
     # without numbalsoda, which compiles the model once more, scipy gives the reference; heyoka
     # compiles for minutes, and its model is checked above
@@ -78,6 +104,7 @@ def test_work_precision__draws_and_prints(bench, monkeypatch, tmp_path, capsys):
     assert "numbalsoda is left out" in printed
 
 
+@pytest.mark.long
 def test_multistable_pendulum__prints_both_variants_with_the_same_labels(bench, capsys):
     bench("multistable_pendulum").main(["--starts", "200", "--rounds", "1"])
     printed = capsys.readouterr().out
@@ -87,6 +114,7 @@ def test_multistable_pendulum__prints_both_variants_with_the_same_labels(bench, 
     assert "undecided  0 starts" in printed
 
 
+@pytest.mark.long
 def test_multistable_pendulum__threads_change_nothing(bench, monkeypatch):
     pendulum = bench("multistable_pendulum")
     monkeypatch.setattr(pendulum, "CHUNK", 16)
@@ -95,6 +123,7 @@ def test_multistable_pendulum__threads_change_nothing(bench, monkeypatch):
     assert one.attempts == three.attempts
 
 
+@pytest.mark.long
 def test_basins__prints_ratios_and_labels(bench, capsys):
     few = ["--scipy-trajectories", "1", "--scipy-periods", "1"]
     bench("basins").main(["--size", "4", "--bands", "2", "--transient", "300", *few])
@@ -103,6 +132,7 @@ def test_basins__prints_ratios_and_labels(bench, capsys):
         assert text in printed
 
 
+@pytest.mark.long
 def test_tangents__prints_a_ratio_for_each_number_of_exponents(bench, capsys):
     few = ["--trajectories", "4", "--periods", "16", "--rounds", "1"]
     # with two it would compile for itself
@@ -112,6 +142,7 @@ def test_tangents__prints_a_ratio_for_each_number_of_exponents(bench, capsys):
         assert name in printed
 
 
+@pytest.mark.long
 def test_intervals__hold_the_truth(bench):
     """A few seeds; the bench takes hundreds. Intervals too narrow by a half would hold it in 60 % of them."""
     intervals = bench("intervals")
@@ -122,6 +153,7 @@ def test_intervals__hold_the_truth(bench):
     assert {o.estimator for o in found} <= {"white", "pieces"}
 
 
+@pytest.mark.long
 def test_identification__compares_the_same_residuals(bench, capsys):
     identification = bench("identification")
     problem = identification.shipped_problem(2)
@@ -133,6 +165,7 @@ def test_identification__compares_the_same_residuals(bench, capsys):
         assert name in printed
 
 
+@pytest.mark.long
 def test_virtual_rig__finds_all_parameters_again(bench):
     """A third of each recording, one seed: no parameter is off by more than its interval allows."""
     rig = bench("virtual_rig")
@@ -143,6 +176,7 @@ def test_virtual_rig__finds_all_parameters_again(bench):
     assert (found.errors / rig.truth() < 0.5).all()
 
 
+@pytest.mark.long
 def test_text_models__prints_all_tables(bench, monkeypatch, capsys):
     # heyoka and numbalsoda compile for long; that their equations are the same is tested below
     monkeypatch.setitem(sys.modules, "numbalsoda", None)
@@ -172,6 +206,7 @@ def test_text_models__prints_all_tables(bench, monkeypatch, capsys):
     assert len(set(folders)) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["belt", "three-magnets", "pendulum-text"])
 def test_text_peers__equations_are_those_of_the_engine(bench, name):
     peers, cases = bench("text_peers"), bench("text_models").CASES
@@ -189,6 +224,7 @@ def test_text_peers__equations_are_those_of_the_engine(bench, name):
     assert np.allclose(theirs, ours, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.long
 def test_object_store__prints_a_table(bench, monkeypatch, capsys):
     pytest.importorskip("obstore")
     for name in ("AWS_ENDPOINT_URL", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_REGION"):
@@ -198,6 +234,7 @@ def test_object_store__prints_a_table(bench, monkeypatch, capsys):
     assert all(name in printed for name in ("set up", "commit a task", "load a variable", "verify"))
 
 
+@pytest.mark.long
 def test_scaling__ceiling(bench, capsys):
     bench("scaling").main(["--seconds", "0", "--workers", "4", "--task-seconds", "0.05", "--rounds", "3"])
     printed = capsys.readouterr().out
@@ -207,6 +244,7 @@ def test_scaling__ceiling(bench, capsys):
     assert all(0 < float(line[-1]) <= 1 for line in lines)
 
 
+@pytest.mark.long
 def test_same_set__prints_a_line_for_each_number_of_sections(bench, capsys):
     same_set = bench("same_set")
     same_set.main(["--cells", "6", "--cases", "Ueda"])

@@ -117,7 +117,7 @@ def test_workers__tasks_that_hang(faulty, tmp_path, monkeypatch):
     """A living worker that is busy for ever: the task is given up there and done elsewhere, or reported."""
     # tasks that do not hang have all the time that a busy machine takes for them
     hangs = {2: 1, 4: 100}
-    limit = lambda self, index, tries: 4.0 if tries <= hangs.get(index, 0) else 600.0  # noqa: E731
+    limit = lambda self, index, tries: 1.5 if tries <= hangs.get(index, 0) else 600.0  # noqa: E731
     monkeypatch.setattr(limits.Limits, "limit_s", limit)
     task = partial(faulty.hanging, str(tmp_path), unlucky=(2,), poison=(4,))
     lines, found = [], []

@@ -23,15 +23,19 @@ HOSTILE = "<script>alert(1)</script> & friends"
 SWEEP = f"""
 kind = "sweep"
 title = "{HOSTILE}"
+model = "duffing"
+[parameters]
+preset = "twin-well"
+frequency_hz = 0.15915494309189535
 [axes]
-frequency_hz = {{ values = [2.6, 2.8] }}
+amplitude = {{ values = [0.1, 0.15] }}
 [initial_conditions]
 kind = "grid"
-psi1_deg = {{ start = -10, stop = 10, num = 3 }}
-psi2_deg = {{ start = -10, stop = 10, num = 2 }}
+x = {{ start = -1.0, stop = 1.0, num = 3 }}
+v = {{ start = -0.2, stop = 0.2, num = 2 }}
 [integration]
-rtol = 1e-6
-atol = 1e-6
+rtol = 1e-7
+atol = 1e-7
 n_transient = 200
 n_keep = 16
 stop_when_closed = true

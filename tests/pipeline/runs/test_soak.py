@@ -1,6 +1,6 @@
 """Many small tasks: memory and file handles of coordinator and workers stay where they are.
 
-300 tasks as part of the suite; ``MAGPEND_LONG=1`` takes 10,000.
+150 tasks as part of the suite; ``MAGPEND_LONG=1`` takes 10,000.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pipeline.runs import run as runs
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 
-N_TASKS = 10_000 if os.environ.get("MAGPEND_LONG") == "1" else 300
+N_TASKS = 10_000 if os.environ.get("MAGPEND_LONG") == "1" else 150
 KILOBYTES_PER_TASK = 10 if N_TASKS > 1000 else 40
 """What a process may grow by; over few tasks, what it takes in once weighs more."""
 HANDLES = 4

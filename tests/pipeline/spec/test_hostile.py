@@ -235,7 +235,7 @@ def outcome(path, smoke):
 
 
 FUZZ = settings(
-    max_examples=1000 if LONG else 75,
+    max_examples=1000 if LONG else 25,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
