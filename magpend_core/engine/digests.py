@@ -132,7 +132,7 @@ def _function(function: FunctionType, seen: dict[int, int]) -> Iterator[bytes]:
             raise _UnknownError
 
 
-def reached(function: FunctionType, path: tuple[str, ...]) -> Any:
+def reached(function: Any, path: tuple[str, ...]) -> Any:
     """Return the global value that a function finds at a path (see `lookups`), None if there is none."""
     return _found(function.__globals__.get(path[0]), path[1:])
 

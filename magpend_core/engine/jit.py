@@ -56,6 +56,8 @@ _OF_PARTS: dict[str, Any] = {
 # numba makes a wrapper for C of every function that has none forbidden, though nothing here is called from C.
 WITHOUT_C: dict[str, Any] = {"no_cfunc_wrapper": True}
 
+_SETTINGS: Any = numba.config
+
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -91,7 +93,7 @@ PARTS = PartFolder(CACHE_FOLDER) if CACHE_FOLDER is not None else None
 
 def inline(function: F) -> F:
     """Compile a helper of the hot path, which allocates nothing; it dissolves into its caller."""
-    if numba.config.DISABLE_JIT:
+    if _SETTINGS.DISABLE_JIT:
         return function
 
     def identity() -> str | None:
@@ -169,11 +171,13 @@ def bound_part(template: Callable[..., Any], bindings: Mapping[str, Any], dissol
 
 
 def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool, names: set[str]) -> Any:
-    if numba.config.DISABLE_JIT:
+    if _SETTINGS.DISABLE_JIT:
         return specialise(template, "part", **used)
     sizes: dict[str, Any] = {}
     # how many rows are loaded at once is a type, so that these templates are compiled for each size
-    general = used if "load_rows" in names else {k: _without_size(k, v, names, sizes) for k, v in used.items()}
+    general = (
+        used if "load_rows" in names else {k: _without_size(k, v, names, sizes) for k, v in used.items()}
+    )
     digest = _template_digest(template, general, dissolves, names)
     function = specialise(template, digest[:16] if digest else "unkept", **general)
     options = {**_OF_PARTS, "forceinline": dissolves}

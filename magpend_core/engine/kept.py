@@ -162,7 +162,13 @@ class PartFolder:
 
     def read(self, name: str) -> bytes | None:
         """Return a record, None if there is none that can be used."""
-        return _read_sealed(self._path(name))
+        try:
+            return None if _made(self._home, self._folder) else _read_sealed(self._path(name))
+        except OSError as error:
+            say(
+                f"a compiled kernel is not used: {self._path(name)} ({error.strerror}); it is compiled again."
+            )
+            return None
 
     def write(self, name: str, record: bytes) -> None:
         """Keep a record, if that is possible."""

@@ -23,7 +23,6 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from itertools import count
-from types import FunctionType, SimpleNamespace
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -56,6 +55,7 @@ from numba.core.untyped_passes import (
 
 from magpend_core.engine.digests import lookups, reached
 from magpend_core.engine.fused import FusedLibrary, fuse_products
+from magpend_core.engine.kept import PartFolder, say
 
 _PLACEHOLDER = 0x6D61_6770_0000_0000
 """Placeholders are integers from here on; no template contains numbers of this size."""
@@ -245,9 +245,8 @@ def _arrays_by_name(text: str) -> str:
 def _check_none_left(text: str) -> None:
     left = [name for name, number in _NAMES.items() if str(number) in text]
     if left or _PLACEHOLDER_BYTES in text:
-        raise RuntimeError(
-            f"a part of an engine has {left or 'an array'} in a constant; mend `sizes_as_loads`."
-        )
+        what = ", ".join(left) or "an array"
+        raise RuntimeError(f"a part of an engine has {what} in a constant: mend `sizes_as_loads`.")
 
 
 def _load_sizes(module: ir.Module, function: ir.Function, names: Mapping[int, str]) -> None:
@@ -413,8 +412,8 @@ class PartDispatcher(CPUDispatcher):
     """
 
     def __init__(
-        self, function: FunctionType, options: Mapping[str, Any], sizes: Mapping[str, int],
-        identity: Callable[[], str | None], folder: Any,
+        self, function: Callable[..., Any], options: Mapping[str, Any], sizes: Mapping[str, int],
+        identity: Callable[[], str | None], folder: PartFolder | None,
     ) -> None:  # fmt: skip
         settings = {"nopython": True, "boundscheck": None, **options}
         super().__init__(py_func=function, targetoptions=settings, pipeline_class=PartCompiler)
@@ -471,7 +470,7 @@ _MEMORY: dict[str, bytes] = {}
 class PartCache:
     """Records of one part: its LLVM code, and which functions it calls with which types."""
 
-    def __init__(self, dispatcher: PartDispatcher, folder: Any) -> None:
+    def __init__(self, dispatcher: PartDispatcher, folder: PartFolder | None) -> None:
         self._dispatcher, self._folder = dispatcher, folder
         self.cache_path = None
 
@@ -485,7 +484,13 @@ class PartCache:
             record = self._folder.read(name)
         if record is None:
             return None
-        found = self._rebuilt(pickle.loads(record), target_context)
+        try:
+            whose, *content = pickle.loads(record)
+        except Exception as error:
+            # what is whole and cannot be read was written by another Python than it says
+            say(f"a compiled part of a kernel, {name}, cannot be used ({error!r}); it is compiled again.")
+            return None
+        found = self._rebuilt(content, target_context) if whose == name else None
         if found is not None:
             _MEMORY[name] = record
         return found
@@ -500,7 +505,7 @@ class PartCache:
         fndesc.typemap = fndesc.calltypes = None
         code = cres.library._final_module.as_bitcode()
         try:
-            record = pickle.dumps((code, fndesc, cres.signature, callees))
+            record = pickle.dumps((name, code, fndesc, cres.signature, callees))
         except Exception:  # a type that cannot be pickled
             return
         _MEMORY[name] = record
@@ -551,7 +556,5 @@ class PartCache:
         )  # fmt: skip
 
 
-class _Key(SimpleNamespace):
+class _Key:
     """Stands for a function that Python cannot call; numba finds compiled code by it."""
-
-    __hash__ = object.__hash__
