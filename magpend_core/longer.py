@@ -10,7 +10,7 @@ import numpy as np
 
 from magpend_core.engine import observers
 from magpend_core.engine.entry import integrate
-from magpend_core.engine.jit import bound_part, kernel, specialise
+from magpend_core.engine.jit import bound_part, entry
 from magpend_core.engine.observers import FIRST_TURN, RECORD, Settings, closed_period, window_of
 from magpend_core.engine.system import System
 from magpend_core.sections import Sections
@@ -97,7 +97,7 @@ def orbit_periods(
     flat = sections[:, -window:].reshape(len(sections), -1)
     rings[:, : flat.shape[1]] = flat
     found = np.zeros(len(sections), np.int16)
-    _judge_of(system)(rings, min(sections.shape[1], window), settings, found)
+    judge_of(system)(rings, min(sections.shape[1], window), settings, found)
     return found
 
 
@@ -108,12 +108,13 @@ def judge(rings: Any, last: int, settings: Settings, found: Any) -> None:
 
 
 @cache
-def _judge_of(system: System) -> Callable[..., None]:
+def judge_of(system: System) -> Callable[..., None]:
+    """Compile `judge` for the angles and scales of a system."""
     bindings: dict[str, Any] = {
         "N": system.n_states,
-        "IS_ANGLE": system.is_angle,
-        "SCALES": system.scales,
+        "IS_ANGLE": np.array(system.is_angle, np.int64),
+        "SCALES": np.array(system.scales),
     }
     for key in observers.HELPERS:
-        bindings[key] = bound_part(getattr(observers, key), system.label, bindings, True, True)
-    return kernel(specialise(judge, system.label, **bindings))
+        bindings[key] = bound_part(getattr(observers, key), bindings, True)
+    return entry(judge, system.label, bindings)

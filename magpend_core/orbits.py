@@ -225,6 +225,8 @@ def polish_orbits(
     *,
     tolerance: float = 1e-10,
     max_iterations: int = 12,
+    rtol: float = RTOL,
+    least_period: bool = True,
     system: System = PENDULUM_FITTED,
 ) -> PeriodicOrbits:
     """Find the periodic orbits near given section points.
@@ -238,11 +240,16 @@ def polish_orbits(
     points
         Guesses of one section point each, shape (n, n_states) [rad, rad/s].
     orbit_period
-        Period of each orbit in drive periods, shape (n,); a multiple of the true one is reduced.
+        Period of each orbit in drive periods, shape (n,).
     tolerance
         Scaled residual at which an orbit counts as found.
     max_iterations
         Limit on the Newton steps.
+    rtol
+        Relative and absolute tolerance of the integration, which bounds the residual that can be reached.
+    least_period
+        Whether a multiple of the true period is reduced. Not with a large `tolerance`: beside its doubling an
+        orbit would be taken for the one of half its period.
     system
         What is integrated.
 
@@ -280,7 +287,9 @@ def polish_orbits(
     )
     for period in np.unique(found.orbit_period):
         rows = np.flatnonzero(found.orbit_period == period)
-        _newton(found, rows, int(period), packed, frequency, tolerance, max_iterations, system)
+        _newton(
+            found, rows, int(period), packed, frequency, tolerance, max_iterations, rtol, least_period, system
+        )
     return found
 
 
@@ -292,11 +301,15 @@ def _newton(
     frequency: np.ndarray,
     tolerance: float,
     max_iterations: int,
+    rtol: float,
+    least_period: bool,
     system: System,
 ) -> None:
     """Iterate the orbits of one period in place."""
     for iteration in range(max_iterations + 1):
-        ends = section_map(packed[rows], frequency[rows], found.section[rows], period, system=system)
+        ends = section_map(
+            packed[rows], frequency[rows], found.section[rows], period, rtol=rtol, system=system
+        )
         images, derivatives = ends.images, ends.derivatives
         found.residual[rows] = scaled_distance(images[:, -1], found.section[rows], system)
         found.n_iterations[rows] = iteration
@@ -304,10 +317,10 @@ def _newton(
         for row, orbit, derivative, times in zip(
             rows[done], images[done], derivatives[done], ends.times[done], strict=True
         ):
-            least = _least_period(orbit, tolerance, system)
+            least = _least_period(orbit, tolerance, system) if least_period else period
             if least < period:
                 again = np.array([row])
-                _newton(found, again, least, packed, frequency, tolerance, max_iterations, system)
+                _newton(found, again, least, packed, frequency, tolerance, max_iterations, rtol, True, system)
                 continue
             multipliers = np.linalg.eigvals(derivative)
             found.orbit_period[row] = period

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
-from typing import Any
+from functools import cache, wraps
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from magpend_core.engine.checks import check_system
 from magpend_core.engine.events import event_bindings
 from magpend_core.engine.jacobians import places_of, whole_jacobian
-from magpend_core.engine.jit import bound_part, keeping, kernel, specialise
+from magpend_core.engine.jit import bound_part, entry, keeping
 from magpend_core.engine.modes import mode_bindings
 from magpend_core.engine.simd import WIDTH, load, load_rows, store_rows
 from magpend_core.engine.system import System
@@ -47,29 +47,44 @@ def _set_modes(t: float, y: Any, rows: Any, lane: int, edge_times: Any) -> None:
         rows[(NC - 1) * WIDTH + lane] = passed
 
 
-def _evaluate(t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
+class _Desk(NamedTuple):
+    """Arrays that `_evaluate` works on, each with a row for `WIDTH` lanes but the first and the last."""
+
+    c: Any  # constants
+    rows: Any  # constants and modes
+    time: Any  # s
+    y: Any  # states
+    values: Any  # of the bound function
+    edge_table: Any  # (3, n_edges), see `lanes.Work`
+
+
+def _desk_for(system: System, n_out: int) -> _Desk:
+    n_rows = system.n_constants + system.n_modes
+    return _Desk(
+        np.empty(system.n_constants), np.ones(n_rows * WIDTH), np.zeros(WIDTH),
+        np.zeros(system.n_states * WIDTH), np.zeros(n_out * WIDTH), np.zeros((3, max(system.n_edges, 1))),
+    )  # fmt: skip
+
+
+def _evaluate(desk: _Desk, t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
     """Fill `out` (n, n_out) with the bound function at `t` (n,) and `states` (n, N)."""
-    c = np.empty(N_OWN)
+    c, rows, time, y, values, edge_table = desk
     constants(frequency, p, c)
-    rows = np.ones(NC * WIDTH)
     for i in range(N_OWN):
         for lane in range(WIDTH):
             rows[i * WIDTH + lane] = c[i]
-    time = np.zeros(WIDTH)
-    y = np.zeros(N * WIDTH)
-    values = np.zeros(out.shape[1] * WIDTH)
-    n, edge_table = len(t), np.zeros((3, max(NE, 1)))
+    n = len(t)
     edges(frequency, p, edge_table[0], edge_table[1], edge_table[2])
     for first in range(0, n, WIDTH):
         for lane in range(WIDTH):
-            source = min(first + lane, n - 1)
+            source = first + lane if first + lane < n else n - 1
             time[lane] = t[source]
             for i in range(N):
                 y[i * WIDTH + lane] = states[source, i]
             if HAS_MODES:
                 _set_modes(time[lane], y, rows, lane, edge_table[0])
         store_rows(values, 0, quantity(load(time, 0), load_rows(y, 0, N), load_rows(rows, 0, NC)))
-        for lane in range(min(WIDTH, n - first)):
+        for lane in range(WIDTH if n - first > WIDTH else n - first):
             for i in range(out.shape[1]):
                 out[first + lane, i] = values[i * WIDTH + lane]
 
@@ -99,9 +114,15 @@ def _evaluator(system: System, kind: str) -> Any:
         "quantities": system.quantities,
     }
     label = f"{system.label}_{kind}"
-    bindings["_set_modes"] = bound_part(_set_modes, label, bindings, True)
-    bindings["quantity"] = bound_part(_KINDS[kind], label, bindings, True)
-    return kernel(specialise(_evaluate, label, **bindings), keeping(*system.functions))
+    bindings["_set_modes"] = bound_part(_set_modes, bindings, True)
+    bindings["quantity"] = bound_part(_KINDS[kind], bindings, True)
+    compiled = entry(_evaluate, label, bindings, keeping(*system.functions))
+
+    @wraps(compiled)
+    def evaluator(t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
+        compiled(_desk_for(system, out.shape[1]), t, states, frequency, p, out)
+
+    return evaluator
 
 
 def _at(kind: str, n_out: int, t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:

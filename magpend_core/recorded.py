@@ -8,19 +8,16 @@ run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import cache
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from magpend_core.engine.driven import LEVEL, with_recorded_drive
 from magpend_core.engine.entry import N_LANES, check_quantities, integrate
-from magpend_core.engine.jit import keeping, kernel, specialise
-from magpend_core.engine.lanes import Cells, engine_bindings
+from magpend_core.engine.lanes import Cells
 from magpend_core.engine.observers import FIRST_TURN, RECORD, Settings
 from magpend_core.engine.system import System
+from magpend_core.longer import judge_of
 from magpend_core.models.parameters import Parameters
 from magpend_core.pointwise import evaluate_packed
 from magpend_core.sampling import Drive, sample
@@ -225,18 +222,6 @@ class _Walk:
         )
 
 
-def _judge(sections: Any, settings: Any, out: Any) -> None:
-    """Fill `out` (cell,) with the periods at which the sections (cell, section * state) close."""
-    for i in range(len(sections)):
-        out[i] = closed_period(sections[i], settings.window, settings)
-
-
-@cache
-def _judge_of(system: System) -> Callable[..., None]:
-    bindings = engine_bindings(replace(system, method="dopri5"), RECORD)
-    return kernel(specialise(_judge, f"{system.label}_judge", **bindings), keeping(*system.functions))
-
-
 def closed_periods(sections: np.ndarray, settings: Settings, system: System) -> np.ndarray:
     """Period at which each row of sections closes, 0 where it does not; see `observers.closed_period`.
 
@@ -251,7 +236,7 @@ def closed_periods(sections: np.ndarray, settings: Settings, system: System) -> 
     """
     out = np.zeros(len(sections), np.int64)
     flat = np.ascontiguousarray(sections.reshape(len(sections), -1))
-    _judge_of(system.recorded_for or system)(flat, settings, out)
+    judge_of(system.recorded_for or system)(flat, settings.window, settings, out)
     return out
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
-from typing import Any
+from functools import cache, wraps
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from magpend_core.engine.checks import check_system
 from magpend_core.engine.entry import check_tolerances, slack_of
-from magpend_core.engine.jit import OPTIONS, keeping, kernel, specialise
+from magpend_core.engine.jit import bound_part, entry, keeping
 from magpend_core.engine.lanes import (
     CROSSED,
     DIVERGED,
@@ -25,6 +24,7 @@ from magpend_core.engine.lanes import (
     UNDERFLOW,
     ZERO,
     engine_bindings,
+    rows_of,
 )
 from magpend_core.engine.modes import CHATTERED
 from magpend_core.engine.observers import RECORD
@@ -40,16 +40,40 @@ MOST_PERIODS = 1e7
 """Drive periods that a trajectory may take, since it cannot be interrupted: some minutes."""
 
 
-def prepare(frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any) -> Any:
-    """Return the rows of one group: the trajectory in lane 0, copies that stand still beside it."""
-    w = np.zeros(ROWS.size)
+class Desk(NamedTuple):
+    """Arrays that `follow` works on."""
+
+    rows: Any  # float64, of one group
+    scratch: Any  # float64, for constants
+    section: Any  # float64 (n_states,)
+    edge_table: Any  # float64 (3, n_edges), see `lanes.Work`
+    y0: Any  # float64 (n_states,): states before an attempt
+    k0: Any  # float64 (n_states,): their slopes
+    events: Any  # int64 (1,)
+    n_watching: Any  # int64 (1,)
+    turns: Any  # int64 (n_states,)
+
+
+def desk_for(system: System) -> Desk:
+    """Allocate the arrays of one trajectory."""
+    n = system.n_states
+    return Desk(
+        np.zeros(rows_of(system).size), np.zeros(max(system.n_constants + system.n_modes, n)), np.zeros(n),
+        np.zeros((3, max(system.n_edges, 1))), np.zeros(n), np.zeros(n), np.zeros(1, np.int64),
+        np.zeros(1, np.int64), np.zeros(n, np.int64),
+    )  # fmt: skip
+
+
+def prepare(
+    w: Any, frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any
+) -> None:
+    """Fill the rows of one group: the trajectory in lane 0, copies that stand still beside it."""
     for lane in range(WIDTH):
         load_cell(w, 0, lane, frequency, p, slack, scratch, edge_table)
         for i in range(N):
             w[ROWS.state + i * WIDTH + lane] = state[i]
         w[ROWS.fresh + lane] = 1.0
         w[ROWS.wish + lane] = FIRST_STEP * w[ROWS.period + lane]
-    return w
 
 
 def fill(
@@ -72,15 +96,13 @@ def fill(
 
 
 def follow(
-    frequency: float, p: Any, state: Any, times: Any, rtol: float, atol: float, slack: float,
+    desk: Desk, frequency: float, p: Any, state: Any, times: Any, rtol: float, atol: float, slack: float,
     max_attempts: float, out: Any,
 ) -> int:  # fmt: skip
     """Fill `out` (len(times), N) at rising `times`; return 0, or the status of a failure."""
-    scratch, section = np.zeros(NC), np.zeros(N)
-    edge_table = np.zeros((3, max(NE, 1)))
-    w = prepare(frequency, p, state, slack, scratch, edge_table)
-    y0, k0, events, n_watching = np.zeros(N), np.zeros(N), np.zeros(1, np.bool_), np.zeros(1, np.int64)
-    turns = np.zeros(N, np.int64)
+    w, section, edge_table, turns = desk.rows, desk.section, desk.edge_table, desk.turns
+    y0, k0, events, n_watching = desk.y0, desk.k0, desk.events, desk.n_watching
+    prepare(w, frequency, p, state, slack, desk.scratch, edge_table)
     edge = begin_period(w, 0, 0, edge_table)
     if not take_section(w, 0, 0, section, turns):
         return DIVERGED
@@ -118,10 +140,18 @@ def follow(
 
 @cache
 def _follower(system: System) -> Callable[..., int]:
-    bindings = engine_bindings(replace(system, method="dopri5"), RECORD)
+    system = replace(system, method="dopri5")
+    bindings = engine_bindings(system, RECORD)
     for template in (prepare, fill):
-        bindings[template.__name__] = njit(**OPTIONS)(specialise(template, system.label, **bindings))
-    return kernel(specialise(follow, system.label, **bindings), keeping(*system.functions))
+        bindings[template.__name__] = bound_part(template, bindings, False)
+    compiled = entry(follow, system.label, bindings, keeping(*system.functions))
+
+    @wraps(compiled)
+    def follower(*arguments: Any) -> int:
+        code: int = compiled(desk_for(system), *arguments)
+        return code
+
+    return follower
 
 
 def trajectory(

@@ -30,7 +30,7 @@ def code_length(function: Callable[..., Any]) -> int:
     if source is None:
         return 0
     total = len(source.__code__.co_code)
-    for path in _lookups(source.__code__):
+    for path in lookups(source.__code__):
         if path[0] in source.__globals__:
             total += code_length(_found(source.__globals__[path[0]], path[1:]))
     return total
@@ -124,12 +124,17 @@ def _function(function: FunctionType, seen: dict[int, int]) -> Iterator[bytes]:
     yield from _parts(tuple(sorted((function.__kwdefaults__ or {}).items())), seen)
     for cell in function.__closure__ or ():
         yield from _parts(cell.cell_contents, seen)
-    for path in _lookups(function.__code__):
+    for path in lookups(function.__code__):
         yield ".".join(path).encode()
         if path[0] in function.__globals__:
             yield from _parts(_found(function.__globals__[path[0]], path[1:]), seen)
         elif not hasattr(builtins, path[0]):
             raise _UnknownError
+
+
+def reached(function: Any, path: tuple[str, ...]) -> Any:
+    """Return the global value that a function finds at a path (see `lookups`), None if there is none."""
+    return _found(function.__globals__.get(path[0]), path[1:])
 
 
 def _found(value: Any, attributes: tuple[str, ...]) -> Any:
@@ -139,6 +144,15 @@ def _found(value: Any, attributes: tuple[str, ...]) -> Any:
             break
         value = getattr(value, name, None)
     return value
+
+
+def code_digest(code: CodeType) -> str:
+    """Return a digest of bytecode and its constants, without anything that it looks up."""
+    digest = hashlib.sha256(sys.version.encode())
+    for part in _code(code, {}):
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()
 
 
 def _code(code: CodeType, seen: dict[int, int]) -> Iterator[bytes]:
@@ -155,7 +169,7 @@ def _code(code: CodeType, seen: dict[int, int]) -> Iterator[bytes]:
             yield from _parts(constant, seen)
 
 
-def _lookups(code: CodeType) -> list[tuple[str, ...]]:
+def lookups(code: CodeType) -> list[tuple[str, ...]]:
     """Globals that a function and those defined in it look up, with the attributes read of each."""
     found: set[tuple[str, ...]] = set()
     path: tuple[str, ...] = ()
@@ -167,5 +181,5 @@ def _lookups(code: CodeType) -> list[tuple[str, ...]]:
         path = (instruction.argval,) if instruction.opname in _GLOBALS else ()
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            found.update(_lookups(constant))
+            found.update(lookups(constant))
     return sorted(found - {()})

@@ -23,6 +23,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from magpend_core.engine.jit import inline
 from magpend_core.engine.simd import (
     WIDTH,
@@ -116,10 +118,9 @@ def event_bindings(system: System) -> dict[str, Any]:
         "N_EVENTS": system.n_events,
         "N_SWITCHES": system.n_switches,
         "N_IMPACTS": system.n_impacts,
-        # one more entry, because numba has no numbers in an empty tuple
-        "DIRECTIONS": (*directions, 0.0),
-        "STARTS": (*starts, 0.0),
-        "SAME_VALUE": (*same, 0.0),
+        "DIRECTIONS": np.array(directions),
+        "STARTS": np.array(starts),
+        "SAME_VALUE": np.array(same),
         "event_values": _events_of(system),
         "middle_of": _middle_of(system.known),
         "HAS_SURFACES": system.n_switches + system.n_impacts > 0,
@@ -291,8 +292,9 @@ def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
     length = where_less(0.5, takes, h, load(w, base + ROWS.ahead) - h)
     on = maximum(takes, where_less(0.0, length, goes_on, 0.0))
     if not any_nonzero(on):
-        for row in (ROWS.resolution, ROWS.ahead, ROWS.aimed):
-            store(w, base + row, 0.0 * h)
+        store(w, base + ROWS.resolution, 0.0 * h)
+        store(w, base + ROWS.ahead, 0.0 * h)
+        store(w, base + ROWS.aimed, 0.0 * h)
         return
     nearest = length
     for k in range(2 * N_EVENTS):

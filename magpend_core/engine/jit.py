@@ -35,22 +35,28 @@ import numpy as np
 from numba import njit
 from numba.core import event
 
-from magpend_core.engine.digests import PACKAGE, functions_digest
-from magpend_core.engine.kept import keep
-from magpend_core.engine.parts import FusingCompiler, PartCompiler, RawCompiler
+from magpend_core.engine.digests import PACKAGE, code_digest, functions_digest
+from magpend_core.engine.kept import PartFolder, keep
+from magpend_core.engine.parts import EntryCompiler, PartDispatcher, placeholder, placeholder_of_array
 
 # No fast math: which products are fused is said by `fused`, and wider flags would turn isnan(nan) into
 # False. The default error model would add a branch to every division.
 F = TypeVar("F", bound=Callable[..., Any])
 
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "pipeline_class": FusingCompiler}
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "pipeline_class": EntryCompiler}
 
 # A function that allocates nothing needs no reference counts, and each is an atomic operation: passing
-# a tuple of a dozen arrays to a callee costs a microsecond.
-UNCOUNTED: dict[str, Any] = {**OPTIONS, "_nrt": False}
+# a tuple of a dozen arrays to a callee costs a microsecond. Parts have no wrappers for Python and C: those
+# take half of the time to compile.
+_OF_PARTS: dict[str, Any] = {
+    "nogil": True, "error_model": "numpy", "_nrt": False,
+    "no_cfunc_wrapper": True, "no_cpython_wrapper": True,
+}  # fmt: skip
 
-# A door for C is made for every function that has none forbidden, though nothing here is called through one.
+# numba makes a wrapper for C of every function that has none forbidden, though nothing here is called from C.
 WITHOUT_C: dict[str, Any] = {"no_cfunc_wrapper": True}
+
+_SETTINGS: Any = numba.config
 
 _PACKAGE = Path(__file__).parents[1]
 
@@ -81,29 +87,20 @@ def _cache_folder() -> Path | None:
 CACHE_FOLDER = _cache_folder()
 
 
+PARTS = PartFolder(CACHE_FOLDER) if CACHE_FOLDER is not None else None
+"""Where the code of parts is kept."""
+
+
 def inline(function: F) -> F:
     """Compile a helper of the hot path, which allocates nothing; it dissolves into its caller."""
-    return njit(forceinline=True, **UNCOUNTED, **WITHOUT_C)(function)
+    if _SETTINGS.DISABLE_JIT:
+        return function
 
+    def identity() -> str | None:
+        return functions_digest(dispatcher)
 
-def part(function: F, dissolves: bool, short: bool = False) -> F:
-    """Compile a part of an engine, which only compiled functions may call.
-
-    It has neither a door for Python nor machine code of its own, which take half of the time to compile: a
-    call from Python would end the process.
-
-    Parameters
-    ----------
-    function
-        It allocates nothing.
-    dissolves
-        Whether it becomes a part of its callers.
-    short
-        Whether the engine is small enough to be optimised as a whole.
-    """
-    compiler = RawCompiler if short else PartCompiler
-    options = {**UNCOUNTED, **WITHOUT_C, "no_cpython_wrapper": True, "pipeline_class": compiler}
-    return njit(forceinline=dissolves, **options)(function)
+    dispatcher: Any = PartDispatcher(function, {**_OF_PARTS, "forceinline": True}, {}, identity, PARTS)
+    return dispatcher
 
 
 class _Uncollected(event.Listener):
@@ -136,36 +133,92 @@ event.register("numba:compiler_lock", _Uncollected())
 _PARTS: dict[Any, tuple[Any, Any]] = {}
 """Parts by what they are made of, each with what must live as long: identities are in its key."""
 
+_SIZES = frozenset(
+    ("N", "N_KNOWN", "N_CONTROLLED", "N_OWN", "NC", "NE", "N_WATCHED", "N_EVENTS", "N_SWITCHES", "N_IMPACTS",
+     "N_ENTRIES", "N_VECTORS", "SECTION_OF")
+)  # fmt: skip
+"""Free names that stand for sizes of a system: a part is compiled once for all values above 0."""
 
-def bound_part(
-    template: Callable[..., Any], name: str, bindings: Mapping[str, Any], dissolves: bool,
-    short: bool = False,
-) -> Any:  # fmt: skip
+_ARRAYS = frozenset(("IS_ANGLE", "SCALES", "ESCAPE", "DIRECTIONS", "STARTS", "SAME_VALUE"))
+"""Free names that stand for arrays with an entry for each state or event: likewise."""
+
+
+def bound_part(template: Callable[..., Any], bindings: Mapping[str, Any], dissolves: bool) -> Any:
     """Bind a template and compile it as a part; a part of the same template and values is the same one.
-
-    Half of what an engine is made of knows no equations: where two engines agree in what a part uses, it is
-    compiled once for both.
 
     Parameters
     ----------
     template
-        A plain function; its free names in `bindings` are bound, the others are its module's.
-    name
-        Of the engine: one name, one content, also of what other processes have kept. Their machine code and
-        that of this process are linked by names, so that two parts of one name would be taken for each other.
+        A plain function; its free names in `bindings` are bound, the others are its module's. It allocates
+        nothing.
     bindings
         More than it uses may be in there.
-    dissolves, short
-        See `part`.
+    dissolves
+        Whether it becomes a part of its callers.
+
+    Returns
+    -------
+    PartDispatcher
+        What only compiled functions may call; the plain function where numba is switched off.
     """
     names = _names_in(template.__code__)
     used = {name: bindings[name] for name in sorted(names) if name in bindings}
     values = tuple((name, _identity(value, names)) for name, value in used.items())
-    key = template.__code__, id(template.__globals__), dissolves, short, values
+    key = template.__code__, id(template.__globals__), dissolves, values
     if key not in _PARTS:
-        function = specialise(template, name, **used)
-        _PARTS[key] = part(function, dissolves, short), (template, used)
+        _PARTS[key] = _part(template, used, dissolves, names), (template, used)
     return _PARTS[key][0]
+
+
+def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool, names: set[str]) -> Any:
+    if _SETTINGS.DISABLE_JIT:
+        return specialise(template, "part", **used)
+    sizes: dict[str, Any] = {}
+    # how many rows are loaded at once is a type, so that these templates are compiled for each size
+    general = (
+        used if "load_rows" in names else {k: _without_size(k, v, names, sizes) for k, v in used.items()}
+    )
+    digest = _template_digest(template, general, dissolves, names)
+    function = specialise(template, digest[:16] if digest else "unkept", **general)
+    options = {**_OF_PARTS, "forceinline": dissolves}
+    return PartDispatcher(function, options, sizes, lambda: digest, PARTS)
+
+
+def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any]) -> Any:
+    """Return a placeholder for a size, and note the size."""
+    if type(value) is int and value > 0 and name in _SIZES:
+        sizes[name] = value
+        return placeholder(name)
+    if name in _ARRAYS and isinstance(value, np.ndarray):
+        sizes[name] = value
+        return placeholder_of_array(name, value)
+    if name == "ROWS":
+        # of the fields only those that are used: systems that agree in them share the part
+        fields = [field for field in value._fields if field in names]
+        sizes |= {f"{name}.{field}": getattr(value, field) for field in fields}
+        return value._replace(**{field: placeholder(f"{name}.{field}") for field in fields})
+    return value
+
+
+def _template_digest(
+    template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool, names: set[str]
+) -> str | None:
+    """Digest of what decides the code of a part; None for a template from outside the package.
+
+    Compiled functions count as where they are found: they are linked, whatever they are.
+    """
+    if template.__module__.partition(".")[0] != PACKAGE:
+        return None
+    first: dict[int, str] = {}
+    rows = [template.__module__, template.__qualname__, code_digest(template.__code__), repr(dissolves)]
+    for name, value in used.items():
+        if hasattr(value, "py_func"):
+            rows.append(f"{name} calls {first.setdefault(id(value), name)}")
+        else:
+            rows.append(f"{name} {_identity(value, names)!r}")
+    if any(" at 0x" in row for row in rows):
+        return None
+    return hashlib.sha256("\n".join(rows).encode()).hexdigest()
 
 
 def _names_in(code: CodeType) -> set[str]:
@@ -209,8 +262,37 @@ def keeping(*functions: Callable[..., Any]) -> str | None:
     return "" if is_covered(*functions) else functions_digest(*functions)
 
 
+def entry(
+    template: Callable[..., Any], name: str, bindings: Mapping[str, Any], kept: str | None = ""
+) -> Callable[..., Any]:
+    """Bind a template and compile it as what Python calls; its machine code is kept.
+
+    The template becomes a part. What Python calls is one line around it, since numba takes long over code
+    that is reached from Python.
+
+    Parameters
+    ----------
+    template
+        A plain function that allocates nothing; its free names in `bindings` are bound.
+    name
+        Of the system and what is done with it: one name, one content.
+    bindings
+        More than the template uses may be in there.
+    kept
+        See `keeping`; by default the folder that `source_digest` names.
+    """
+    code = template.__code__
+    arguments = ", ".join(code.co_varnames[: code.co_argcount])
+    text = f"def {template.__name__}({arguments}):\n    return _part({arguments})\n"
+    scope: dict[str, Any] = {"__name__": template.__module__}
+    exec(compile(text, code.co_filename, "exec"), scope)
+    return kernel(
+        specialise(scope[template.__name__], name, _part=bound_part(template, bindings, False)), kept
+    )
+
+
 def kernel(function: F, kept: str | None = "") -> F:
-    """Compile an entry point and keep its machine code in the digest-named cache folder.
+    """Compile a function that Python calls and keep its machine code in the digest-named cache folder.
 
     Pass what `keeping` says of the functions that it calls if some may be from outside the package.
     """

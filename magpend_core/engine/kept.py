@@ -151,10 +151,68 @@ class KeptCode(FunctionCache):
         try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except OSError as error:
+            _say_not_kept(self._cache_path, error)
+
+
+class PartFolder:
+    """Records of an engine's parts, each a sealed file; see `parts`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._home, self._folder = folder.parent, folder / "parts"
+
+    def read(self, name: str) -> bytes | None:
+        """Return a record, None if there is none that can be used."""
+        try:
+            return None if _made(self._home, self._folder) else _read_sealed(self._path(name))
+        except OSError as error:
             say(
-                f"compiled kernels cannot be kept in {self._cache_path} ({error.strerror or error}); make "
-                "room there, or set MAGPEND_CACHE_DIR to another folder."
+                f"a compiled kernel is not used: {self._path(name)} ({error.strerror}); it is compiled again."
             )
+            return None
+
+    def write(self, name: str, record: bytes) -> None:
+        """Keep a record, if that is possible."""
+        if _made(self._home, self._folder):
+            return
+        path = self._path(name)
+        own = f"{path}.{os.getpid()}.{threading.get_ident()}"
+        try:
+            with open(own, "wb", opener=_for_the_owner) as file:
+                file.write(_DIGEST(record).digest())
+                file.write(record)
+            os.replace(own, path)
+        except OSError as error:
+            _say_not_kept(str(self._folder), error)
+
+    def _path(self, name: str) -> str:
+        return os.path.join(self._folder, f"{name}.part")
+
+
+def _for_the_owner(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
+
+
+def _read_sealed(path: str) -> bytes | None:
+    """Return the content of a file that is whole and nobody else's; None, and say why, if it is not."""
+    try:
+        with open(path, "rb") as file:
+            problem = _exposed(os.fstat(file.fileno()))
+            sealed = b"" if problem else file.read()
+    except FileNotFoundError:
+        return None
+    content = sealed[_LENGTH:]
+    # the digest of nothing does not begin an empty file
+    if not problem and _DIGEST(content).digest() == sealed[:_LENGTH]:
+        return content
+    say(f"a compiled kernel is not used: {path} {problem or 'is damaged'}; it is compiled again.")
+    return None
+
+
+def _say_not_kept(folder: str, error: OSError) -> None:
+    say(
+        f"compiled kernels cannot be kept in {folder} ({error.strerror or error}); make room there, or set "
+        "MAGPEND_CACHE_DIR to another folder."
+    )
 
 
 class _Entries(IndexDataCacheFile):
@@ -162,19 +220,13 @@ class _Entries(IndexDataCacheFile):
 
     def load(self, key: Any) -> Any:
         path = self._path(key)
-        try:
-            with open(path, "rb") as file:
-                problem = _exposed(os.fstat(file.fileno()))
-                sealed = b"" if problem else file.read()
-        except FileNotFoundError:
+        content = _read_sealed(path)
+        if content is None:
             return None
-        content = memoryview(sealed)[_LENGTH:]
-        if not problem and _DIGEST(content).digest() == sealed[:_LENGTH]:
-            # the digest of nothing does not begin an empty file
-            name, stamp, kept = pickle.loads(content)
-            if (name, stamp) == (key, self._source_stamp):
-                return kept
-        say(f"a compiled kernel is not used: {path} {problem or 'is damaged'}; it is compiled again.")
+        name, stamp, kept = pickle.loads(content)
+        if (name, stamp) == (key, self._source_stamp):
+            return kept
+        say(f"a compiled kernel is not used: {path} is damaged; it is compiled again.")
         return None
 
     def save(self, key: Any, data: Any) -> None:

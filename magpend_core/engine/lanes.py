@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, wraps
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from magpend_core.engine import observers
 from magpend_core.engine import tangents as tangent_templates
 from magpend_core.engine.digests import code_length
 from magpend_core.engine.events import LANDED, TAKE_BACK, event_bindings
-from magpend_core.engine.jit import bound_part, inline, keeping, kernel, specialise
+from magpend_core.engine.jit import bound_part, entry, inline, keeping
 from magpend_core.engine.modes import CHATTERED, mode_bindings
 from magpend_core.engine.observers import Observer
 from magpend_core.engine.simd import (
@@ -168,34 +168,11 @@ def choose_step(w: Any, base: int, slack: float) -> None:
     fade are not felt from further away than `FADED`: a step may lead to there, or to a tenth of D. A step
     ends on the segment's end exactly, and the last two steps before that share the rest.
     """
-    y = load_rows(w, base + ROWS.state, N_KNOWN)
-    dy = load_rows(w, base + ROWS.slopes, N_KNOWN)
-    c = load_rows(w, base + ROWS.constants, NC)
     t = load(w, base + ROWS.time)
     remaining = load(w, base + ROWS.target) - t
     h = load(w, base + ROWS.wish)
-    if HAS_LAYERS:  # numba cannot loop over an empty tuple
-        # the least quotient, kept as one until the end: one division for all layers
-        speed_h = 1.0 + 0.0 * h
-        for value, rate, half_width, per_strength in layers_at(t, y, dy, c):
-            speed = absolute(rate)
-            ratio = step_ratio(slack * speed * per_strength)
-            distance = absolute(value)
-            nearing = value * rate
-            # the two bounds of the docstring over one common division
-            towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
-            away = ratio * hypot_rough(distance, half_width)
-            if LAYERS_FADE:
-                reach = half_width * maximum(FADED - 1.32 * log2_rough(ratio), 1.0)
-                nearer = (1.0 + ratio) * minimum(distance - reach, 0.9 * distance)
-                towards = maximum(towards, nearer)
-                away = where_less(reach, distance, 1e100, away)
-            length = where_less(nearing, 0.0, towards, away)
-            speed = speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)
-            mine, other = length * speed_h, h * speed
-            h = where_less(mine, other, length, h)
-            speed_h = where_less(mine, other, speed, speed_h)
-        h = h / speed_h
+    if HAS_LAYERS:
+        h = limited_by_layers(w, base, slack, t, h)
     if NE > 0:
         passed = t - load(w, base + ROWS.start)
         away = hypot_rough(passed, load(w, base + ROWS.start_width))
@@ -209,6 +186,34 @@ def choose_step(w: Any, base: int, slack: float) -> None:
         h = where_less(0.0, aimed, aimed, h)
     h = where_less(0.5, load(w, base + ROWS.fresh), 0.0, h)
     store(w, base + ROWS.step, h)
+
+
+def limited_by_layers(w: Any, base: int, slack: float, t: Any, h: Any) -> Any:
+    """Return the step `h`, or the longest one that the nearest layer allows."""
+    y = load_rows(w, base + ROWS.state, N_KNOWN)
+    dy = load_rows(w, base + ROWS.slopes, N_KNOWN)
+    c = load_rows(w, base + ROWS.constants, NC)
+    # the least quotient, kept as one until the end: one division for all layers
+    speed_h = 1.0 + 0.0 * h
+    for value, rate, half_width, per_strength in layers_at(t, y, dy, c):
+        speed = absolute(rate)
+        ratio = step_ratio(slack * speed * per_strength)
+        distance = absolute(value)
+        nearing = value * rate
+        # the two bounds of the docstring over one common division
+        towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
+        away = ratio * hypot_rough(distance, half_width)
+        if LAYERS_FADE:
+            reach = half_width * maximum(FADED - 1.32 * log2_rough(ratio), 1.0)
+            nearer = (1.0 + ratio) * minimum(distance - reach, 0.9 * distance)
+            towards = maximum(towards, nearer)
+            away = where_less(reach, distance, 1e100, away)
+        length = where_less(nearing, 0.0, towards, away)
+        speed = speed * where_less(nearing, 0.0, 1.0 + ratio, 1.0)
+        mine, other = length * speed_h, h * speed
+        h = where_less(mine, other, length, h)
+        speed_h = where_less(mine, other, speed, speed_h)
+    return h / speed_h
 
 
 def run_stage(w: Any, base: int, s: int) -> None:
@@ -480,7 +485,7 @@ def take_section(w: Any, base: int, lane: int, section: Any, turns: Any) -> bool
     for i in range(N):
         at = base + ROWS.state + i * WIDTH + lane
         x = w[at]
-        if good and IS_ANGLE[i] and not (-math.pi < x <= math.pi):
+        if good and IS_ANGLE[i] == 1 and not (-math.pi < x <= math.pi):
             n = math.ceil((x - math.pi) / TWO_PI)
             x -= n * TWO_PI
             # rounding can leave x on the wrong side of the cut
@@ -524,6 +529,9 @@ class Work(NamedTuple):
     memory: Any  # float64 (lanes, n_memory), the observer's own
     watching: Any  # int64, 1 in a period whose extremes are wanted
     n_watching: Any  # int64 per group: sum of the above
+    events: Any  # int64 per group: whether one of its lanes has an event
+    scratch: Any  # float64, for constants and for states
+    section: Any  # float64 (n_states,)
 
 
 class Cells(NamedTuple):
@@ -696,36 +704,50 @@ def keep_time(w: Any, base: int, lane: int, memory: Any, out: Any) -> None:
         out[n_kept(memory)] = time
 
 
-def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: float, settings: Any) -> None:
-    """Integrate all branches, `n_lanes` at a time, and fill the output arrays of `cells`."""
-    n_branches = cells.frequency.shape[0]
-    active = min(n_lanes, n_branches)
-    n_groups = (active + WIDTH - 1) // WIDTH
+def work_for(system: System, observer: Observer, cells: Cells, n_lanes: int, settings: Any) -> Work:
+    """Allocate the bookkeeping of so many lanes."""
+    n_groups = -(-min(n_lanes, len(cells.frequency)) // WIDTH)
     size = n_groups * WIDTH
-    n_memory, n_edges = memory_size(settings, N) + HAS_SECTION, max(NE, 1)
-    # each kind of array that numba makes takes a twentieth of a second to compile: all are made flat
-    work = Work(
-        np.zeros(n_groups * ROWS.size), np.zeros(size, np.int64), np.zeros(size, np.int64),
-        np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size * N, np.int64).reshape((size, N)),
-        np.zeros(size * 3 * n_edges).reshape((size, 3, n_edges)),
-        np.zeros(size * n_memory).reshape((size, n_memory)),
-        np.zeros(size, np.int64), np.zeros(n_groups, np.int64),
-    )  # fmt: skip
-    scratch = np.zeros(max(NC, N))
-    section = np.zeros(N)
-    for lane in range(size):
-        # lanes beyond the last branch repeat it, so that they hold ordinary numbers; no one looks
-        start_branch(cells, work, lane, min(lane, n_branches - 1), settings, scratch)
-    next_branch = active
+    memory_size = getattr(observer.memory_size, "py_func", observer.memory_size)
+    n_memory = memory_size(settings, system.n_states) + (system.section is not None)
+    rows = rows_of(system, cells.watched.shape[-2])
+    return Work(
+        lanes=np.zeros(n_groups * rows.size),
+        branch=np.zeros(size, np.int64),
+        point=np.zeros(size, np.int64),
+        edge=np.zeros(size, np.int64),
+        i_period=np.zeros(size, np.int64),
+        turns=np.zeros((size, system.n_states), np.int64),
+        edge_table=np.zeros((size, 3, max(system.n_edges, 1))),
+        memory=np.zeros((size, n_memory)),
+        watching=np.zeros(size, np.int64),
+        n_watching=np.zeros(n_groups, np.int64),
+        events=np.zeros(n_groups, np.int64),
+        scratch=np.zeros(max(system.n_constants + system.n_modes, system.n_states)),
+        section=np.zeros(system.n_states),
+    )
+
+
+def advance(
+    cells: Cells, work: Work, active: int, rtol: float, atol: float, max_attempts: float, settings: Any
+) -> None:
+    """Integrate all branches, `active` at a time, and fill the output arrays of `cells`."""
+    n_branches = cells.frequency.shape[0]
     # a field of a tuple is counted by an atomic operation at every use: too slow per lane
-    rows, events = work.lanes, np.zeros(n_groups, np.int64)
+    rows, events, scratch, section = work.lanes, work.events, work.scratch, work.section
+    for lane in range(len(work.branch)):
+        # lanes beyond the last branch repeat it, so that they hold ordinary numbers; no one looks
+        branch = lane if lane < n_branches else n_branches - 1
+        start_branch(cells, work, lane, branch, settings, scratch)
+    next_branch = active
     while active > 0:
         in_use = (active + WIDTH - 1) // WIDTH
         attempt(rows, events, work.n_watching, in_use, cells.slack, rtol, atol, max_attempts)
         for group in range(in_use):
             if events[group] == 0:
                 continue
-            lane, last = group * WIDTH, min(group * WIDTH + WIDTH, active)
+            lane, last = group * WIDTH, group * WIDTH + WIDTH
+            last = last if last < active else active
             while lane < last:
                 event = rows[group * ROWS.size + ROWS.event + lane % WIDTH]
                 if event == NOTHING or not serve(cells, work, lane, settings, section, scratch):
@@ -738,7 +760,7 @@ def advance(cells: Cells, n_lanes: int, rtol: float, atol: float, max_attempts: 
                     # the last lane moves here, with its event if it has one
                     active -= 1
                     copy_lane(work, active, lane)
-                    last = min(last, active)
+                    last = last if last < active else active
 
 
 def copy_lane(work: Work, source: int, target: int) -> None:
@@ -766,7 +788,7 @@ _INLINE = (
     "evaluate_watched", "update_extremes", "keep_extremes", "set_watching", "begin_watch", "keep_time",
 )  # fmt: skip
 _CALLED = (
-    "choose_step", "run_stage", "run_stages", "finish_step", "attempt",
+    "limited_by_layers", "choose_step", "run_stage", "run_stages", "finish_step", "attempt",
     "forget", "end_cell", "end_branch", "start_point", "start_branch", "serve", "copy_lane",
 )  # fmt: skip
 
@@ -785,7 +807,6 @@ def _layers_at(system: System) -> Callable[..., Any]:
 
 def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> dict[str, Any]:
     """Names that the templates of this module use, bound to a system and an observer."""
-    name = _name(system, observer, watched)
     bindings: dict[str, Any] = {
         "ROWS": rows_of(system, len(watched)),
         "WATCHES": len(watched) > 0,
@@ -810,12 +831,9 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "LAYERS_FADE": system.layers_fade,
         "REWRITES": observer.rewrites,
         "RENEW_BELOW": observer.renew_below,
-        "IS_ANGLE": system.is_angle,
-        "SCALES": system.scales,
-        "ESCAPE": tuple(
-            min(bound, FARTHEST) if angle else bound
-            for bound, angle in zip(system.escape, system.is_angle, strict=True)
-        ),
+        "IS_ANGLE": np.array(system.is_angle, np.int64),
+        "SCALES": np.array(system.scales),
+        "ESCAPE": np.where(system.is_angle, np.minimum(system.escape, FARTHEST), system.escape),
         "constants": system.constants,
         "edges": system.edges,
         "forcing": system.forcing,
@@ -825,15 +843,12 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         **observer.bindings,
         **tangent_bindings(system),
     }
-    if bindings["CARRIES"]:
-        # a tuple's entry is found by a branch for each, an array's by its place
-        bindings |= {key: np.array(bindings[key]) for key in ("IS_ANGLE", "SCALES", "ESCAPE")}
     lengths = code_length(system.rhs) + code_length(system.forcing)
     short = lengths <= UNROLLED_LENGTH and not bindings["CARRIES"]
     for key in observers.HELPERS:
-        bindings[key] = bound_part(getattr(observers, key), name, bindings, True, short)
-    bindings["observe"] = bound_part(observer.observe, name, bindings, True, short)
-    bindings["renew"] = bound_part(observer.renew, name, bindings, True, short)
+        bindings[key] = bound_part(getattr(observers, key), bindings, True)
+    bindings["observe"] = bound_part(observer.observe, bindings, True)
+    bindings["renew"] = bound_part(observer.renew, bindings, True)
     templates: dict[str, Any] = {}
     for module in (event_templates, mode_templates):
         templates |= {key: getattr(module, key) for key in (*module.INLINE, *module.CALLED)}
@@ -848,7 +863,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         templates["squared_error"] = squared_error_of_two
     dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *tangent_templates.INLINE, *_INLINE}
     for key, template in templates.items():
-        bindings[key] = bound_part(template, name, bindings, key in dissolving, short)
+        bindings[key] = bound_part(template, bindings, key in dissolving)
     return bindings
 
 
@@ -865,4 +880,11 @@ def _engine_of(system: System, observer: Observer, watched: tuple[int, ...]) -> 
     bindings = engine_bindings(system, observer, watched)
     rest = observer.n_kept, observer.keeps_next
     kept = keeping(*system.functions, observer.observe, observer.memory_size, observer.renew, *rest)
-    return kernel(specialise(advance, _name(system, observer, watched), **bindings), kept)
+    compiled = entry(advance, _name(system, observer, watched), bindings, kept)
+
+    @wraps(compiled)
+    def engine(cells: Cells, n_lanes: int, rtol: float, atol: float, attempts: float, settings: Any) -> None:
+        work = work_for(system, observer, cells, n_lanes, settings)
+        compiled(cells, work, min(n_lanes, len(cells.frequency)), rtol, atol, attempts, settings)
+
+    return engine

@@ -73,8 +73,8 @@ class Observer:
     """Named functions for the engine, with values for free names in them.
 
     They are plain Python functions, compiled when they are bound to a system: inside, `N` is the number of
-    states, `IS_ANGLE` and `SCALES` are the system's, and further free names are those of `bindings`. They run
-    once per cell and period, not per step, on plain numbers and arrays.
+    states, `IS_ANGLE` (0 or 1) and `SCALES` are arrays of the system's, and further free names are those of
+    `bindings`. They run once per cell and period, not per step, on plain numbers and arrays.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ def _lag_distance(ring: Any, i: int, j: int, window: int) -> float:
     largest = 0.0
     for k in range(N):
         x = abs(ring[a + k] - ring[b + k])
-        if IS_ANGLE[k]:
+        if IS_ANGLE[k] == 1:
             x = min(x, abs(TWO_PI - x))
         largest = max(largest, x / SCALES[k])
     return largest

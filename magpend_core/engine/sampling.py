@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, wraps
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from magpend_core.engine.jit import bound_part, keeping, kernel, specialise
+from magpend_core.engine.jit import bound_part, entry, keeping
 from magpend_core.engine.lanes import (
     CROSSED,
     DIVERGED,
@@ -30,6 +30,7 @@ from magpend_core.engine.lanes import (
     STEP_UNDERFLOW,
     TOO_MANY_STEPS,
     engine_bindings,
+    rows_of,
 )
 from magpend_core.engine.modes import CHATTERED
 from magpend_core.engine.observers import RECORD
@@ -79,6 +80,9 @@ class Seats(NamedTuple):
     edge_table: Any  # float64 (lanes, 3, n_edges)
     p: Any  # float64 (n_parameters,), scratch
     weights: Any  # float64 (N_STAGES,), scratch
+    scratch: Any  # float64, for constants
+    events: Any  # int64 per group: whether one of its lanes has an event
+    n_watching: Any  # int64 per group: 0
 
 
 def begin_interval(samples: Samples, seats: Seats, lane: int, scratch: Any) -> None:
@@ -240,25 +244,39 @@ def copy_seat(seats: Seats, source: int, target: int) -> None:
         seats.before[b + row] = seats.before[a + row]
 
 
-def follow_all(samples: Samples, n_lanes: int, rtol: float, atol: float, max_attempts: float) -> None:
-    """Integrate all trajectories, `n_lanes` at a time, and fill the output arrays of `samples`."""
-    n = len(samples.piece)
-    active = min(n_lanes, n)
-    n_groups = (active + WIDTH - 1) // WIDTH
-    size, n_columns = n_groups * WIDTH, len(samples.columns)
-    seats = Seats(
-        np.zeros(n_groups * ROWS.size), np.zeros(size * 2 * n_columns), np.zeros((size, 2)),
-        np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size, np.int64),
-        np.zeros(size, np.int64), np.zeros((size, N), np.int64), np.zeros((size, 3, max(NE, 1))),
-        np.zeros(samples.parameters.shape[1]), np.zeros(N_STAGES),
-    )  # fmt: skip
-    scratch = np.zeros(max(NC, N))
-    for lane in range(size):
+def seats_for(system: System, samples: Samples, n_lanes: int) -> Seats:
+    """Allocate what so many lanes work on."""
+    n_groups = -(-min(n_lanes, len(samples.piece)) // WIDTH)
+    size, n = n_groups * WIDTH, system.n_states
+    return Seats(
+        lanes=np.zeros(n_groups * rows_of(system).size),
+        before=np.zeros(size * 2 * len(samples.columns)),
+        clock=np.zeros((size, 2)),
+        trajectory=np.zeros(size, np.int64),
+        interval=np.zeros(size, np.int64),
+        done=np.zeros(size, np.int64),
+        edge=np.zeros(size, np.int64),
+        turns=np.zeros((size, n), np.int64),
+        edge_table=np.zeros((size, 3, max(system.n_edges, 1))),
+        p=np.zeros(samples.parameters.shape[1]),
+        weights=np.zeros(N_STAGES),
+        scratch=np.zeros(max(system.n_constants + system.n_modes, n)),
+        events=np.zeros(n_groups, np.int64),
+        n_watching=np.zeros(n_groups, np.int64),
+    )
+
+
+def follow_all(
+    samples: Samples, seats: Seats, active: int, rtol: float, atol: float, max_attempts: float
+) -> None:
+    """Integrate all trajectories, `active` at a time, and fill the output arrays of `samples`."""
+    n, scratch = len(samples.piece), seats.scratch
+    for lane in range(len(seats.trajectory)):
         # lanes beyond the last trajectory repeat it, so that they hold ordinary numbers; no one looks
-        begin_trajectory(samples, seats, lane, min(lane, n - 1), scratch)
+        begin_trajectory(samples, seats, lane, lane if lane < n else n - 1, scratch)
     following = active
     rows, before, clock = seats.lanes, seats.before, seats.clock
-    events, n_watching = np.zeros(n_groups, np.bool_), np.zeros(n_groups, np.int64)
+    events, n_watching = seats.events, seats.n_watching
     while active > 0:
         in_use = (active + WIDTH - 1) // WIDTH
         for group in range(in_use):
@@ -288,7 +306,15 @@ _CALLED = ("begin_interval", "begin_trajectory", "write_due", "go_on", "end_traj
 @cache
 def sampler_of(system: System) -> Callable[..., None]:
     """Compile `follow_all` for a system."""
-    bindings = engine_bindings(replace(system, method="dopri5"), RECORD)
+    system = replace(system, method="dopri5")
+    bindings = engine_bindings(system, RECORD)
     for key in (*_INLINE, *_CALLED):
-        bindings[key] = bound_part(globals()[key], system.label, bindings, key in _INLINE)
-    return kernel(specialise(follow_all, system.label, **bindings), keeping(*system.functions))
+        bindings[key] = bound_part(globals()[key], bindings, key in _INLINE)
+    compiled = entry(follow_all, system.label, bindings, keeping(*system.functions))
+
+    @wraps(compiled)
+    def sampler(samples: Samples, n_lanes: int, rtol: float, atol: float, attempts: float) -> None:
+        seats, active = seats_for(system, samples, n_lanes), min(n_lanes, len(samples.piece))
+        compiled(samples, seats, active, rtol, atol, attempts)
+
+    return sampler

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core.engine.jacobians import rows_of_entries
-from magpend_core.engine.jit import part
+from magpend_core.engine.jit import inline
 from magpend_core.engine.simd import WIDTH, load, multiply_add, store
 from magpend_core.engine.system import System
 
@@ -66,8 +66,6 @@ def tangent_bindings(system: System) -> dict[str, Any]:
         order += [row[j] for j in own]
         starts.append(len(columns))
     return names | {
-        # machine code of its own would take a third of the time to compile
-        "rhs": _as_part(system.rhs),
         "ENTRY_COLUMNS": np.array(columns),
         "ROW_STARTS": np.array(starts),
         "HAS_TRACE": _has_trace(system),
@@ -81,14 +79,9 @@ def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callabl
     if has_trace:
         parts.append(trace_of(rows_of_entries(base), "entries") or "0.0 * y[0]")
     lines = ["def tangent_entries(y, u, c):", "entries = _jacobian(y, u, c)", f"return ({', '.join(parts)},)"]
-    scope: dict[str, Any] = {"__name__": base.rhs.__module__, "_jacobian": _as_part(base.jacobian)}
+    scope: dict[str, Any] = {"__name__": base.rhs.__module__, "_jacobian": base.jacobian}
     exec("\n    ".join(lines), scope)
-    return part(scope["tangent_entries"], True)
-
-
-def _as_part(function: Any) -> Any:
-    """Return a compiled function of a system as a part of an engine, without machine code of its own."""
-    return part(getattr(function, "py_func", function), True)
+    return inline(scope["tangent_entries"])
 
 
 def stage_row(w: Any, row: int, s: int, h: Any) -> None:

@@ -199,4 +199,4 @@ def test_run_branches__read_only_memory_compiles_nothing_more(preset):
         array.flags.writeable = False
     frozen = run_branches(packed, frequency, start, **settings)
     assert frozen.section.tobytes() == found.section.tobytes()
-    assert len(engine_of(PENDULUM_FITTED, RECORD).signatures) == 1
+    assert len(engine_of(PENDULUM_FITTED, RECORD).__wrapped__.signatures) == 1

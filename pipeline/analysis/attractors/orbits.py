@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from magpend_core.engine.system import System
-from magpend_core.orbits import polish_orbits, stroboscopic_map
+from magpend_core.orbits import RTOL, polish_orbits, stroboscopic_map
 from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.stability import MATRIX_ERROR, by_margin, largest_error
 from pipeline.analysis.sets import Geometry, rounded_points
@@ -24,6 +24,12 @@ SAME_ORBIT = 1e-7
 
 PLACE_ERROR = 30.0
 """Error of a multiplier beside a fold over the residual's root: twice the root of the map's curvature."""
+
+NEAR, NEARLY, NEAR_STEPS, NEAR_RTOL = 1e-5, 1e-3, 8, 1e-8
+"""Scaled residual to which all guesses are polished, that with which they go on, steps and tolerance for it.
+
+Many lead to the same orbit, and only one of these is polished further.
+"""
 
 RUN_ON_PERIODS, RUN_ON_TOLERANCE, RUN_ON_RTOL = 2000, 1e-5, 1e-8
 """How `run_on` integrates: drive periods at most, closure tolerance, tolerance of the steps."""
@@ -141,24 +147,53 @@ def polish(
     """
     if not len(points):
         return []
+    near = polish_orbits(
+        packed, frequency, points, period,
+        tolerance=NEAR, max_iterations=NEAR_STEPS, rtol=NEAR_RTOL, least_period=False, system=system,
+    )  # fmt: skip
+    first, own = near.section.copy(), np.flatnonzero(near.converged)
+    images, _ = _images(packed[own], frequency[own], first[own], near.orbit_period[own], NEAR_RTOL, system)
+    for row, image in zip(own, images, strict=True):
+        first[row] = _rolled(image, geometry)[0]
+    # of an orbit that is very unstable the loose tolerance shows no more than that it is there
+    good = np.flatnonzero(near.residual <= NEARLY)
+    rounded = rounded_points(first[good], geometry)
+    key = np.column_stack([packed[good], frequency[good], near.orbit_period[good], rounded])
+    _, once, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    rows = good[once]
+    # from the rounded point, so that an orbit does not depend on which guess of it came first
+    orbits = _polished(
+        packed[rows], frequency[rows], rounded[once] * np.asarray(geometry.scales), near.orbit_period[rows],
+        geometry, system, tolerance,
+    )  # fmt: skip
+    found: list[Orbit | None] = [None] * len(points)
+    for i, k in zip(good, place.ravel(), strict=True):
+        found[i] = orbits[k]
+    return found
+
+
+def _polished(
+    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, geometry: Geometry,
+    system: System, tolerance: float, turned: bool = False,
+) -> list[Orbit | None]:  # fmt: skip
+    """Polish guesses to a residual; each orbit begins at its first point, unless it has just been turned."""
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
-    rows = np.flatnonzero(found.converged)
     orbits: list[Orbit | None] = [None] * len(points)
-    first = found.section[rows].copy()
-    images, _ = _images(packed[rows], frequency[rows], first, found.orbit_period[rows], system)
-    for i, image in enumerate(images):
-        first[i] = _rolled(image, geometry)[0]
-    # again from the first point, so that multipliers, matrix and residual belong to it
-    again = polish_orbits(
-        packed[rows], frequency[rows], first, found.orbit_period[rows], tolerance=tolerance, system=system
+    rows = np.flatnonzero(found.converged)
+    images, derivatives = _images(
+        packed[rows], frequency[rows], found.section[rows], found.orbit_period[rows], RTOL, system
     )
-    images, derivatives = _images(packed[rows], frequency[rows], again.section, again.orbit_period, system)
     for i, row in enumerate(rows):
-        if again.converged[i]:
-            in_time = np.concatenate([again.section[i][None], images[i][:-1]])
-            residual = float(again.residual[i])
-            seconds = float(again.seconds[i])
-            orbits[row] = Orbit(in_time, again.multipliers[i], residual, derivatives[i], seconds)
+        in_time = np.concatenate([found.section[row][None], images[i][:-1]])
+        residual, seconds = float(found.residual[row]), float(found.seconds[row])
+        orbits[row] = Orbit(in_time, found.multipliers[row], residual, derivatives[i], seconds)
+        first = _rolled(in_time, geometry)[0]
+        if not turned and (first != in_time[0]).any():
+            one = slice(row, row + 1)
+            (orbits[row],) = _polished(
+                packed[one], frequency[one], first[None], found.orbit_period[one], geometry, system,
+                tolerance, turned=True,
+            )  # fmt: skip
     return orbits
 
 
@@ -185,15 +220,16 @@ def run_on(
 
 
 def _images(
-    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, system: System
-) -> tuple[list[np.ndarray], np.ndarray]:
+    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, rtol: float,
+    system: System,
+) -> tuple[list[np.ndarray], np.ndarray]:  # fmt: skip
     """Section points after 1, ..., period drive periods, and the derivative of the last, per row."""
     images: list[np.ndarray] = [points[:0]] * len(points)
     derivatives = np.full((len(points), system.n_states, system.n_states), np.nan)
     for p in np.unique(period):
         rows = np.flatnonzero(period == p)
         image, derivatives[rows] = stroboscopic_map(
-            packed[rows], frequency[rows], points[rows], int(p), system=system
+            packed[rows], frequency[rows], points[rows], int(p), rtol=rtol, system=system
         )
         for row, states in zip(rows, image, strict=True):
             images[row] = states

@@ -188,7 +188,7 @@ engines = []
 entry.engine_of = lambda *a: engines.append(engine_of(*a)) or engines[-1]
 found = run_branches(parameters=[[[0.1]]], frequency_hz=[[0.5]], initial_states=[[1.0]],
                      n_transient=0, n_keep=1, rtol=1e-9, atol=1e-9, system=SYSTEM)
-stats = engines[0].stats
+stats = engines[0].__wrapped__.stats
 print(found.section.ravel()[0].hex(), sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
 """
 
@@ -228,7 +228,7 @@ engines = []
 entry.engine_of = lambda *a: engines.append(engine_of(*a)) or engines[-1]
 for amplitude in (0.2, 0.4):
     found = sections(model.load(A=amplitude), 0.5, [[1.0, 0.0]], n_transient=0, n_keep=1)
-    stats = engines[0].stats
+    stats = engines[0].__wrapped__.stats
     print(found.section.ravel()[0].hex(), sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
 assert engines[1] is engines[0]
 """

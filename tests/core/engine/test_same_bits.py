@@ -105,7 +105,7 @@ print(digest(run_branches(packed, frequency, starts, n_transient=7, n_keep=3, rt
 packed, frequency, starts = (inputs["struck_" + k] for k in ("packed", "frequency", "starts"))
 settings = {"n_transient": 0, "n_keep": 9, "rtol": 1e-7, "atol": 1e-7, "system": load_model("impact").system}
 print(digest(run_branches(packed, frequency, starts, **settings)))
-code = "".join(engine_of(PENDULUM_FITTED, RECORD, ()).inspect_asm().values())
+code = "".join(engine_of(PENDULUM_FITTED, RECORD, ()).__wrapped__.inspect_asm().values())
 print(WIDTH)
 print(*[word for word in ("zmm", "ymm") if word in code], *["fma"] * ("vfmadd" in code))
 """

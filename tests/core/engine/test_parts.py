@@ -1,0 +1,180 @@
+"""Parts of engines: compiled once for all systems, kept on disk, linked with each system's sizes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba import njit
+
+from magpend_core.engine import jit, parts
+from magpend_core.engine.jit import PARTS, bound_part, entry, inline
+from magpend_core.engine.simd import WIDTH, load, load_rows, store
+
+pytestmark = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")
+
+RUN = """
+import sys
+import numpy as np
+from numba.core import event
+from magpend_core.models import load_model
+from magpend_core.sections import sections
+
+class Compiled(event.Listener):
+    def on_start(self, event):
+        dispatcher = event.data["dispatcher"]
+        names.append(dispatcher.py_func.__qualname__)
+    def on_end(self, event):
+        pass
+
+for name in sys.argv[1:]:
+    names = []
+    listener = Compiled()
+    event.register("numba:compile", listener)
+    model = load_model(name)
+    start = np.full((3, model.system.n_states), 0.1) * [[1.0], [2.0], [3.0]]
+    found = sections(model.load(), 0.3, start, n_transient=3, n_keep=2, rtol=1e-7, atol=1e-7)
+    event.unregister("numba:compile", listener)
+    print(name, found.section.tobytes().hex(), found.n_steps.sum(), ",".join(names) or "nothing")
+"""
+
+
+@pytest.fixture
+def integrated(run_python, tmp_path):
+    """Integrates models one after the other in a fresh process; returns a row of words for each."""
+
+    def run(*models, **variables):
+        code = RUN.replace("sys.argv[1:]", repr(list(models)))
+        folder = {"MAGPEND_CACHE_DIR": str(tmp_path / "cache"), **variables}
+        return [line.split() for line in run_python(code, **folder).splitlines()]
+
+    return run
+
+
+def test_parts__a_second_system_compiles_its_equations_alone(integrated):
+    """Other states, other constants, angles or none: what knows no equations is had from the first one."""
+    first, second = integrated("driven-pendulum"), integrated("duffing")
+    assert len(first[0][3].split(",")) > 30
+    # besides the equations: the entry, which Python calls, and the stages, in which the equations are
+    mine = ("_rhs", "_forcing", "_constants", "_no_edges", "advance_duffing", "run_stages")
+    others = [name for name in second[0][3].split(",") if not name.startswith(mine)]
+    assert not others
+
+
+def test_parts__bits_depend_on_the_system_alone(integrated):
+    """From the cache, after another system with other sizes, or compiled from nothing."""
+    mixed = {row[0]: row[1:3] for row in integrated("duffing", "three-magnets")}
+    again = {row[0]: row[1:3] for row in integrated("three-magnets", "duffing", MAGPEND_CACHE="0")}
+    alone = {"three-magnets": integrated("three-magnets", MAGPEND_CACHE="0")[0][1:3]}
+    assert mixed == again
+    assert mixed["three-magnets"] == alone["three-magnets"]
+
+
+def _sum_of_states(w, out):
+    """Sum of the first entry of each state, and what its array says of it."""
+    for i in range(N):  # noqa: F821
+        out[0] += w[ROWS.state + i * WIDTH]  # noqa: F821
+        out[1] += SCALES[i] * (IS_ANGLE[i] + 1)  # noqa: F821
+
+
+def sizes(n):
+    rows = parts_rows(n)
+    return {"N": n, "ROWS": rows, "SCALES": np.arange(1.0, n + 1), "IS_ANGLE": np.arange(n) % 2}
+
+
+def parts_rows(n):
+    from collections import namedtuple
+
+    return namedtuple("Rows", ("state", "size"))(n * WIDTH, 3 * n * WIDTH)
+
+
+def expected(n):
+    return [sum(range(n * WIDTH, 2 * n * WIDTH, WIDTH)), sum((i + 1) * (i % 2 + 1) for i in range(n))]
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7])
+def test_bound_part__is_one_code_with_the_sizes_of_each_system(n):
+    part = bound_part(_sum_of_states, sizes(n), False)
+    out = np.zeros(2)
+    # also called from a function that numba compiles in its own way
+    njit(lambda w, out: part(w, out))(np.arange(3.0 * n * WIDTH), out)
+    np.testing.assert_array_equal(out, expected(n))
+    assert part.key == bound_part(_sum_of_states, sizes(n + 1), False).key
+
+
+def _in_a_constant(out):
+    out[0] = N  # noqa: F821
+
+
+def test_size_in_a_constant__is_an_error_and_not_a_wrong_number(monkeypatch):
+    monkeypatch.setattr(parts, "_load_sizes", lambda *_: None)
+    part = bound_part(_in_a_constant, {"N": 3}, False)
+    with pytest.raises(RuntimeError, match="has N in a constant"):
+        njit(lambda out: part(out))(np.zeros(1))
+
+
+def _first(out):
+    out[0] = second(out) + N  # noqa: F821
+
+
+def _second(out):
+    return 10.0 * N  # noqa: F821
+
+
+def test_parts_of_one_engine__agree_in_their_sizes():
+    other = bound_part(_second, {"N": 4}, False)
+    first = entry(_first, "disagrees", {"second": other, "N": 3}, None)
+    with pytest.raises(RuntimeError, match="disagree in N: 3 and 4"):
+        first(np.zeros(1))
+    agrees = entry(_first, "agrees", {"second": bound_part(_second, {"N": 3}, False), "N": 3}, None)
+    out = np.zeros(1)
+    agrees(out)
+    assert out[0] == 33.0
+
+
+def test_inline__can_be_called_from_python_too():
+    @inline
+    def cubed(x):
+        return x * x * x
+
+    @njit
+    def both(x):
+        return cubed(x) + 1.0
+
+    assert (both(2.0), cubed(2.0), cubed(3.0)) == (9.0, 8.0, 27.0)
+
+
+def test_load_rows__of_so_many_rows_is_compiled_for_each_number():
+    def total(w, out):
+        rows = load_rows(w, 0, N)  # noqa: F821
+        store(out, 0, rows[0] + rows[N - 1])  # noqa: F821
+
+    for n in (1, 2, 5):
+        part = bound_part(total, {"N": n, "load_rows": load_rows, "load": load}, False)
+        w, out = np.arange(5.0 * WIDTH), np.zeros(WIDTH)
+        njit(lambda w, out, part=part: part(w, out))(w, out)
+        np.testing.assert_array_equal(out, w[:WIDTH] + w[(n - 1) * WIDTH : n * WIDTH])
+
+
+def test_damaged_records__are_compiled_again(integrated, tmp_path):
+    whole = integrated("duffing")[0]
+    records = sorted((tmp_path / "cache").rglob("*.part"))
+    assert len(records) > 30
+    for engine in (tmp_path / "cache").rglob("*.nbc"):
+        engine.unlink()
+    content = [record.read_bytes() for record in records]
+    half = len(content[0]) // 2
+    records[0].write_bytes(content[0][:half] + bytes([content[0][half] ^ 4]) + content[0][half + 1 :])
+    records[1].write_bytes(content[1][:100])
+    records[2].write_bytes(b"")
+    records[3].unlink()
+    records[3].mkdir()
+    records[4].write_bytes(content[5])
+    records[5].write_bytes(content[4])
+    assert integrated("duffing")[0][1:3] == whole[1:3]
+
+
+def test_parts__are_kept_beside_the_engines():
+    assert PARTS is None or Path(PARTS._folder).parent == jit.CACHE_FOLDER
