@@ -4,8 +4,8 @@ Escape from a chaotic saddle forgets the past, so lifetimes beyond the first few
 (Kantz and Grassberger, Physica D 17 (1985) 75; Lai and Tel, Transient Chaos, 2011, ch. 1). Let r be the
 number of escapes and T the time at risk, summed over all sampled cells. The mean lifetime is T/r, and its
 interval at confidence 1 - a runs from ``2 T/chi2(1 - a/2; 2 r + 2)`` to ``2 T/chi2(a/2; 2 r)`` (Epstein and
-Sobel, J. Am. Stat. Assoc. 48 (1953) 486, and Garwood, Biometrika 28 (1936) 437, for observation that ends at a given
-time). If none leaves, the one-sided bound is ``T/(-ln a)``, a third of T at 95 %.
+Sobel, J. Am. Stat. Assoc. 48 (1953) 486, and Garwood, Biometrika 28 (1936) 437, for observation that ends at
+a given time). If none leaves, the one-sided bound is ``T/(-ln a)``, a third of T at 95 %.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ SAME_ORBIT = 1e-7
 """Largest distance between two polished orbits that are one, on top of the errors from their residuals."""
 
 PLACE_ERROR = 30.0
-"""Error of a multiplier near a fold per square root of the residual: twice the root of the map's curvature."""
+"""Error of a multiplier near a fold per root of the residual: twice the root of the map's curvature."""
 
 NEAR, NEARLY, NEAR_STEPS, NEAR_RTOL = 1e-5, 1e-3, 8, 1e-8
 """First polish: target residual, largest residual that continues, most Newton steps, tolerance.
