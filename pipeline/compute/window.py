@@ -1,7 +1,7 @@
-"""Tasks on the workers of a dask scheduler: a few in flight per thread, watched while they run.
+"""Run tasks on the workers of a dask scheduler, a few in flight per thread, and watch them.
 
-What has to do with waiting happens in the client's event loop; the results, the starts of tasks and the
-news of workers meet in one queue, so that nothing that stands still can hold up the rest.
+All waiting happens in the client's event loop. Results and starts of tasks arrive in one queue, so that a
+stopped worker cannot hold up the others.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WINDOW = 3
 """Tasks in flight per worker thread."""
 
 TICK_S = 1.0
-"""The workers are looked at so often [s]."""
+"""Time between two checks of the workers [s]."""
 
 MOST_LOOKED_AT = 100
 """Workers that are looked at in a second: more of them are looked at less often."""
@@ -57,7 +57,7 @@ class _Flight:
 
 
 def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]:
-    """Run a task on a worker and say before that it begins."""
+    """Run a task on a worker, and report its start first."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -124,7 +124,7 @@ class Window:
             self._fill()
 
     def _fill(self) -> None:
-        """Submit what may start, up to the window; when nothing is left, what failed, one by one."""
+        """Submit tasks that may start, up to the window; when none are left, failed tasks one by one."""
         wanted = WINDOW * max(self._watch.n_threads, 1) - len(self._flights)
         chosen: list[int] = []
         while len(chosen) < wanted and (index := self._order.take()) is not None:
@@ -191,7 +191,7 @@ class Window:
         )
 
     def _look(self) -> None:
-        """See which workers there are and which of them do not answer, and restart those."""
+        """Check which workers there are, and restart those that do not answer."""
         try:
             seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
         except (OSError, TimeoutError) as error:
@@ -214,7 +214,7 @@ class Window:
             self._echo("the scheduler has no workers; waiting for some")
 
     def _give_up_late(self) -> None:
-        """Take tasks that have run for too long away from their workers, and restart these."""
+        """Give up tasks that have run for too long, and restart their workers."""
         for ticket, flight in list(self._flights.items()):
             if flight.started is None:
                 continue
@@ -242,7 +242,7 @@ class Window:
 
 
 class Watch:
-    """Knows which workers there are and when each was last heard of.
+    """The record of workers and of the time when each last reported.
 
     Its clock goes on only while it is looked at: time in which this process was itself stopped, by Ctrl-Z
     or a closed lid, blames nobody.

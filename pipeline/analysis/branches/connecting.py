@@ -187,7 +187,7 @@ def _leads_to(point: Point | None, other: Found) -> int | None:
 
 
 def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[Found]:
-    """Return the orbits that one can meet: upwards of its own period, both ways of half, quarter, ... of it."""
+    """Return the orbits that one can meet: upwards of its own period, both ways of half, quarter, ..."""
     if one.number in (known.up if way > 0 else known.down):
         return []
     halves = {one.period // 2**k for k in range(1, one.period.bit_length()) if one.period % 2**k == 0}

@@ -17,8 +17,8 @@ from pipeline.analysis.branches.problems import Family, OrbitProblem
 ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium")
 
 REST = 0.01
-"""A cycle counts as an equilibrium if its crossing speed times its period is below this distance [scales of the
-state that crosses]."""
+"""A cycle counts as an equilibrium if its crossing speed times its period is below this distance [scales of
+the state that crosses]."""
 
 
 @dataclass(eq=False)

@@ -1,8 +1,8 @@
 """Run many computations in step, so that their trajectories share the engine's lanes.
 
 A computation is a generator: it yields a `Query`, receives the `Value` of its problem, and returns its
-result. A single orbit would fill one lane of sixteen. One call serves all waiting computations, at little more
-than the cost of one. Each gets the same numbers as if it ran alone.
+result. A single orbit would fill one lane of sixteen. One call serves all waiting computations, at little
+more than the cost of one. Each gets the same numbers as if it ran alone.
 """
 
 from __future__ import annotations

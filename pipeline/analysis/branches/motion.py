@@ -58,7 +58,7 @@ def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarr
 
 
 _SEEN_WHOLE = np.array(np.inf)
-"""Frequency given to the classifier: infinite, since samples of the whole orbit leave no time between them."""
+"""Frequency given to the classifier: infinite, since samples of the whole orbit leave no gap."""
 
 
 def _values(parameters: Parameters) -> Mapping[str, Any]:
