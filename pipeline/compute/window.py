@@ -66,7 +66,7 @@ def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]
 
 
 class Window:
-    """Runs the tasks of an `Order` on the workers that a client reaches.
+    """A runner of an `Order`'s tasks on the workers of a dask client.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class Window:
         self._news.put(("start", event[1]["ticket"], event[1]["worker"]))
 
     def _on_end(self, ticket: int, future: Any) -> None:
-        """Have a result fetched; in a thread of the client's."""
+        """Start fetching a finished task's result; runs in a thread of the client."""
         if ticket not in self._flights:
             return
         if future.status in ("error", "cancelled"):
@@ -159,7 +159,7 @@ class Window:
             fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
 
     def _wait(self) -> Iterator[tuple[str, int, Any]]:
-        """Yield all news, after waiting for some for a moment."""
+        """Wait for news for at most `TICK_S`, and yield all that have come."""
         with contextlib.suppress(queue.Empty):
             yield self._news.get(timeout=TICK_S)
             while True:
@@ -259,7 +259,7 @@ class Watch:
 
     @property
     def limit_s(self) -> float:
-        """For how long a worker may be silent [s].
+        """Longest silence of a worker [s].
 
         It doubles with those that were found: on a machine that is far too busy all are slow to answer.
         """
@@ -268,7 +268,7 @@ class Watch:
 
     @property
     def now(self) -> float:
-        """Seconds on this clock."""
+        """Time of this clock [s], which stops while this process is stopped."""
         now = self._clock()
         self._time += min(now - self._last, 5 * TICK_S)
         self._last = now
@@ -294,12 +294,12 @@ class Watch:
         return silent
 
     def forget(self, address: str) -> None:
-        """Begin anew with a worker."""
+        """Forget when a worker last reported."""
         self._heard.pop(address, None)
 
 
 async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
-    """Fetch a result."""
+    """Fetch a result, or the error instead."""
     try:
         return await client.gather(future, asynchronous=True), None
     except (Exception, asyncio.CancelledError) as error:
@@ -307,7 +307,7 @@ async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]
 
 
 def _restarted(client: Any, address: str) -> None:
-    """Restart a worker, and wait for that; in a thread of its own, for a stopped process takes its time."""
+    """Restart a worker and wait for it; runs in a separate thread, since a stopped process is slow."""
     with contextlib.suppress(Exception):
         client.restart_workers([address], timeout=ANSWER_S, raise_for_error=False)
 

@@ -190,7 +190,7 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
 
 
 def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
-    """Label the sampled cells that ended, and the cells in their boxes or groups, by their ends."""
+    """Label the sampled cells that reached an end, and all cells in their boxes or groups, by this end."""
     ends = {course.key: course.end for course in found.courses if not course.goes_on}
     if not ends:
         return
@@ -227,7 +227,7 @@ def _label_raw(
 def _label_sets(
     point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
 ) -> None:
-    """Label the sampled cells of the sets, and the other cells by the sets that their points lie on."""
+    """Label the sampled cells of each set, and all other cells whose section points lie on the set."""
     for i, one in enumerate(sets):
         own = one.cells[labels.label[one.cells] < 0]
         labels.put(own, first + i, SAME_SET)

@@ -37,7 +37,7 @@ STATE_STEP = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Ends of the trajectories that a problem asked for.
+    """The ends of the trajectories that a problem requested.
 
     Attributes
     ----------
@@ -133,20 +133,20 @@ class Family:
         return np.array([*self.system.scales, *self.scales])
 
     def unknowns(self, state: np.ndarray, values: Sequence[float]) -> np.ndarray:
-        """Scaled unknowns of a section point and values of the free parameters."""
+        """Return the scaled unknowns of a section point and of values of the free parameters."""
         return np.asarray(np.concatenate([state, values]) / self.unit)
 
     def state(self, u: np.ndarray) -> np.ndarray:
-        """Section point [rad, rad/s], angles wrapped."""
+        """Return the section point [the states' units], angles wrapped."""
         n = self.system.n_states
         return wrap_angles(np.asarray(u[:n] * np.asarray(self.system.scales)), self.system)
 
     def values(self, u: np.ndarray) -> np.ndarray:
-        """Values of the free parameters."""
+        """Return the values of the free parameters."""
         return np.asarray(u[self.system.n_states :] * np.asarray(self.scales))
 
     def rows(self, many: np.ndarray) -> Rows:
-        """Trajectories of one period from each of many unknowns, shape (m, size)."""
+        """Return the trajectories of one period from many unknowns (m, size)."""
         n = self.system.n_states
         frequency = np.full(len(many), self.frequency_hz)
         packed = np.tile(self.parameters, (len(many), 1))
@@ -159,13 +159,13 @@ class Family:
         return Rows(many[:, :n] * np.asarray(self.system.scales), frequency, packed, self.period)
 
     def mismatch(self, u: np.ndarray, image: np.ndarray) -> np.ndarray:
-        """Scaled difference between the image and the point, angles on their circle."""
+        """Compute the scaled difference between the image and the point, angles on their circle."""
         scales = np.asarray(self.system.scales)
         start = u[: self.system.n_states] * scales
         return np.asarray(wrap_angles(image - start, self.system) / scales)
 
     def scaled(self, monodromy: np.ndarray) -> np.ndarray:
-        """Monodromy matrix in scaled states."""
+        """Return the monodromy matrix in scaled states."""
         scales = np.asarray(self.system.scales)
         return np.asarray(monodromy * scales / scales[:, None])
 

@@ -285,7 +285,7 @@ def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Na
 
 
 class _Curves:
-    """Computes the correlation dimensions of attractors from their cells' pooled sections."""
+    """The correlation dimensions of attractors, from their cells' pooled sections."""
 
     def __init__(self, options: ChaosOptions) -> None:
         self._n_max = options.n_max
