@@ -1,4 +1,5 @@
-"""Analyses of a cube: Dataset in, labelled data out. None integrates but `attractors.identify`.
+"""Analyse cubes: functions that take a Dataset and return labelled data.
 
-It polishes one point per closed orbit and follows each attractor over a few periods for its features.
+Most functions only read the cube. Those that find or follow orbits integrate: `attractors.identify`,
+`attractors.match` with `connect`, `attractors.portraits`, and the functions of `branches`.
 """

@@ -1,4 +1,4 @@
-"""Confidence intervals of probabilities."""
+"""Compute confidence intervals of probabilities."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ REFERENCES = {
 def binomial_interval(
     count: npt.ArrayLike, n: npt.ArrayLike, *, confidence: float = 0.95, method: Interval = "wilson"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Confidence interval of a probability from `count` hits in `n` independent trials.
+    """Compute the confidence interval of a probability from `count` hits in `n` independent trials.
 
     Wilson's score interval (J. Am. Stat. Assoc. 22, 209, 1927) covers the truth at the stated rate on
-    average over the probability; Clopper and Pearson's (Biometrika 26, 404, 1934) at least at the
-    stated rate for every probability, and is wider. Both are compared by Brown, Cai and DasGupta
-    (Stat. Sci. 16, 101, 2001). Neither collapses to a point at 0 or `n` hits.
+    average over the probability. The interval of Clopper and Pearson (Biometrika 26, 404, 1934) covers it
+    at least at the stated rate for every probability, and is wider. Brown, Cai and DasGupta (Stat. Sci. 16,
+    101, 2001) compare them. Neither interval collapses to a point at 0 or `n` hits.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def binomial_interval(
     Returns
     -------
     low, high
-        Ends of the intervals, within [0, 1]. That the trials are independent is not validated.
+        Ends of the intervals, within [0, 1]. Independence of the trials is not validated.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def binomial_interval(
         half = np.sqrt(z2 * (k * (safe - k) / safe + 0.25 * z2))
         low, high = (centre - half) / (safe + z2), (centre + half) / (safe + z2)
     elif method == "clopper-pearson":
-        # arguments of 0 belong to the ends that are set below
+        # arguments of 0 are replaced by 1 here; the ends that need them are set below
         low = special.betaincinv(np.maximum(k, 1.0), safe - k + 1.0, tail)
         high = special.betaincinv(k + 1.0, np.maximum(safe - k, 1.0), 1.0 - tail)
     else:

@@ -1,7 +1,7 @@
-"""What each cell of a run ends on: an attractor, nothing bounded, or something that does not count.
+"""Decide the outcome of each cell of a run: an attractor, divergence, or no outcome.
 
-Shares, basins and all that is made of them count sets that attract. Every other cell is counted under its own
-name: what its set is, or how it failed. This is the only place where that is decided.
+Shares and basins count only cells that end on attractors or diverge. All other cells are counted by name: by
+the stability of their set, or by the way they failed. Only this module makes that decision.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED, TRANSIENT
 from pipeline.layout.vocabulary import DIVERGES as DIVERGED_LATER
 
 DIVERGED = -2
-"""Label of the cells that diverged: an outcome like an attractor. -1 is no outcome."""
+"""Label of cells that diverged, which is an outcome like an attractor. The label -1 means no outcome."""
 
 _ON_SET = {
     UNSTABLE: "on an unstable orbit or equilibrium",
@@ -37,7 +37,7 @@ _BY_STATUS = {
 
 
 def outcomes(ids: xr.Dataset) -> xr.DataArray:
-    """Label of each cell: the attractor that it ends on, -2 (`DIVERGED`), or -1 for everything else.
+    """Label each cell by the attractor that it ends on, by -2 (`DIVERGED`), or by -1 for all others.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def outcomes(ids: xr.Dataset) -> xr.DataArray:
 
 
 def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
-    """Stability of the set that each cell is on, 0 for none; on the parameter dims, then the start dims."""
+    """Return the stability of each cell's set, 0 for none, on the parameter dims and then the start dims."""
     dims, _ = split_dims(ids["attractor_id"])
     cells, stability = _cells(ids, "attractor_id"), ids["stability"].transpose(*dims, "attractor").values
     found = np.zeros(cells.shape, np.int8)
@@ -61,12 +61,12 @@ def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
 
 
 def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
-    """Cells that do not end on an attractor, by what became of them.
+    """Group the cells that do not end on an attractor by their fate.
 
     Returns
     -------
     dict of ndarray of bool
-        By name, on the parameter dims and then the start dims; each such cell is in exactly one.
+        Masks by name, on the parameter dims and then the start dims. Each of these cells is in exactly one.
     """
     label = outcomes(ids).transpose(*_dims(ids)).values
     status, stability = _cells(ids, "status"), stability_of_cells(ids)
@@ -83,7 +83,7 @@ def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
 
 
 def share_interval(count: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """95 % Wilson interval of shares, from the numbers of cells; NaN where the share is 0.
+    """Compute the 95 % Wilson interval of shares from numbers of cells; NaN where the share is 0.
 
     Parameters
     ----------
@@ -106,12 +106,12 @@ def _cells(ids: xr.Dataset, name: str) -> np.ndarray:
 
 
 def left_out(ids: xr.Dataset) -> str:
-    """Return `sentence` if there are cells that end on no attractor; else an empty text."""
+    """Return `sentence` if some cells end on no attractor; otherwise an empty text."""
     return sentence(ids) if other_cells(ids) else ""
 
 
 def sentence(ids: xr.Dataset) -> str:
-    """One sentence on how many cells end on attractors, and what the others do."""
+    """Return a sentence on how many cells end on attractors, and on the fate of the others."""
     total = ids["attractor_id"].size
     others = other_cells(ids)
     n = total - sum(int(which.sum()) for which in others.values())

@@ -1,4 +1,4 @@
-"""Select from the attractors of a run what an analysis or a figure is about."""
+"""Select parameter points and axis values of a run's cube or attractors."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ Floats = npt.NDArray[np.float64]
 
 
 def parameter_dims(attractors: xr.Dataset) -> list[str]:
-    """Names of the swept parameters."""
+    """Return the names of the swept parameters."""
     return list(split_dims(attractors["attractor_id"])[0])
 
 
 def start_dims(attractors: xr.Dataset) -> list[str]:
-    """Names of the dims that tell the cells of one parameter point apart."""
+    """Return the names of the dims that distinguish the cells of one parameter point."""
     return list(split_dims(attractors["attractor_id"])[1])
 
 
 def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...], purpose: str) -> xr.Dataset:
-    """Select one value of each axis that is not to be kept.
+    """Select one value of each axis that is not in `keep`.
 
     Parameters
     ----------
     ds
-        With `attractor_id`.
+        Dataset with `attractor_id`.
     at
-        Value by axis; it must be one of the axis (`place`).
+        Value by axis; it must lie on the axis (see `place`).
     keep
         Axes to keep.
     purpose
-        What is made of it, for messages.
+        Purpose of the selection, for error messages.
 
     Raises
     ------
@@ -62,13 +62,12 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
 
 
 def place(axis: xr.DataArray, value: float) -> int:
-    """Return the place of a value on an axis.
+    """Return the index of a value on an axis.
 
     Raises
     ------
     ValueError
-        If it is not there, within 1e-6 of the spacing to the next value; the message names the
-        values on either side.
+        If no axis value is within 1e-6 of the spacing; the message names the values on either side.
     """
     values = axis.values.astype(np.float64)
     index = int(np.abs(values - value).argmin())
@@ -86,14 +85,14 @@ def place(axis: xr.DataArray, value: float) -> int:
 
 
 def _slack(values: Floats, index: int) -> float:
-    """How far from a value of an axis a number may be that means it."""
+    """Return the tolerance for matching a number to an axis value."""
     apart = np.abs(values - values[index])
     spacing = apart[apart > 0].min() if (apart > 0).any() else abs(values[index])
     return float(1e-6 * spacing)
 
 
 def snap(ds: xr.Dataset, at: Mapping[str, float]) -> dict[str, float]:
-    """Return the nearest values that the axes have; what lies off an axis stays as it is."""
+    """Replace values by the nearest axis values; keep values outside of an axis."""
     found = {}
     for name, value in at.items():
         axis = ds[name].values.astype(np.float64).ravel() if name in ds.dims else np.array([value])
@@ -103,16 +102,16 @@ def snap(ds: xr.Dataset, at: Mapping[str, float]) -> dict[str, float]:
 
 
 def select_points(ds: xr.Dataset, at: Mapping[str, float] | None, *, purpose: str = "") -> xr.Dataset:
-    """Select values of a cube's swept parameters, which stay as dims.
+    """Select values of a cube's swept parameters, and keep the dims with length 1.
 
     Parameters
     ----------
     ds
         Cube.
     at
-        Value by parameter; it must be one of the axis (`place`).
+        Value by parameter; it must lie on the axis (see `place`).
     purpose
-        If given, one point must be left; says what it is for, in the message.
+        Purpose of the selection, for the error message; if given, exactly one point must remain.
 
     Raises
     ------

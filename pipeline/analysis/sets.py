@@ -1,8 +1,7 @@
-"""Sets of states: distances on circles and lines, occupied boxes, groups.
+"""Compute distances between sets of states, the boxes that they occupy, and connected groups.
 
-States are compared in units of the system's scales, angles on their circle, by the largest
-difference of a component. Nothing here depends on the order of its rows, and nothing is quadratic in
-their number.
+States are compared in units of the system's scales, angles on their circle, by the largest difference of a
+component. Results do not depend on the order of rows, and the work is not quadratic in their number.
 """
 
 from __future__ import annotations
@@ -24,12 +23,14 @@ TWO_PI = 2.0 * np.pi
 
 @dataclass(frozen=True)
 class Geometry:
-    """Which components are angles, and what counts as 1 in each.
+    """The geometry of states: which components are angles, and the scale of each.
 
     Attributes
     ----------
     is_angle : tuple of bool
+        Whether each component is an angle.
     scales : tuple of float
+        Change of each component that counts as 1 [the states' units].
     """
 
     is_angle: tuple[bool, ...]
@@ -37,7 +38,7 @@ class Geometry:
 
     @classmethod
     def of(cls, owner: System | Model) -> Geometry:
-        """Geometry of the states of a system, or of a model."""
+        """Return the geometry of the states of a system or a model."""
         return cls(owner.is_angle, owner.scales)
 
     @property
@@ -51,7 +52,7 @@ class Geometry:
         return np.where(self.is_angle, TWO_PI / np.asarray(self.scales), 0.0)
 
     def scaled(self, points: np.ndarray) -> np.ndarray:
-        """States in units of the scales, angles in [0, circumference)."""
+        """Return states (..., state) in units of the scales, angles in [0, circumference)."""
         scaled = np.asarray(points, np.float64) / np.asarray(self.scales)
         for i, length in enumerate(self.circumference):
             if length > 0.0:
@@ -60,7 +61,7 @@ class Geometry:
         return np.asarray(scaled)
 
     def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Scaled a - b, the short way round on circles."""
+        """Return the scaled difference a - b, along the shorter arc for angles."""
         difference = (np.asarray(a) - np.asarray(b)) / np.asarray(self.scales)
         for i, length in enumerate(self.circumference):
             if length > 0.0:
@@ -68,15 +69,15 @@ class Geometry:
         return np.asarray(difference)
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Largest scaled difference of a component."""
+        """Return the largest scaled difference of a component, over the last axis."""
         return np.asarray(np.abs(self.difference(a, b)).max(axis=-1))
 
     def tree(self, points: np.ndarray) -> cKDTree:
-        """Search tree over states (query with `scaled` states and ``p=inf``)."""
+        """Build a search tree of states (query it with `scaled` states and ``p=inf``)."""
         return cKDTree(self.scaled(points), boxsize=self.circumference)
 
     def boxes(self, points: np.ndarray, side: float) -> np.ndarray:
-        """Whole numbers of the box that each state lies in; a circle holds a whole number of boxes."""
+        """Return the integer coordinates of each state's box; a circle holds a whole number of boxes."""
         scaled = self.scaled(points)
         boxes = np.empty(scaled.shape, np.int64)
         for i, length in enumerate(self.circumference):
@@ -88,10 +89,10 @@ class Geometry:
         return boxes
 
     def box_pairs(self, boxes: np.ndarray, side: float) -> np.ndarray:
-        """Pairs of rows of `boxes` (unique) that touch, corners included; shape (n, 2)."""
+        """Return the pairs of (unique) boxes that touch, also at corners, as row numbers (n, 2)."""
         if len(boxes) < 2:
             return np.empty((0, 2), np.int64)
-        # in units of one box, so that a circle is as long as it has boxes
+        # lengths in boxes: a circle is as long as its number of boxes
         lengths = [float(self._n_boxes(x, side)) if x > 0.0 else 0.0 for x in self.circumference]
         tree = cKDTree(boxes.astype(np.float64), boxsize=np.array(lengths))
         return np.asarray(tree.query_pairs(1.5, p=np.inf, output_type="ndarray"), np.int64)
@@ -102,9 +103,9 @@ class Geometry:
 
 
 def hashes(rows: np.ndarray) -> np.ndarray:
-    """One uint64 per row that depends on the row's bits alone: an order without a history.
+    """Hash each row to a uint64 that depends on the row's bits alone, to sort rows reproducibly.
 
-    Zeros of either sign count as one number.
+    Zeros of both signs have the same hash.
     """
     values = np.ascontiguousarray(rows)
     bits = (values + 0.0 if values.dtype.kind == "f" else values.astype(np.int64)).view(np.uint64)
@@ -118,31 +119,31 @@ def hashes(rows: np.ndarray) -> np.ndarray:
 
 
 def groups(n: int, pairs: np.ndarray) -> np.ndarray:
-    """Number of the connected group of each of `n` nodes."""
+    """Return the number of each node's connected group, for `n` nodes and pairs (m, 2)."""
     edges = np.asarray(pairs, np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
 def nearest_distances(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Distance of each state of `a` from the nearest of `b`."""
+    """Return the distance of each state of `a` from the nearest state of `b`."""
     return np.asarray(geometry.tree(b).query(geometry.scaled(a), p=np.inf)[0])
 
 
 def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
-    """Mean distance of the states of one set from the other set, the larger of both directions.
+    """Compute the mean distance of one set's states from the other set, the larger of both directions.
 
-    For samples of a chaotic set the largest distance is set by outliers; the mean is not (the
-    modified Hausdorff distance of Dubuisson and Jain, Proc. 12th ICPR, 1994, p. 566).
+    This is the modified Hausdorff distance of Dubuisson and Jain (Proc. 12th ICPR, 1994, p. 566). For samples
+    of a chaotic set, outliers determine the largest distance, but not the mean.
     """
     there, back = nearest_distances(a, b, geometry), nearest_distances(b, a, geometry)
     return float(max(there.mean(), back.mean()))
 
 
 def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
-    """Canonical order of sets: lexicographic by the rounded least point of each.
+    """Return the canonical order of sets: lexicographic by the rounded least point of each.
 
-    Ties go to the shorter set, then to all points in the order given.
+    In a tie the shorter set comes first; then all points decide, in the order given.
     """
 
     def key(i: int) -> tuple[tuple[float, ...], int, bytes]:
@@ -153,6 +154,6 @@ def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
 
 
 def rounded_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Scaled points, angles in (-pi, pi], rounded to 1e-6: an order that survives another CPU."""
+    """Scale points, wrap angles to (-pi, pi], and round to 1e-6, so that all processors sort them alike."""
     centred = geometry.difference(points, np.zeros(points.shape[-1]))
     return np.asarray(np.round(centred, 6) + 0.0)

@@ -1,7 +1,7 @@
-"""What the classifier of a run's model says of its cells: on which side a motion stays, for the pendulum.
+"""Classify the motion of a run's cells by the model's classifier, for example by side.
 
-The words, the rule and its evidence are the model's (`magpend_core.models.model.Classifier`); here they meet
-the parameters of the run, those that it sweeps included.
+The model defines the labels, the rule and its evidence (`magpend_core.models.model.Classifier`). This module
+applies the rule with the parameters of the run, swept parameters included.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from magpend_core.models.parameters import Parameters
 from pipeline.layout.vocabulary import BOUNDED, FREQUENCY_DIM, INFERRED, PERIODIC, model_of, parameters_of
 
 UNKNOWN = 0
-"""Code of every classifier's first word: there is nothing to judge."""
+"""Code of every classifier's first label: the motion is unknown."""
 
 _COMPUTED = (PERIODIC, BOUNDED, INFERRED)
 
 
 def classify(ds: xr.Dataset, *, parameters: Parameters | None = None) -> xr.DataArray | None:
-    """Label each cell by the classifier of the model. Lazy where `ds` is.
+    """Label each cell by the classifier of the model; lazy if `ds` is lazy.
 
     Parameters
     ----------
@@ -32,18 +32,18 @@ def classify(ds: xr.Dataset, *, parameters: Parameters | None = None) -> xr.Data
         counts as turning. The drive frequency [Hz] is the coordinate ``frequency``, else the attribute
         ``frequency_hz``, else infinite. Coordinates named like parameters replace those of the run.
     parameters
-        What was integrated; by default as the attributes say.
+        Parameters of the run, by default from the attributes.
 
     Returns
     -------
     DataArray of int8, or None
-        Codes of the classifier's words on the dims of ``status``, with the attributes ``flag_values`` and
+        Codes of the classifier's labels on the dims of ``status``, with the attributes ``flag_values`` and
         ``flag_meanings``; 0 (unknown) for cells that were not computed. None if the model has no classifier.
 
     Raises
     ------
     ValueError
-        If the run's parameters are not there.
+        If the run's parameters are missing.
     """
     model = model_of(ds) if parameters is None else parameters.model
     if model.classifier is None:
@@ -67,7 +67,7 @@ def classify(ds: xr.Dataset, *, parameters: Parameters | None = None) -> xr.Data
 
 
 def flags_of(classifier: Classifier) -> dict[str, Any]:
-    """Attributes of an array of a classifier's codes."""
+    """Return the attributes of an array of a classifier's codes."""
     return {
         "units": "1",
         "long_name": classifier.meaning,
@@ -85,7 +85,7 @@ def _label(
     section: np.ndarray, status: np.ndarray, frequency: np.ndarray, *rest: np.ndarray,
     classifier: Classifier, fixed: Mapping[str, float], swept: list[str], n_angles: int,
 ) -> np.ndarray:  # fmt: skip
-    """Codes of one block: leading dims broadcast, the section's last two are its sections and states."""
+    """Classify the cells of a block; leading dims broadcast, a section's last dims are period and state."""
     values = {**fixed, **dict(zip(swept, rest, strict=False))}
     turns = rest[len(swept)] if len(rest) > len(swept) else np.zeros((1,) * status.ndim + (n_angles,), int)
     known = np.isfinite(section).all(axis=(-2, -1)) & np.isin(status, _COMPUTED)

@@ -1,4 +1,4 @@
-"""Tables of analyses: rows of numbers for programs, aligned lines for people."""
+"""Format the tables of analyses: rows of numbers for programs, aligned lines for people."""
 
 from __future__ import annotations
 
@@ -9,53 +9,53 @@ import numpy as np
 import xarray as xr
 
 FEW_POINTS = 6
-"""Up to so many parameter points get a table each."""
+"""Most parameter points that get a table each."""
 
 MOST_RANGES = 6
-"""Up to so many ranges of an axis are listed."""
+"""Most ranges of an axis that are listed."""
 
 Row = dict[str, Any]
 
 
 def where_of(ds: xr.Dataset, at: Mapping[str, int]) -> Row:
-    """Values of the parameters at a point."""
+    """Return the parameter values at a point, by dim."""
     return {d: float(ds[d].values[i]) for d, i in at.items()}
 
 
 def words_of(array: xr.DataArray) -> list[str]:
-    """Meanings of an array of codes."""
+    """Return the labels of an array of codes, in the order of the codes."""
     return str(array.attrs["flag_meanings"]).split()
 
 
 def unit_of(ds: xr.Dataset, dim: str) -> str:
-    """Unit of an axis after a space, nothing for 1."""
+    """Return the unit of an axis with a leading space; empty for a dimensionless axis."""
     unit = ds[dim].attrs.get("units", "1")
     return "" if unit == "1" else f" {unit}"
 
 
 def heading(ds: xr.Dataset, where: Row) -> list[str]:
-    """Heading of a parameter point, none if nothing is swept."""
+    """Return the heading of a parameter point as a list of lines; empty if nothing is swept."""
     text = ", ".join(f"{d} {v:g}{unit_of(ds, d)}" for d, v in where.items())
     return [f"{text}:"] if text else []
 
 
 def number(value: float, spec: str) -> str:
-    """Format a number, a dash if it is not finite."""
+    """Format a number; return a dash if it is not finite."""
     return format(value, spec) if np.isfinite(value) else "-"
 
 
 def with_interval(row: Row) -> str:
-    """Fraction with its interval."""
+    """Format a fraction with its interval."""
     return f"{row['fraction']:.4f} ({row['low']:.4f} to {row['high']:.4f})"
 
 
 def distinct(values: Iterable[Any]) -> str:
-    """Different values in order."""
+    """Join the distinct values in sorted order."""
     return ", ".join(map(str, sorted(set(values))))
 
 
 def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
-    """Range of each axis, and the number of points."""
+    """Return the columns with the range of each axis and the number of points."""
     words = {}
     for d in dims:
         values = [row[d] for row in rows]
@@ -64,7 +64,7 @@ def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str
 
 
 def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> str:
-    """Largest fraction and where it is."""
+    """Format the largest fraction and its parameter point."""
     best = max(rows, key=lambda row: (np.nan_to_num(row["fraction"], nan=-1.0),))
     if not np.isfinite(best["fraction"]):
         return "-"
@@ -75,7 +75,7 @@ def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> s
 def summary(
     ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str], describe: Callable[..., dict[str, str]]
 ) -> list[str]:
-    """Return a table with a line per id."""
+    """Return the lines of a table with one row per id."""
     key = "attractor_id" if rows and "attractor_id" in rows[0] else "label"
     groups: dict[int, list[Row]] = {}
     for row in rows:
@@ -93,7 +93,7 @@ def aligned(rows: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def with_error(value: float, error: float, most: int = 6) -> str:
-    """Value and standard error, both to two digits of the error, of the value `most` decimals at most."""
+    """Format a value and its standard error to two digits of the error, with at most `most` decimals."""
     if not np.isfinite(value):
         return "-"
     if not (np.isfinite(error) and error >= 1e-6):
@@ -103,7 +103,7 @@ def with_error(value: float, error: float, most: int = 6) -> str:
 
 
 def axis_ranges(ds: xr.Dataset, dim: str, rows: Sequence[Row], alone: bool) -> str:
-    """Ranges of neighbouring values of the only axis; otherwise, or if they are many, the whole range."""
+    """Format the ranges of neighbouring axis values; the whole range if they are many or not `alone`."""
     axis = ds[dim].values.astype(np.float64)
     values = np.array(sorted({row[dim] for row in rows}))
     places = np.searchsorted(np.sort(axis), values)

@@ -1,1 +1,1 @@
-"""Tasks and how they are run: the only room that knows dask, and the kernel's door for pipelines."""
+"""Run tasks: the only room that knows dask, and the pipeline's entry to the kernel."""

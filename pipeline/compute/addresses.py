@@ -1,4 +1,4 @@
-"""Addresses of dask schedulers: read, and asked whether one answers, within seconds."""
+"""Read the addresses of dask schedulers, and check within seconds that a scheduler answers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 from pipeline.spec.problems import SpecError
 
 ANSWER_S = 5.0
-"""How long a scheduler may take for each of: accepting a connection, saying who it is."""
+"""Longest time for a scheduler to accept a connection, and again to identify itself [s]."""
 
 OPTION = "--scheduler"
 SCHEMES = ("tcp", "tls")
@@ -30,19 +30,19 @@ _TLS_SETTINGS = (
 
 
 class SchedulerError(Exception):
-    """A scheduler or its workers cannot be used; the message says why and what to do."""
+    """Error of a scheduler or its workers; the message gives the reason and the remedy."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where a scheduler is said to be.
+    """The address of a scheduler.
 
     Attributes
     ----------
     scheme, host : str
     port : int
     source : str
-        Where it was given, for messages: the option, a variable, or a file.
+        Source of the address, for messages: the option, a variable, or a file.
     """
 
     scheme: str
@@ -52,12 +52,12 @@ class Address:
 
     @property
     def url(self) -> str:
-        """As dask has it."""
+        """Address as dask writes it."""
         return f"{self.scheme}://{self.host}:{self.port}"
 
     @property
     def named(self) -> str:
-        """As messages have it."""
+        """Address for messages, with its source unless that is the option."""
         return self.url if self.source == OPTION else f"{self.url} (from {self.source})"
 
 
@@ -67,7 +67,7 @@ def read_address(text: str, source: str) -> Address:
     Raises
     ------
     SpecError
-        If it is none.
+        If the text or the file has no address.
     """
     if text.lower().endswith(".json"):
         return _from_file(Path(text))
@@ -104,7 +104,7 @@ def _from_file(path: Path) -> Address:
 
 
 def security_of(address: Address) -> Any:
-    """Keys for an address, from dask's own settings; None where the connection is plain.
+    """Return the TLS keys for an address, from dask's own settings; None for a plain connection.
 
     Raises
     ------
@@ -129,17 +129,17 @@ def security_of(address: Address) -> Any:
 
 
 def ask(address: Address) -> None:
-    """Make sure that a dask scheduler answers at an address, within seconds.
+    """Check within seconds that a dask scheduler answers at an address.
 
     Raises
     ------
     SchedulerError
-        Saying what is there instead.
+        If none answers; the message says what is there instead.
     """
     security = security_of(address)
     _knock(address)
     found: dict[str, Any] = {}
-    # a thread of its own: where this is called, an event loop may be running
+    # use a separate thread, since an event loop may be running in the caller's
     thread = threading.Thread(target=lambda: found.update(_asked(address, security)), daemon=True)
     thread.start()
     thread.join(3 * ANSWER_S)
@@ -185,7 +185,7 @@ def _asked(address: Address, security: Any) -> dict[str, Any]:
 
 
 async def _identity(address: Address, security: Any) -> dict[str, Any]:
-    """Ask a server of dask who it is."""
+    """Ask a dask server for its identity."""
     from distributed.comm.core import connect
 
     keys = _keys(security) if security is not None else {}

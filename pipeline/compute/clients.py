@@ -1,4 +1,4 @@
-"""Clients of dask: of a local cluster, of jobs of a batch system, or of a scheduler that exists already."""
+"""Connect to dask: a local cluster, jobs of a batch system, or an existing scheduler."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pipeline.spec.problems import SpecError
 Echo = Callable[[str], None]
 
 ALLOWED_FAILURES = 3
-"""Worker deaths that a task may be blamed for: one would blame innocent tasks."""
+"""Worker deaths that dask allows per task: a single one may have another cause than the task."""
 
 LOCAL, IN_PROCESS = "local", "none"
 ADDRESS, CLUSTER_FILE, WAIT = "DASK_SCHEDULER_ADDRESS", "MAGPEND_CLUSTER", "MAGPEND_WAIT_FOR_WORKERS"
@@ -31,19 +31,19 @@ _SAY_EVERY_S, _CONNECT_S = 30.0, 10.0
 
 @dataclass(frozen=True)
 class Where:
-    """Where tasks are computed, as people say it.
+    """The place where tasks are computed, as the user states it.
 
     Attributes
     ----------
     scheduler : str, optional
         ``local`` for processes of this machine, ``none`` for this process, a scheduler's address or JSON
-        file, or the name of a batch system. By default what ``DASK_SCHEDULER_ADDRESS`` says, else ``local``.
+        file, or the name of a batch system. By default ``DASK_SCHEDULER_ADDRESS``, else ``local``.
     cluster_file : Path, optional
-        With the ``[cluster]`` table of a batch system; by default what ``MAGPEND_CLUSTER`` says.
+        File with the ``[cluster]`` table of a batch system; by default the value of ``MAGPEND_CLUSTER``.
     dashboard : bool
-        Serve dask's dashboard on loopback, and say where.
+        Whether to serve dask's dashboard on loopback, and print its address.
     place : str, optional
-        Of the run directory, which all workers must see: see `open_files`.
+        Place of the run directory, which all workers must see (`open_files`).
     """
 
     scheduler: str | None = None
@@ -53,16 +53,16 @@ class Where:
 
     @classmethod
     def of(cls, scheduler: Where | str | None) -> Where:
-        """What a scheduler's name alone says."""
+        """Make a `Where` from a scheduler's name; return a `Where` unchanged."""
         return scheduler if isinstance(scheduler, Where) else cls(scheduler)
 
     def resolved(self) -> Address | Cluster | str:
-        """A scheduler's address, a batch system's jobs, ``local``, or ``none``; nothing is asked or started.
+        """Return an address, a batch system's cluster, ``local`` or ``none``, without starting anything.
 
         Raises
         ------
         SpecError
-            If what is said means nothing, or cannot be had here.
+            If the statement is invalid, or not available here.
         """
         found = self._resolved()
         if (
@@ -108,12 +108,12 @@ class Where:
 
 
 def reach(where: Where) -> None:
-    """Make sure, within seconds, that the scheduler answers, if there should be one already.
+    """Check within seconds that an existing scheduler answers; do nothing for other places.
 
     Raises
     ------
     SpecError, SchedulerError
-        Saying what is wrong, and the remedy.
+        If the place is invalid or no scheduler answers; the message gives the remedy.
     """
     target = where.resolved()
     if isinstance(target, Address):
@@ -122,7 +122,7 @@ def reach(where: Where) -> None:
 
 @contextlib.contextmanager
 def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]:
-    """Yield a client whose workers are there, have the same programs and see the run directory.
+    """Yield a client whose workers have arrived, have the same programs and see the run directory.
 
     Parameters
     ----------
@@ -131,12 +131,12 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
     n_workers
         Processes of a local cluster.
     echo
-        Prints a line.
+        Function that prints a line.
 
     Raises
     ------
     SpecError, SchedulerError
-        Before anything is computed.
+        If there are no such workers, before anything is computed.
     """
     import dask
     import distributed  # noqa: F401  its defaults come with it, and would go with a setting made before them
@@ -171,7 +171,7 @@ def _client(scheduler: Any, security: Any) -> Any:
 
 
 def _patience() -> int:
-    """How long to wait for workers of a scheduler that exists [s]."""
+    """Return the longest wait for workers of an existing scheduler [s]."""
     text = os.environ.get(WAIT) or WAIT_FOR_WORKERS
     try:
         return seconds_of(text)
@@ -180,7 +180,7 @@ def _patience() -> int:
 
 
 def _wait(client: Any, name: str, patience_s: int, echo: Echo) -> None:
-    """Wait for the first worker, and say so."""
+    """Wait for the first worker, and print a line while waiting."""
     started = said = time.monotonic()
     first = True
     while not _workers(client):

@@ -1,4 +1,4 @@
-"""Whether one trajectory has closed on a periodic orbit, and how long that would take."""
+"""Decide whether a trajectory has closed on a periodic orbit, and estimate how long it would take."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from magpend_core.engine.system import System
 from pipeline.spec.tables import Integration
 
 LOOKED_AT = 129
-"""Sections at the end of a trajectory that are compared."""
+"""Number of last sections of a trajectory that are compared."""
 
 FEWEST = 8
-"""Sections without which nothing can be said."""
+"""Fewest sections for a decision."""
 
 NEAR = 0.1
-"""Largest distance from an orbit at which a rate is believed: chaotic sections come closer by chance, too."""
+"""Largest distance from an orbit at which a rate is trusted: chaotic sections also approach by chance."""
 
 LONGEST: int = Integration.model_fields["max_orbit_period"].default
 TOLERANCE: float = Integration.model_fields["closure_tolerance"].default
@@ -25,7 +25,7 @@ TOLERANCE: float = Integration.model_fields["closure_tolerance"].default
 
 
 class Closing(NamedTuple):
-    """How far a motion is from a periodic orbit.
+    """The distance of a motion from a periodic orbit, and the time until it closes.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Closing(NamedTuple):
         return self.to_go == 0.0
 
     def sentence(self, n_transient: int) -> str:
-        """Say it, with the ``--transient`` that would do after one of `n_transient` periods."""
+        """Return a sentence, with the ``--transient`` that would suffice after `n_transient` periods."""
         periods = f"{self.period} drive period{'s' if self.period > 1 else ''}"
         if self.is_closed:
             return f"closed: the motion repeats after {periods} (distance {self.distance:.1e})"
@@ -64,7 +64,7 @@ class Closing(NamedTuple):
 
 
 def closing_of(sections: np.ndarray, system: System) -> Closing | None:
-    """Compare sections that are whole periods apart.
+    """Judge from sections whether a motion closes, by comparing sections that are whole periods apart.
 
     The distances of a period fall into four quarters. If the largest of each quarter shrinks from quarter
     to quarter, the sum of all that follow bounds the distance from the orbit, as in
@@ -75,7 +75,7 @@ def closing_of(sections: np.ndarray, system: System) -> Closing | None:
     sections
         Consecutive last sections of a trajectory, shape (n, n_states) [the states' units].
     system
-        What was integrated: it has the scales of the states, and says which are angles.
+        System that was integrated; gives the scales of the states and the angles.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def closing_of(sections: np.ndarray, system: System) -> Closing | None:
             # see `observers._smallest_divisor`
             if closed[0].period % one.period == 0 and _late(distances) <= 10.0 * TOLERANCE
         )
-    # a period that shrinks beats one that is small by chance; its multiples have about the same bound
+    # prefer a shrinking distance to a small one; multiples of a period have about the same bound
     least = min(found, key=lambda one: (math.isinf(one.to_go), one.distance))
     return next(
         one for one in found
@@ -104,7 +104,7 @@ def closing_of(sections: np.ndarray, system: System) -> Closing | None:
 
 
 def _lag_distances(sections: np.ndarray, p: int, system: System) -> np.ndarray:
-    """Largest scaled differences of sections `p` apart, angles on the circle."""
+    """Return the scaled distances of sections `p` apart, angles on the circle."""
     apart = np.abs(sections[p:] - sections[:-p])
     angles = np.array(system.is_angle, dtype=bool)
     turned = apart[:, angles] % (2.0 * np.pi)
@@ -113,12 +113,12 @@ def _lag_distances(sections: np.ndarray, p: int, system: System) -> np.ndarray:
 
 
 def _late(distances: np.ndarray) -> float:
-    """Largest distance of the last quarter."""
+    """Return the largest distance of the last quarter."""
     return float(distances[-(len(distances) // 4) :].max())
 
 
 def _judged(p: int, distances: np.ndarray) -> Closing:
-    """Judge one period by the distances of sections that are so far apart."""
+    """Judge the period `p` by the distances of sections `p` apart."""
     quarter = len(distances) // 4
     last = distances[len(distances) - 4 * quarter :].reshape(4, quarter).max(axis=1)
     if last[2:].max() <= 0.01 * TOLERANCE:  # errors of integration hide what shrinks

@@ -1,7 +1,7 @@
 """Run tasks: in this process, or on the workers of a dask scheduler.
 
-Tasks are submitted in a window, so that a scheduler holds few of them however long the run is; their
-results are small dicts. Nothing here knows what a task computes.
+Tasks are submitted in a window, so that a scheduler holds only few of them in a long run. Their results are
+small dicts. This module does not depend on what a task computes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Echo = Callable[[str], None]
 
 
 def default_workers() -> int:
-    """CPU cores that this process may use."""
+    """Return the number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -36,34 +36,34 @@ def run_tasks(
 ) -> Iterator[dict[str, Any]]:
     """Run `task` for every index and yield the results as they come.
 
-    Where one fails, the others go on; it is tried again alone when they are done.
+    If a task fails, the others continue; the failed task is tried again alone at the end.
 
     Parameters
     ----------
     task
-        Must be importable on the workers, or a partial of such a function. Running it twice, even at
-        once, must do no harm.
+        Function of an index, importable on the workers, or a partial of one. Running it twice, even at the
+        same time, must do no harm.
     indices
-        What to run, each once.
+        Tasks to run, each once.
     after
-        The task whose result must be there before one starts, or None; one that is not in `indices` is
-        there already.
+        Function that returns a task's predecessor or None. A predecessor that is not in `indices` counts as
+        done.
     seconds
-        What a task takes on one core, as estimated [s]. A worker that is busy with it for far longer (see
-        `pipeline.compute.limits`) is restarted, and the task goes elsewhere. Not looked at in this process.
+        Estimated time of a task on one core [s]. A worker that takes far longer (see
+        `pipeline.compute.limits`) is restarted, and its task runs elsewhere. Not used in this process.
     workers
-        Processes of the local cluster; 0 runs in this process.
+        Number of processes of the local cluster; 0 runs in this process.
     scheduler
-        Where; a text stands for ``Where(text)``.
+        Place of the computation; a text stands for ``Where(text)``.
     echo
-        Takes a line when something goes wrong and is dealt with.
+        Function that takes a line about each problem that was handled.
 
     Raises
     ------
     SpecError, SchedulerError
-        Before anything is computed, if there are no such workers; and when the scheduler is lost.
+        If there are no such workers, before anything is computed; or if the scheduler is lost.
     TaskFailedError
-        At the end, if tasks failed twice; at once, if so many fail that it is not the tasks.
+        If tasks failed twice, at the end; or at once if so many fail that the cause is another.
     """
     order = Order(indices, after)
     where = Where.of(scheduler)

@@ -1,4 +1,4 @@
-"""The product ``lyapunov``: exponents of a task's cells, from the last kept section of each on."""
+"""Compute the product ``lyapunov``: exponents of a task's cells, from each cell's last kept section."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ AUDIT = 0.01
 their moduli."""
 
 SIGMA = 5.0
-"""Standard errors by which the exponent of a flow that is 0 may differ from it."""
+"""Standard errors by which a flow's exponent nearest to 0 may differ from 0."""
 
 
 def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
@@ -61,9 +61,9 @@ def _falling(rates: np.ndarray) -> np.ndarray:
 
 
 def flags(found: LyapunovExponents, *, is_flow: bool = False) -> np.ndarray:
-    """Codes of `LyapunovFlag`; only a whole spectrum can be held against the divergence.
+    """Return codes of `LyapunovFlag`, shape (cell,); only a whole spectrum is compared with the divergence.
 
-    One exponent of a flow is 0, wherever the motion does not come to rest.
+    One exponent of a flow must be 0, unless the motion comes to rest.
     """
     flag = np.full(len(found.status), LyapunovFlag.GOOD, np.int8)
     if found.is_whole:

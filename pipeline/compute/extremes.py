@@ -1,4 +1,4 @@
-"""The product ``extremes``: what the engine watched during the kept periods."""
+"""Return the product ``extremes``, which the engine recorded during the kept periods."""
 
 from __future__ import annotations
 

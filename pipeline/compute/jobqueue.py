@@ -1,4 +1,4 @@
-"""Workers from a batch system: each job holds some, and there are as many jobs as there is work for."""
+"""Start workers in jobs of a batch system, as many jobs as the work needs."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from pipeline.spec.problems import SpecError
 JOB_NAME = "magpend-worker"
 _CLASSES = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "sge": "SGECluster", "lsf": "LSFCluster"}
 COMMANDS = {"slurm": "sbatch", "pbs": "qsub", "sge": "qsub", "lsf": "bsub"}
-"""What sends a batch script."""
+"""Commands that submit a batch script."""
 
 _THREADS = ("export NUMBA_NUM_THREADS=1", "export OMP_NUM_THREADS=1")
 _MEANWHILE_S = 60
 _TARGET = "0.1 s"
-"""Few tasks are in flight per worker, however many are left: more workers are wanted if they take longer."""
+"""Target duration of the tasks in flight: short, since only few tasks per worker are in flight."""
 
 
 def check_means(cluster: Cluster) -> None:
-    """Make sure that jobs can be sent from here.
+    """Check that jobs can be submitted from here.
 
     Raises
     ------
     SpecError
-        Naming the extra that is not installed, or the command that is not found.
+        If an extra is not installed or a command is not found; the message names it.
     """
     problems = []
     if not find_spec("dask_jobqueue"):
@@ -49,9 +49,9 @@ def check_means(cluster: Cluster) -> None:
 
 
 def jobs_folder(place: str) -> Path:
-    """Where a run's batch scripts, and what its jobs say, are kept: beside its directory.
+    """Return the folder for a run's batch scripts and job logs, beside the run directory.
 
-    Those of a run that is in no local folder are kept in the working directory.
+    For a run that is not in a local folder it lies in the working directory.
     """
     where = (
         Path(place).absolute() if "://" not in place else Path.cwd() / place.rstrip("/").rpartition("/")[2]
@@ -60,14 +60,14 @@ def jobs_folder(place: str) -> Path:
 
 
 def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
-    """Keywords of the classes of dask-jobqueue.
+    """Return the keywords for the classes of dask-jobqueue.
 
     Parameters
     ----------
     cluster
-        What a job is.
+        Description of a job.
     folder
-        Where the batch system puts what jobs say.
+        Folder for the job logs.
     """
     account = "account" if cluster.kind in ("slurm", "pbs") else "project"
     time = cluster.walltime if cluster.kind != "lsf" else hours_and_minutes(cluster.walltime_s)
@@ -96,7 +96,7 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
 
 
 def worker_script(cluster: Cluster, folder: Path) -> str:
-    """The batch script of a job that holds workers, as far as it is known before a scheduler runs."""
+    """Return the batch script of a job, with placeholders for the scheduler's address and the name."""
     import dask_jobqueue
 
     job = getattr(dask_jobqueue, _CLASSES[cluster.kind]).job_cls
@@ -104,7 +104,7 @@ def worker_script(cluster: Cluster, folder: Path) -> str:
 
 
 def _keys(folder: Path) -> Any:
-    """Make keys and write them where the jobs find them; scheduler, workers and client have the same."""
+    """Make keys in a folder that the jobs read; scheduler, workers and client share them."""
     from distributed import Security
 
     made = Security.temporary()  # type: ignore[no-untyped-call]
@@ -128,10 +128,11 @@ def _keys(folder: Path) -> Any:
 def job_cluster(
     cluster: Cluster, folder: Path, *, dashboard: bool, echo: Callable[[str], None]
 ) -> Iterator[Any]:
-    """Yield a cluster of jobs, which ends with the block.
+    """Yield a cluster of jobs that ends with the block.
 
-    Scheduler and workers know each other by keys of this cluster's own, which lie in `folder`, readable by
-    their owner alone, as long as it lives: other people on the network can neither read nor send anything.
+    Scheduler and workers identify each other by keys made for this cluster. The keys lie in `folder`,
+    readable by their owner alone, until the cluster ends. Others on the network can neither read nor send
+    anything.
 
     Raises
     ------

@@ -1,32 +1,32 @@
-"""When a task has taken too long: the limit follows from its estimate, and from how estimates turned out."""
+"""Limit the time of a task, from its estimate and from the accuracy of earlier estimates."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 LEAST_S = 60.0
-"""No task is given up earlier than this after its start [s]."""
+"""Least limit of any task [s]."""
 
 FACTOR = 10.0
-"""A task may take this many times its estimate, or times what the worst task so far took of its own."""
+"""Limit of a task in units of its estimate times the worst ratio so far of a task's time to its estimate."""
 
 SHORT_S = 1.0
-"""Tasks that took less say nothing about estimates: starting takes its time [s]."""
+"""Shorter tasks are not compared with their estimates, since starting dominates their time [s]."""
 
 MORE = 2.0
-"""Every further try of a task may take this many times longer than the one before."""
+"""Factor of the limit from one try of a task to the next."""
 
 SILENT_S = 20.0
-"""A worker that has not been heard of for so long is taken for stopped [s]; they report every half second."""
+"""A worker that is silent for this time counts as stopped [s]; workers report every half second."""
 
 
 class Limits:
-    """Says how long tasks may take.
+    """The time limits of tasks.
 
     Parameters
     ----------
     seconds
-        Estimated time of a task on one core [s]; None knows no limit.
+        Estimated time of a task on one core [s]; None sets no limit.
     """
 
     def __init__(self, seconds: Callable[[int], float] | None) -> None:
@@ -34,12 +34,12 @@ class Limits:
         self._worst = 1.0
 
     def finished(self, index: int, took_s: float) -> None:
-        """Learn from a task that finished: estimates may be several times too low."""
+        """Update the worst ratio of time to estimate by a finished task."""
         if self._seconds is not None and took_s > SHORT_S:
             self._worst = max(self._worst, took_s / max(self._seconds(index), 1e-9))
 
     def limit_s(self, index: int, tries: int) -> float:
-        """Longest time for a task of which it is the n-th try [s]."""
+        """Return the time limit of a task at its n-th try, n = `tries` [s]."""
         if self._seconds is None:
             return float("inf")
         return max(LEAST_S, FACTOR * self._worst * self._seconds(index)) * MORE ** (tries - 1)

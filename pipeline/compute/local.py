@@ -1,8 +1,8 @@
-"""A cluster of this machine's cores, which lives as long as the run.
+"""Run a cluster of processes on this machine, for the duration of a run.
 
-What protects it from other people on this machine: it listens on loopback alone, and every connection
-is TLS with a certificate on both sides, made for this cluster and kept in a folder that its owner alone
-may enter. Who has no key can neither give it work nor read results; its HTTP servers answer nothing.
+The cluster is protected from other users of the machine. It listens on loopback alone. Every connection uses
+TLS with a certificate on both sides, made for this cluster and kept in a folder that only its owner may
+enter. Without the key, nobody can submit work or read results. Its HTTP servers answer nothing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pipeline.compute.addresses import SchedulerError
 PREFIX = "magpend-workers-"
 
 START_S = 180.0
-"""A worker that does not start within this time has failed [s]."""
+"""Longest wait for the first worker [s]."""
 
 LOGGERS = [
     "tornado",
@@ -36,10 +36,10 @@ LOGGERS = [
 ]
 
 REMOVALS = 20
-"""Times that a folder is removed, a tenth of a second apart."""
+"""Most attempts to remove a folder, a tenth of a second apart."""
 
 SETTINGS: dict[str, Any] = {
-    # what nobody reads, and what grows with tasks and time: profiles, events, states of the machine
+    # switch off unread logs that grow with tasks and time: profiles, events, system states
     "distributed.worker.profile.enabled": False,
     "distributed.admin.low-level-log-length": 20,
     "distributed.admin.log-length": 100,
@@ -58,21 +58,21 @@ _scratch_folders: set[Path] = set()
 
 
 def memory_per_worker(n_workers: int) -> float:
-    """Share of the machine's memory at which a worker is ended, before the system ends anything."""
+    """Return the share of the machine's memory at which a worker is ended, before the system intervenes."""
     return 1.0 / n_workers
 
 
 @contextlib.contextmanager
 def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
-    """Yield a cluster of single-threaded processes, reachable with its own keys alone.
+    """Yield a cluster of single-threaded processes that only its own keys can reach.
 
-    Some workers may still be starting when it comes. The dashboard shows what is computed to everyone on
-    this machine.
+    The first worker has started; others may still be starting. The dashboard shows the computation to
+    everyone on this machine.
 
     Raises
     ------
     SchedulerError
-        If none starts.
+        If no worker starts.
     """
     import dask
     from distributed import LocalCluster
@@ -80,7 +80,7 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
     _start_tracker()
     pages = {} if dashboard else NO_PAGES
     with contextlib.ExitStack() as stack:
-        # a cluster that is half there could not be ended in order
+        # postpone signals: a cluster that is partly started cannot be closed properly
         with _signals_put_off():
             stack.enter_context(_hushed())
             scratch = stack.enter_context(_scratch())
@@ -125,10 +125,10 @@ def _await_one(cluster: Any) -> None:
 
 @contextlib.contextmanager
 def _loop() -> Iterator[Any]:
-    """Yield an event loop in a thread of its own.
+    """Yield an event loop in a separate thread.
 
-    Ctrl-C goes to every process of the terminal. Workers shall leave it to the coordinator: they inherit
-    from this thread that it is blocked.
+    Ctrl-C goes to every process of the terminal, but only the coordinator should handle it. Workers inherit
+    the blocked signals from this thread.
     """
     from distributed.utils import LoopRunner
 
@@ -217,7 +217,7 @@ def _start_tracker() -> None:
 
 @contextlib.contextmanager
 def _signals_put_off() -> Iterator[None]:
-    """Keep signals that somebody handles until the end, when they are raised again."""
+    """Postpone handled signals to the end of the block, and raise them there."""
     if threading.current_thread() is not threading.main_thread():
         yield  # signals are handled by the main thread alone
         return
@@ -237,7 +237,7 @@ def _signals_put_off() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
-    """Block signals in this thread, and in what it starts meanwhile."""
+    """Block signals in this thread, and in the threads and processes that it starts meanwhile."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -247,9 +247,9 @@ def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hushed() -> Iterator[None]:
-    """Say nothing of connections that come and go; after an exception for good, for that says what happened.
+    """Silence dask's logs of connections; after an exception they stay silent, since its message suffices.
 
-    dask logs some of them after a cluster has closed.
+    dask logs some connections only after a cluster has closed.
     """
     loggers = [logging.getLogger(name) for name in LOGGERS]
     before = [logger.level for logger in loggers]
@@ -261,7 +261,7 @@ def _hushed() -> Iterator[None]:
 
 
 def kill_workers() -> None:
-    """End the workers at once: what they are computing is given up, and may take long."""
+    """End the workers at once, without waiting for their tasks."""
     for process in multiprocessing.active_children():
         if process.name.startswith("Dask Worker process"):
             with contextlib.suppress(ValueError):  # closed meanwhile
@@ -269,7 +269,7 @@ def kill_workers() -> None:
 
 
 def abandon() -> None:
-    """Leave nothing behind, without waiting: for a process that is about to end at once."""
+    """End the workers and remove their folders, for a process that is about to exit at once."""
     kill_workers()
     for folder in list(_scratch_folders):
         _remove(folder)

@@ -1,4 +1,4 @@
-"""Cells of a sweep with more kept sections, from what another run holds of them."""
+"""Extend cells of a sweep that another run holds, to more kept sections."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from pipeline.spec.parsing import Spec
 Values = dict[str, np.ndarray]
 
 SUMS = ("turns", "n_periods", "n_steps", "n_rejected")
-"""Variables that go on from what they were."""
+"""Variables to which the extension is added."""
 PER_SECTION = ("section", "extremes")
 """Variables with an entry for each kept section, NaN in cells that failed."""
 
 
 def obstacle(old: Spec, new: Spec) -> str:
-    """Say why cells cannot go on to the number of sections that a wider run keeps; empty if they can."""
+    """Return the reason why cells cannot be extended to another run's `n_keep`; empty if they can."""
     had, wanted = old.integration.n_keep, new.integration.n_keep
     if had == wanted:
         return ""
@@ -42,27 +42,27 @@ def obstacle(old: Spec, new: Spec) -> str:
 
 
 def _judged(spec: Spec) -> int:
-    """Sections by which it is judged at a cell's end what closes."""
+    """Return the number of last sections by which a cell's closure is judged."""
     n_periods = spec.integration.n_transient + spec.integration.n_keep
     return min(n_periods, window_of(spec.integration.max_orbit_period))
 
 
 def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old: int) -> tuple[Any, Values]:
-    """Integrate cells on until they have as many sections as a run keeps.
+    """Extend the integration of cells until they have as many sections as a run keeps.
 
-    A cell is left out whose outcome could be another than that of a longer run: where the moment at which its
-    orbit had closed is not known, or it fails later on.
+    A cell is left out if its outcome could differ from that of a longer run: if the moment at which its orbit
+    closed is not known, or if it fails later.
 
     Parameters
     ----------
     spec
-        Of the run.
+        Specification of the run.
     inputs
-        What the cells were integrated from, branches of one point.
+        Inputs of the cells, as branches of one point.
     stored
-        Their variables, with leading dims (branch, point).
+        Variables of the cells, with leading dims (branch, point).
     n_old
-        Sections that they have.
+        Number of sections that the cells have.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old:
 
 
 def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n_old: int) -> Values:
-    """Variables of the periods that follow."""
+    """Integrate the further periods and return their variables."""
     watched: dict[str, Any] = {}
     for name, options in spec.products.items():
         watched |= CELL_PRODUCTS[name].integrate(options)
@@ -110,7 +110,7 @@ def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n
 
 
 def _longer(name: str, old: np.ndarray, more: Mapping[str, np.ndarray], go: np.ndarray, n: int) -> np.ndarray:
-    """A variable of all cells, gone on with in some."""
+    """Return a variable of all cells, extended in the cells `go`."""
     if name in PER_SECTION:
         whole = np.full((*old.shape[:2], n, *old.shape[3:]), np.nan)
         whole[go] = np.concatenate([old[go], more[name]], axis=2)

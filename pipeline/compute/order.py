@@ -1,6 +1,6 @@
-"""Which task comes next: after its predecessor, before what many wait for; what failed, once more alone.
+"""Decide which task comes next: predecessors first, long chains first, failed tasks alone at the end.
 
-Pure bookkeeping: nothing here runs a task.
+This module only keeps the books; it runs no task.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
 MOST_IN_A_ROW = 16
-"""Tasks that may fail one after another: more, and it is not the tasks (a full disk, a broken set-up)."""
+"""Failures in a row at which the run stops: the cause is then not the tasks, but for example a full disk."""
 
 MOST_FAILED = 64
-"""Failed tasks that are set aside to be tried again alone, one by one."""
+"""Number of failed tasks at which the run stops; fewer are tried again alone, one by one."""
 
 MOST_NAMED = 10
 MOST_LETTERS = 300
@@ -22,14 +22,14 @@ Predecessor = Callable[[int], int | None]
 
 
 class TaskFailedError(Exception):
-    """Tasks failed, and failed again when tried alone; the message says which and why.
+    """Error of tasks that failed twice, or of too many failures; the message names tasks and reasons.
 
     Attributes
     ----------
     failed : dict
-        Why, by task.
+        Reason by task.
     waiting : int
-        Tasks that were not begun because they come after a failed one.
+        Number of tasks that were not begun because they come after a failed one.
     """
 
     def __init__(self, failed: dict[int, str], waiting: int = 0, note: str = "") -> None:
@@ -50,13 +50,13 @@ class TaskFailedError(Exception):
 
 
 def why(error: BaseException) -> str:
-    """An exception in one line."""
+    """Format an exception as one line."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}..."
 
 
 class Order:
-    """Hands out tasks: one whose predecessor is done, and of these one that the longest chain waits for.
+    """The order of tasks: a task starts after its predecessor, and those with the longest chain come first.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Order:
         return heapq.heappop(self._ready)[1] if self._ready else next(self._unseen, None)
 
     def take_failed(self) -> int | None:
-        """Return a failed task for its second try, once nothing else can be done; None if there is none."""
+        """Return a failed task for its second try; None if there is none."""
         return self._second.popleft() if self._second else None
 
     def done(self, index: int) -> None:
@@ -144,12 +144,12 @@ class Order:
             raise TaskFailedError(self._failed, note=note + "command goes on when the cause is gone.")
 
     def close(self) -> None:
-        """Say how it ended.
+        """Raise TaskFailedError if tasks failed twice.
 
         Raises
         ------
         TaskFailedError
-            If tasks are left.
+            If failed tasks are left.
         """
         if self._failed:
             raise TaskFailedError(self._failed, self._left - len(self._failed))

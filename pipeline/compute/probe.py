@@ -1,4 +1,4 @@
-"""What a worker must have in common with whoever sends it tasks: programs, and the run directory."""
+"""Check that workers have the same programs as this process, and see the same run directory."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ PACKAGES = ("numpy", "numba", "zarr", "numcodecs", "dask", "distributed")
 _ROOMS = ("spec", "layout", "products", "compute", "store")
 _SHOWN = 3
 _LATE_S, _AGAIN_S = 5.0, 0.2
-"""A network's file system may take so long to show a new file."""
+"""Longest wait for a new file on a network's file system, and time between two looks [s]."""
 
 
 @cache
 def installation() -> dict[str, str]:
-    """What computes and writes here: versions, and digests of what magpend's own code means."""
+    """Return the versions of the programs here, and digests of magpend's own code."""
     from magpend_core.meaning import kernel_version, meaning_digest
 
     pipeline = Path(__file__).parents[1]
@@ -43,12 +43,12 @@ def installation() -> dict[str, str]:
 
 
 def check_versions(client: Any, workers: Iterable[str]) -> None:
-    """Refuse workers whose programs are other than here: they would compute or write something else.
+    """Check that workers have the same programs as this process.
 
     Raises
     ------
     SchedulerError
-        Naming workers, what differs, and the remedy.
+        If they differ; the message names workers, differences and the remedy.
     """
     here = installation()
     answers = client.run(installation, workers=list(workers), on_error="return")
@@ -73,14 +73,14 @@ def _difference(here: Mapping[str, str], there: Any) -> str:
 
 
 def check_directory(client: Any, workers: Iterable[str], place: str) -> None:
-    """Refuse workers that do not see the run directory, or cannot write to it.
+    """Check that workers see the run directory and can write to it.
 
-    A file of one moment goes through all of them: another directory by the same name does not pass.
+    All workers must read a temporary file there, so that another directory with the same name is detected.
 
     Raises
     ------
     SchedulerError
-        Naming workers, and the remedy.
+        If workers do not; the message names them and the remedy.
     """
     files, token = open_files(place), uuid.uuid4().hex
     # where, and named as, leftovers are swept by the next run, should this process be killed here
@@ -100,7 +100,7 @@ def check_directory(client: Any, workers: Iterable[str], place: str) -> None:
 
 
 def sees(place: str, key: str, token: str) -> str:
-    """Say what bars this process from a run directory; empty if nothing does."""
+    """Return the reason why this process cannot use a run directory; empty if it can."""
     deadline = time.monotonic() + _LATE_S
     while True:
         try:
@@ -135,25 +135,25 @@ def _listed(problems: Mapping[str, str]) -> str:
 
 
 class MisfitError(Exception):
-    """A worker that came later has other programs than whoever sends it tasks."""
+    """Error of a late worker whose programs differ from those of the process that sends tasks."""
 
 
 class Fitting:
-    """A task that is done by workers with the same programs alone, also by those that come later.
+    """A task that checks the worker's programs first, also on workers that come later.
 
     Parameters
     ----------
     task
-        Takes an index.
+        Function of an index.
     programs
-        See `installation`; by default those here.
+        Required programs, see `installation`; by default those of this process.
     """
 
     def __init__(self, task: Callable[[int], dict[str, Any]], programs: dict[str, str] | None = None) -> None:
         self.task, self.programs = task, programs or installation()
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Do the task; raises `MisfitError` where it would not be the same."""
+        """Run the task; raise `MisfitError` if the programs differ."""
         if why := _difference(self.programs, installation()):
             raise MisfitError(f"this worker has other programs ({why}); install the same versions everywhere")
         return self.task(index)

@@ -1,4 +1,4 @@
-"""Cells under a recorded drive."""
+"""Integrate cells under a recorded drive."""
 
 from __future__ import annotations
 

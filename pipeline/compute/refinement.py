@@ -1,4 +1,4 @@
-"""Grids of initial conditions from coarse to fine: cells well inside a basin are inferred, not integrated.
+"""Refine grids of initial conditions from coarse to fine; infer cells well inside a basin.
 
 A tile of cells is cut into boxes by every `stride`-th cell of each dim, and its last. The cells at the
 corners of the boxes are integrated. Then, until nothing changes: a box stays as it is if all integrated
@@ -7,8 +7,8 @@ corners of the parts are integrated. At the end the cells left in the boxes that
 the same orbit. Because its neighbours' cells count, a box is opened again when a boundary is found to run
 into it.
 
-What this cannot see: a piece of another basin that lies between the integrated cells, less than `stride`
-wide in some dim and away from every boundary found in the tile. Measured against full grids of 128 x 128
+The method misses a piece of another basin that lies between the integrated cells, less than `stride` wide in
+some dim and away from every boundary found in the tile. Measured against full grids of 128 x 128
 cells with a stride of 8: of a Duffing oscillator with smooth boundaries 33 to 58 % of the cells were
 integrated, and at most 6e-5 of the labels differed; of the pendulum at 2.8 Hz, in a window of 0.004 rad
 crossed by two bundles of filaments, 26 %, and 1.2e-3 differed, most of them in a filament that began at a
@@ -41,7 +41,7 @@ Each lies within the tolerance of its orbit, or within twice that on the slow sp
 """
 
 NOT_COMPUTED, NO_ORBIT = -2, -1
-"""Classes of cells that are no orbit: not integrated, and integrated without closing."""
+"""Classes of cells without an orbit: not integrated, and integrated without closing."""
 
 WORK = ("n_periods", "n_steps", "n_rejected")
 """Variables that count what was integrated: 0 where a cell is inferred."""
@@ -51,7 +51,7 @@ Integrate = Callable[[np.ndarray], Mapping[str, np.ndarray]]
 
 @dataclass
 class Orbits:
-    """Closed orbits met so far in a tile, numbered in the order in which they are met.
+    """The closed orbits found so far in a tile, numbered in the order of their discovery.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class Orbits:
         return found
 
     def _on(self, sections: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Which of some sections, shape (cell, period, n_states), are these points in cyclic order."""
+        """Return which sections (cell, period, n_states) are these points in some cyclic order."""
         shifts = (np.roll(points, shift, axis=0) for shift in range(len(points)))
         near = [
             scaled_distance(sections, p, self.system).max(axis=1, initial=0.0) <= self.tolerance
@@ -112,7 +112,7 @@ def infer(
     closure_tolerance: float,
     system: System,
 ) -> dict[str, np.ndarray]:
-    """Return all variables of a tile, computed where need be and inferred elsewhere.
+    """Return all variables of a tile, computed where necessary and inferred elsewhere.
 
     Parameters
     ----------
@@ -124,9 +124,9 @@ def infer(
         From the flat indices of some cells to their variables, cells first: those of
         `magpend_core.run_branches`.
     closure_tolerance
-        Of the run; see `SAME`.
+        Closure tolerance of the run, see `SAME`.
     system
-        What is integrated.
+        System to integrate.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def infer(
 
 
 def refine(shape: tuple[int, ...], stride: int, classes_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Say which cells of a tile are integrated, and for each of the others which one stands for it.
+    """Choose the cells of a tile to integrate, and a representative for each of the others.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def _first_boxes(shape: tuple[int, ...], stride: int) -> np.ndarray:
 
 
 def _corners(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Flat indices, shape (box, corner); the first corner comes first."""
+    """Return the flat indices of the boxes' corners, shape (box, corner), the first corner first."""
     dims = range(len(shape))
     ends = itertools.product((0, 1), repeat=len(shape))
     at = [[boxes[:, e, i] for i, e in zip(dims, end, strict=True)] for end in ends]
@@ -217,7 +217,7 @@ def _halves(boxes: np.ndarray) -> np.ndarray:
 
 
 def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Boxes of one size together: their rows, and the flat indices of their cells, shape (box, cell)."""
+    """Yield the boxes by size: their rows, and the flat indices of their cells (box, cell)."""
     first = np.ravel_multi_index(tuple(boxes[:, 0].T), shape)
     extents, which = np.unique(boxes[:, 1] - boxes[:, 0], axis=0, return_inverse=True)
     for i, extent in enumerate(extents):
@@ -227,7 +227,7 @@ def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.n
 
 
 def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Which boxes stay: all integrated cells in them and next to them have one class, that of an orbit."""
+    """Return which boxes stay: all integrated cells in and next to them are on one orbit."""
     own = known[np.ravel_multi_index(tuple(boxes[:, 0].T), shape)]
     padded = np.pad(known.reshape(shape), 1, constant_values=NOT_COMPUTED)
     classes = padded.ravel()
@@ -239,7 +239,7 @@ def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _sources(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Source of each cell: the least first corner among the boxes that hold it."""
+    """Return the source of each cell: the least first corner of the boxes that hold it."""
     source = np.arange(len(known))
     rest = known == NOT_COMPUTED
     source[rest] = len(known)

@@ -1,4 +1,4 @@
-"""Cells taken from other runs instead of integrated: what went in is the same, so what comes out is.
+"""Take cells from other runs with the same inputs, instead of integrating them.
 
 A worker opens the runs that cells are taken from once. For each task it looks up which of its cells they
 hold, reads these from their committed chunks, compared with the records, and integrates the rest. What a run
@@ -36,7 +36,7 @@ Origin = tuple[str, str]
 Values = dict[str, np.ndarray]
 
 ABSENT = (Status.PENDING, Status.INFERRED)
-"""What a committed cell can be without having been integrated."""
+"""Statuses of committed cells that were not integrated."""
 
 
 @dataclass
@@ -46,9 +46,9 @@ class Source:
     Attributes
     ----------
     run : Run
-        It, with what was committed when it was opened.
+        The run, with the tasks that were committed when it was opened.
     wanted : Spec
-        Of the run that takes its cells.
+        Specification of the run that takes its cells.
     """
 
     run: Run
@@ -102,7 +102,7 @@ class Source:
         return taken, {name: array[taken] for name, array in values.items()}
 
     def _task(self, place: np.ndarray) -> np.ndarray:
-        """Task that each cell belongs to; the number of tasks for `NOWHERE`."""
+        """Return the task of each cell; the number of tasks for `NOWHERE`."""
         plan = self.run.plan
         steps = np.unravel_index(np.maximum(place, 0), plan.shape)
         places = tuple(step // b for step, b in zip(steps, plan.block, strict=True))
@@ -110,13 +110,13 @@ class Source:
         return np.where(place == NOWHERE, plan.n_tasks, tasks)
 
     def _inside(self, task: int, place: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Indices of cells within their task's block."""
+        """Return the indices of cells within their task's block."""
         steps = np.unravel_index(place, self.run.plan.shape)
         return tuple(step - s.start for step, s in zip(steps, self.run.plan.task(task), strict=True))
 
 
 def same_products(run: Run, wanted: Spec) -> list[str]:
-    """Products that a run has computed as another one wants them: same options, same code."""
+    """Return the products that a run has computed with the wanted options and the same code."""
     code = run.info.identity["code"]
     return [
         name
@@ -131,7 +131,7 @@ def _module(product: str) -> str:
 
 
 def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
-    """Say what keeps the cells of a run from being those of another; nothing if they can be.
+    """Return the reasons why a run's cells cannot be used by another; empty if they can.
 
     Parameters
     ----------
@@ -152,14 +152,14 @@ def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
 
 
 class Pool:
-    """The cells that some runs hold of one.
+    """The cells of a run that other runs hold.
 
     Parameters
     ----------
     spec
-        Of the run that takes them.
+        Specification of the run that takes the cells.
     runs
-        Those that hold them; of a cell that several hold the first one's is taken.
+        Runs that hold cells; the first one that has a cell provides it.
     """
 
     def __init__(self, spec: Spec, runs: Sequence[Run]) -> None:
@@ -230,12 +230,12 @@ class Pool:
 
 
 def _leading(taken: np.ndarray) -> np.ndarray:
-    """Points at the begin of each branch that are taken: a walk needs all before a point."""
+    """Count the first points of each branch that are taken: a walk needs all points before one."""
     return np.asarray(np.cumprod(taken, axis=1).sum(axis=1))
 
 
 def _points(inputs: Inputs, part: slice) -> Inputs:
-    """Some of the points of branches."""
+    """Return the inputs of some points of the branches."""
     return replace(inputs, parameters=inputs.parameters[:, part], frequency_hz=inputs.frequency_hz[:, part])
 
 
@@ -247,7 +247,7 @@ def _put(values: Values, rows: np.ndarray, part: Mapping[str, np.ndarray], n: in
 
 
 def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], names: Sequence[str]) -> Values:
-    """Compute products of cells that are known but for these."""
+    """Compute the named products of cells whose other variables are known."""
     if not names:
         return {}
     no_turns = np.zeros((*inputs.frequency_hz.shape, 0), np.int32)

@@ -1,4 +1,4 @@
-"""One trajectory: a labelled time series, as CSV or NetCDF and as a figure."""
+"""Simulate one trajectory as a labelled time series, and write it as CSV or NetCDF."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ MAX_SAMPLES = 100_000_000
 DEGREES = "_deg"
 DEFAULT_PERIODS = 10
 CLOCK_HZ, FLOW_PERIODS = 1.0, 50
-"""Without a drive time is counted in seconds, and a series has more of them."""
+"""Frequency that stands for a missing drive (periods are seconds), and the default number of its periods."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """Which series is wanted: drive periods before it and in it (None: all of them), density, tolerances."""
+    """The requested series: drive periods before it and in it (None: all), density, tolerances."""
 
     n_transient: int
     n_periods: int | None
@@ -180,7 +180,7 @@ def _at_frequency(
 
 
 def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> dict[str, Any]:
-    """Attributes that say whether the motion has closed; none if there are too few sections."""
+    """Return the attributes on whether the motion has closed; empty if there are too few sections."""
     found = closing_of(sections[-LOOKED_AT:], parameters.model.system)
     if found is None:
         return {}
@@ -217,7 +217,7 @@ def _under_recording(
 def _labelled(
     parameters: Parameters, time: np.ndarray, clock: str, states: np.ndarray, values: np.ndarray
 ) -> xr.Dataset:
-    """States and quantities of a series, with names, units and what was integrated."""
+    """Make the dataset of a series' states and quantities, with names, units and parameters."""
     import xarray as xr
 
     model = parameters.model
@@ -236,7 +236,7 @@ def _labelled(
 
 
 def start_of(model: str | Model, given: Mapping[str, float]) -> tuple[float, ...]:
-    """Initial state of a model from values by name: a state's, or an angle's or rate's in degrees.
+    """Return a model's initial state from values by name; angles and rates may be in degrees.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""One task: a block of cells through the kernel into the store. The same function runs everywhere.
+"""Compute one task: integrate a block of cells and commit it to the store.
 
 A task is named by the run directory, the run's digest and its index; it reads the rest from
 ``run.json``. Its result is a small dict; the numbers go straight to the store.
@@ -98,7 +98,7 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def rest_states(cells: Sections) -> np.ndarray:
-    """States in which cells that did not come back to the section were left, NaN for all others."""
+    """Return the last states of cells without a return to the section, NaN for all others."""
     is_left = cells.status == Status.NO_RETURN
     return np.where(is_left[..., None], cells.final_state, np.nan)
 
@@ -188,7 +188,7 @@ def run_task(
 
 
 def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, Any]:
-    """Read where the task before has left the branches of a task, if they do not begin in it."""
+    """Read where the preceding task ended the branches of a task; empty if they begin in it."""
     predecessor = plan.predecessor(index)
     if predecessor is None:
         return {}
@@ -201,7 +201,7 @@ def _taking(
     directory: str, digest: str, sources: tuple[tuple[str, str], ...], cells: CellMap,
     block: tuple[slice, ...], taken: list[int],
 ) -> dict[str, Any]:  # fmt: skip
-    """Say what gives a task's cells where it is not the kernel alone: what other runs hold comes first."""
+    """Return the integrator that takes cells from other runs first; empty if there are no other runs."""
     if not sources:
         return {}
     from pipeline.compute.reuse import pool_of

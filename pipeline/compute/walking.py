@@ -1,4 +1,4 @@
-"""Branches that go on where another task has left them, bit for bit."""
+"""Continue branches bit for bit from where another task ended them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WALKED = ("section", "rest_state", "status", "step_size")
 
 
 def going_on(inputs: Inputs, before: Mapping[str, np.ndarray]) -> Inputs:
-    """Let branches start where they were left.
+    """Return the inputs with branches that start where the task before ended them.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def going_on(inputs: Inputs, before: Mapping[str, np.ndarray]) -> Inputs:
 
 
 def walk(inputs: Inputs, **keywords: Any) -> Sections:
-    """Return what `magpend_core.run_branches` says of branches, those that have ended before among them.
+    """Integrate branches by `magpend_core.run_branches`; those that ended before are marked as unreached.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def walk(inputs: Inputs, **keywords: Any) -> Sections:
 
 
 def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
-    """Put what was found of some branches among those that are not reached."""
+    """Spread the results of living branches over all branches, with fill values for the others."""
     if found is None:
         return None
     fill = int(Status.UNREACHED) if name == "status" else np.nan if found.dtype.kind == "f" else 0

@@ -1,7 +1,7 @@
-"""Tasks on the workers of a dask scheduler: a few in flight per thread, watched while they run.
+"""Run tasks on the workers of a dask scheduler, a few in flight per thread, and watch them.
 
-What has to do with waiting happens in the client's event loop; the results, the starts of tasks and the
-news of workers meet in one queue, so that nothing that stands still can hold up the rest.
+All waiting happens in the client's event loop. Results and starts of tasks arrive in one queue, so that a
+stopped worker cannot hold up the others.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WINDOW = 3
 """Tasks in flight per worker thread."""
 
 TICK_S = 1.0
-"""The workers are looked at so often [s]."""
+"""Time between two checks of the workers [s]."""
 
 MOST_LOOKED_AT = 100
 """Workers that are looked at in a second: more of them are looked at less often."""
@@ -57,7 +57,7 @@ class _Flight:
 
 
 def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]:
-    """Run a task on a worker and say before that it begins."""
+    """Run a task on a worker, and report its start first."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -66,7 +66,7 @@ def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]
 
 
 class Window:
-    """Runs the tasks of an `Order` on the workers that a client reaches.
+    """A runner of an `Order`'s tasks on the workers of a dask client.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class Window:
             self._fill()
 
     def _fill(self) -> None:
-        """Submit what may start, up to the window; when nothing is left, what failed, one by one."""
+        """Submit tasks that may start, up to the window; when none are left, failed tasks one by one."""
         wanted = WINDOW * max(self._watch.n_threads, 1) - len(self._flights)
         chosen: list[int] = []
         while len(chosen) < wanted and (index := self._order.take()) is not None:
@@ -146,7 +146,7 @@ class Window:
         self._news.put(("start", event[1]["ticket"], event[1]["worker"]))
 
     def _on_end(self, ticket: int, future: Any) -> None:
-        """Have a result fetched; in a thread of the client's."""
+        """Start fetching a finished task's result; runs in a thread of the client."""
         if ticket not in self._flights:
             return
         if future.status in ("error", "cancelled"):
@@ -159,7 +159,7 @@ class Window:
             fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
 
     def _wait(self) -> Iterator[tuple[str, int, Any]]:
-        """Yield all news, after waiting for some for a moment."""
+        """Wait for news for at most `TICK_S`, and yield all that have come."""
         with contextlib.suppress(queue.Empty):
             yield self._news.get(timeout=TICK_S)
             while True:
@@ -191,7 +191,7 @@ class Window:
         )
 
     def _look(self) -> None:
-        """See which workers there are and which of them do not answer, and restart those."""
+        """Check which workers there are, and restart those that do not answer."""
         try:
             seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
         except (OSError, TimeoutError) as error:
@@ -214,7 +214,7 @@ class Window:
             self._echo("the scheduler has no workers; waiting for some")
 
     def _give_up_late(self) -> None:
-        """Take tasks that have run for too long away from their workers, and restart these."""
+        """Give up tasks that have run for too long, and restart their workers."""
         for ticket, flight in list(self._flights.items()):
             if flight.started is None:
                 continue
@@ -242,7 +242,7 @@ class Window:
 
 
 class Watch:
-    """Knows which workers there are and when each was last heard of.
+    """The record of workers and of the time when each last reported.
 
     Its clock goes on only while it is looked at: time in which this process was itself stopped, by Ctrl-Z
     or a closed lid, blames nobody.
@@ -259,7 +259,7 @@ class Watch:
 
     @property
     def limit_s(self) -> float:
-        """For how long a worker may be silent [s].
+        """Longest silence of a worker [s].
 
         It doubles with those that were found: on a machine that is far too busy all are slow to answer.
         """
@@ -268,7 +268,7 @@ class Watch:
 
     @property
     def now(self) -> float:
-        """Seconds on this clock."""
+        """Time of this clock [s], which stops while this process is stopped."""
         now = self._clock()
         self._time += min(now - self._last, 5 * TICK_S)
         self._last = now
@@ -294,12 +294,12 @@ class Watch:
         return silent
 
     def forget(self, address: str) -> None:
-        """Begin anew with a worker."""
+        """Forget when a worker last reported."""
         self._heard.pop(address, None)
 
 
 async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
-    """Fetch a result."""
+    """Fetch a result, or the error instead."""
     try:
         return await client.gather(future, asynchronous=True), None
     except (Exception, asyncio.CancelledError) as error:
@@ -307,7 +307,7 @@ async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]
 
 
 def _restarted(client: Any, address: str) -> None:
-    """Restart a worker, and wait for that; in a thread of its own, for a stopped process takes its time."""
+    """Restart a worker and wait for it; runs in a separate thread, since a stopped process is slow."""
     with contextlib.suppress(Exception):
         client.restart_workers([address], timeout=ANSWER_S, raise_for_error=False)
 

@@ -1,1 +1,1 @@
-"""Coexisting attractors: found, described, followed along the axes."""
+"""Find coexisting attractors, describe them, and follow them along the axes."""

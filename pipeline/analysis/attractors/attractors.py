@@ -1,12 +1,13 @@
-"""Coexisting attractors: found at every parameter point, shown to attract, and followed along the sweep.
+"""Find the attractors at every parameter point, test whether they attract, and follow them along the sweep.
 
     ds = pipeline.open_run(directory)
     found = identify(ds)                 # integrates: Newton's method, and samples of what has not settled
     named = match(found, threshold=0.3)  # follows orbits along the axes; repeat it with other options
 
-The way of a parameter point: `equilibria` and `cycles` of flows, `searching` for orbits, `extending` what no
-orbit accounts for, `labelling` cells and sets. `hysteresis.hysteresis` says where a continuation in both
-directions meets other attractors.
+The modules work on a parameter point in this order: `equilibria` and `cycles` find the equilibria and the
+limit cycles of flows, `searching` finds orbits, `extending` integrates the remaining cells further, and
+`labelling` labels cells and describes sets. `hysteresis.hysteresis` finds where a continuation meets
+different attractors going up and going down.
 
 Schema
 ------
@@ -22,10 +23,10 @@ variable                 dims                                  dtype, fill  mean
 ``decision``             parameter dims, start dims            int8, 0      how it was decided, see below
 ``status``               parameter dims, start dims            int8         as in the cube
 ``ran_out``              parameter dims                        int8, 0      1 if the budget of the extension
-                                                                            ended before all was told
+                                                                            ended before all was decided
 ``kind``                 parameter dims, attractor             int8, 0      `vocabulary.KINDS`
 ``stability``            parameter dims, attractor             int8, 0      `vocabulary.STABILITIES`
-``evidence``             parameter dims, attractor             int8, 0      what the stability rests on:
+``evidence``             parameter dims, attractor             int8, 0      evidence for the stability:
                                                                             `vocabulary.EVIDENCE`
 ``orbit_period``         parameter dims, attractor             int32, 0     drive periods; 0 if not periodic
 ``n_cells``              parameter dims, attractor             int64, 0     cells
@@ -54,12 +55,12 @@ variable                 dims                                  dtype, fill  mean
 ``eigenvalue_real``,     parameter dims, attractor, multiplier float64, NaN of an equilibrium [1/s], by
 ``eigenvalue_imag``                                                         falling real part
 ``n_sampled``            parameter dims, attractor             int64, 0     its cells that were extended
-``n_left``               parameter dims, attractor             int64, 0     of these, that left it
+``n_left``               parameter dims, attractor             int64, 0     extended cells that left it
 ``n_leaving``            parameter dims, attractor             int64, 0     extended cells near their end
                                                                             from the start
 ``n_to``                 parameter dims, attractor,            int64, 0     cells that left, by the id of the
                          destination                                        set that they ended on
-``time_at_risk``         parameter dims, attractor             float64, NaN of all together [drive periods]
+``time_at_risk``         parameter dims, attractor             float64, NaN sum over cells [drive periods]
 ``mean_lifetime``,       parameter dims, attractor             float64, NaN lifetime and its interval, or its
 ``lifetime_low``,                                                           lower bound and infinity [drive
 ``lifetime_high``                                                           periods]; see `lifetimes`
@@ -67,32 +68,32 @@ variable                 dims                                  dtype, fill  mean
                                                                             with, above the longest looked for
 ======================== ===================================== ============ ==================================
 
-`attractor_points` are NaN beyond the set's own: an orbit's points in the order of time, or a sample of
-another set. What the model does not have (angles, a classifier, an energy, a symmetry) has no
-variable. Ranges of a polished orbit are those over its full period, angles as they run on from the first
-point and -pi to pi for one that rotates; all others are those of the kept sections, and
-the energy of other sets that of their stored points.
+`attractor_points` holds an orbit's points in the order of time, or a sample of any other set; the rest of the
+row is NaN. A model without angles, classifier, energy or symmetry lacks the variables that need it. For a
+polished orbit, ranges cover the full period; angles are unwrapped from the first point, and an angle that
+rotates has the range -pi to pi. For all other sets, state ranges cover the kept sections, and energy ranges
+the stored points.
 
 Distances are in units of the states' scales (1 rad, 10 rad/s for the pendulum), angles on their circle;
 states are in the units of the coordinate ``state_units``.
 From `identify` an id numbers the sets of one parameter point (attribute ``matched`` 0), in
 lexicographic order of the least section point; from `match` it follows a set (``matched`` 1), and
 where that set is absent its row holds the fill values. `match` adds ``match_basis`` (int8, parameter
-dims, attractor): what the id rests on there; `matching` says what an id is.
+dims, attractor): the evidence for the id there. `matching` defines an id.
 
-What is listed is a *set* that cells are on. Only a set with the stability ``attracts`` is an attractor; what
-shows it is in `stability`. `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on the
-orbit, 3 approaching the orbit, 4 one of the set, 5 ended there when it was extended, 6 at rest (see
+Each row lists a *set* that cells are on. Only a set with the stability ``attracts`` is an attractor; see
+`stability` for the criteria. `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on
+the orbit, 3 approaching the orbit, 4 one of the set, 5 ended there when it was extended, 6 at rest (see
 `equilibria`), 7 diverged when it was extended (no id); `deciding.decide` has the criteria. A cell that is
 not bounded (diverged, step limit, pending, unreached, or without a return and yet not at rest) has the id -1
-and its own `status`; a bounded one that belongs to nothing found has the id -1 and `decision` 0: it is not
-settled.
+and its own `status`. A bounded cell that belongs to no set has the id -1 and `decision` 0: it is not settled.
 
-A run with a loose `closure_tolerance` (1e-3 and more) is short, and its closed cells say little: sections
-recur within a few per cent near unstable orbits too, and near a period doubling with half the period.
-There a cell belongs only to a polished orbit that attracts, if it is near enough or spirals in; all others
-are run on (`orbits.run_on`) until they close within 1e-5, or stay undecided. So no attractor is made of a
-loose closure alone, and the periods are the orbits' own.
+A run with a loose `closure_tolerance` (above 1e-4, which makes the default `tolerance` of `identify` exceed
+1e-3) is short, and closure proves little: sections also recur
+within a few per cent near unstable orbits, and with half the period near a period doubling. In this case a
+cell is assigned to an orbit only if the orbit is polished and attracts, and the cell is near enough or
+spirals in. All other cells are integrated further (`orbits.run_on`) until they close within 1e-5, or stay
+undecided. A loose closure alone never makes an attractor, and periods are those of polished orbits.
 """
 
 from __future__ import annotations
@@ -151,21 +152,21 @@ def identify(
     ds
         Cube with `section`, `status`, `orbit_period`, and `turns` if there is rotation.
     options
-        By default those of `IdentifyOptions`. Its `tolerance` of 0 stands for ten times the attribute
+        By default the defaults of `IdentifyOptions`. A `tolerance` of 0 stands for ten times the attribute
         ``closure_tolerance`` of `ds`, and 1e-4 at least: a slow spiral can be eight times the closure
-        tolerance away (`magpend_core.engine.observers.closed_period`). Above 1e-3 the run is taken as
+        tolerance away (`magpend_core.engine.observers.closed_period`). Above 1e-3 the run counts as
         loosely closed, see the text of this module. Without `polish` closed cells are grouped by distance
         alone, no spiral is recognised, and features that need integration are missing.
     parameters
-        What was integrated; by default as `ds.attrs` say. Axes of the cube replace the values of the
-        same name. With another `system`, its packed vector.
+        Parameters of the run, by default from `ds.attrs`. Axes of the cube replace the values of the
+        same name. If `system` is given, its packed parameter vector.
     system
-        By default that of the run's model. With one of its own there is neither energy nor mirror image nor
-        side.
+        By default the system of the run's model. With another system the result has no energy, mirror image
+        or side.
     block_bytes
-        Sections held in memory at once [bytes]; changes nothing in the result.
+        Most memory for sections at once [bytes]; does not change the result.
     changes
-        Fields of the options, instead of `options`.
+        Fields of `IdentifyOptions`, used if `options` is None.
 
     Returns
     -------
@@ -210,7 +211,7 @@ def _flags(words: str) -> dict[str, Any]:
 
 
 def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Search) -> xr.Dataset:
-    """Result of `identify`, in the schema of the module."""
+    """Build the result of `identify` in the schema of this module."""
     dims, start_dims = split_dims(ds["status"])
     shape = tuple(ds.sizes[d] for d in dims)
     table = _filled(ds, dims, shape, found, search)
@@ -243,7 +244,7 @@ def _filled(
     ds: xr.Dataset, dims: tuple[str, ...], shape: tuple[int, ...],
     found: Mapping[tuple[int, ...], Found], search: Search,
 ) -> _Table:  # fmt: skip
-    """Table of the attractors of all parameter points."""
+    """Fill the table of the attractors of all parameter points."""
     n = max((len(f.features) for f in found.values()), default=0)
     longest = max((len(x.points) for f in found.values() for x in f.features), default=0)
     n_states = ds.sizes["state"]
@@ -260,7 +261,7 @@ def _filled(
 
 
 def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
-    """Take the largest exponent of sets that do not close from the cube, where it has one."""
+    """Copy the largest Lyapunov exponent from the cube, if it has one, to the sets that do not close."""
     if "lyapunov" not in ds:
         return result
     dims, signs = result["attractor_id"].dims, ChaosOptions()
@@ -272,7 +273,7 @@ def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
         point, i = tuple(index[:-1]), index[-1]
         which = (ids[point] == i) & counts[point]
         if which.any():
-            # in rising order, so that the last bit does not depend on that of the cells
+            # sum in rising order, so that the last bit does not depend on the order of the cells
             order = np.argsort(rate[point][which], kind="stable")
             own, errors = rate[point][which][order], error[point][which][order]
             _, stderr, _ = pooled_mean(own[None], errors[None], np.ones((1, own.size), bool))
@@ -327,11 +328,11 @@ _ELSEWHERE = (
     "n_cells", "share", "attractor_points", "multiplier_real", "multiplier_imag", "eigenvalue_real",
     "eigenvalue_imag", "n_to",
 )  # fmt: skip
-"""Variables that are no attribute of `Features`."""
+"""Variables that are not copied from an attribute of `Features`."""
 
 
 def _names(dynamics: Dynamics) -> list[str]:
-    """Names of the variables: what the model does not know is left out."""
+    """Names of the variables, without those that the model cannot provide."""
     model = dynamics.model
     has_energy = model is not None and any(q.name == ENERGY for q in model.quantities)
     left_out = {
@@ -360,7 +361,7 @@ class _Table:
             self.arrays[name] = np.full((*shape, n, *(sizes[d] for d in own)), fill, dtype)
 
     def fill(self, at: tuple[int, ...], x: Features, n_cells: int) -> None:
-        """Write one set."""
+        """Write the features of one set into the arrays."""
         arrays = self.arrays
         arrays["n_cells"][at] = n_cells
         if x.n_to is not None:
@@ -376,7 +377,7 @@ class _Table:
             arrays[name][at] = getattr(x, name)
 
     def share(self, index: tuple[int, ...], one: Found) -> None:
-        """Write the shares of a point's attractors among its cells with an outcome."""
+        """Write the shares of a point's attractors among its cells that attract or diverge."""
         counts = np.array(one.counts, np.int64)
         attracts = np.array([x.stability == ATTRACTS for x in one.features], bool)
         total = int(counts[attracts].sum()) + self.n_diverged[index] + int((one.decision == DIVERGES).sum())
@@ -384,7 +385,7 @@ class _Table:
             self.arrays["share"][index][: len(counts)] = np.where(attracts, counts / total, 0.0)
 
     def variables(self) -> dict[str, Any]:
-        """As xarray takes them."""
+        """Return the arrays as (dims, values, attributes) for xarray."""
         more: dict[str, dict[str, Any]] = {
             "kind": _flags(" ".join(KINDS)), "stability": _flags(" ".join(STABILITIES)),
             "evidence": _flags(" ".join(EVIDENCE)),

@@ -1,4 +1,4 @@
-"""Sets that do not close: what extended cells show of them."""
+"""Describe sets that do not close, from the extended trajectories of their cells."""
 
 from __future__ import annotations
 
@@ -16,34 +16,36 @@ from pipeline.analysis.attractors.requests import LEG, Settings, Slopes, Work
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TRANSIENT
 
 SLOPES = (1024, 4096)
-"""Most derivatives of the section map for the exponents of a set: first, and where these decide nothing."""
+"""Most derivatives of the section map for the exponents of a set: at first, and if the first are too few."""
 
 MOST_SHAPED = 1024
-"""Most section points by which a torus is told."""
+"""Most section points that the test for a torus uses."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoundedSet:
-    """A set that does not close, and what was shown of it.
+    """A set that does not close: its kind, stability and evidence.
 
     Attributes
     ----------
     cells : ndarray of int64
         Sampled cells that are on it at the end.
     cloud : Cloud or None
+        Section points to compare other cells with.
     points : ndarray, (n, state)
         Some of its section points.
     kind, stability, evidence : int
+        Codes of `vocabulary.KINDS`, `STABILITIES` and `EVIDENCE`.
     growth : Growth or None
         None if there are not enough sections.
     n_sampled, n_left, n_leaving : int
-        Cells that were extended, that left it, and that were near their end from the start.
+        Numbers of cells that were extended, that left it, and that were near their end from the start.
     time_at_risk : float
-        Of all sampled cells together [drive periods or returns].
+        Sum over all sampled cells [drive periods or returns].
     ended : dict
-        Where cells that left it went: numbers of cells by `Course.end`.
+        Numbers of cells that left it, by `Course.end`.
     closes_above : int
-        Period that it may close with, above the longest looked for; 0 if none is seen.
+        Period with which it may close, longer than the search allows; 0 if none is seen.
     """
 
     cells: np.ndarray
@@ -62,7 +64,7 @@ class BoundedSet:
 
     @classmethod
     def neutral(cls) -> BoundedSet:
-        """Everything in a flow that preserves volume."""
+        """Return the set of all cells of a flow that preserves volume."""
         none = np.zeros(0, np.int64)
         evidence = stability.BY_VOLUME
         return cls(none, None, none, BOUNDED_SET, NEUTRAL, evidence, None, 0, 0, 0, 0.0, {})
@@ -71,7 +73,21 @@ class BoundedSet:
 def describe(
     own: Sequence[Course], left: Sequence[Course], point: Point, settings: Settings, has_stayed: bool
 ) -> Work[BoundedSet]:
-    """Kind, stability and lifetimes of the set that some cells are on, and that others have left."""
+    """Return the kind, stability and lifetimes of a set, from the cells that stayed and those that left.
+
+    Parameters
+    ----------
+    own
+        Cells on the set.
+    left
+        Cells that left it.
+    point
+        Parameter point of the cells.
+    settings
+        Tolerances and the integration.
+    has_stayed
+        Whether the cells stayed long enough for a verdict.
+    """
     paths = [course.stayed for course in own]
     pooled = np.concatenate(paths)
     growth, kind = None, BOUNDED_SET
@@ -92,7 +108,7 @@ def describe(
 
 
 def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
-    """Return the set that cells were on before they left, where none of the sample stayed."""
+    """Return the transient set that cells were on before they left, when no sampled cell stayed."""
     paths = [course.stayed for course in left]
     return BoundedSet(
         np.zeros(0, np.int64), Cloud.of(paths, settings.geometry, settings.closure), np.concatenate(paths),
@@ -102,7 +118,7 @@ def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
 
 
 def ends_of(left: Iterable[Course]) -> dict[int, int]:
-    """Numbers of cells by where they ended."""
+    """Count cells by their end."""
     ended: dict[int, int] = {}
     for course in left:
         ended[course.end] = ended.get(course.end, 0) + 1
@@ -110,7 +126,7 @@ def ends_of(left: Iterable[Course]) -> dict[int, int]:
 
 
 def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
-    """Whether a cell that left was before on the set that others are on."""
+    """Return whether a cell was on the set of `own` before it left."""
     points = np.concatenate([other.stayed for other in own])
     return bool(mixing(course.stayed, points, settings.geometry, settings.closure) >= OTHER)
 
@@ -131,7 +147,7 @@ def _verdict(
 
 
 def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) -> Work[Growth | None]:
-    """Exponents of the section map along the extended cells of a set; None if they are too short."""
+    """Compute the exponents of the section map along extended cells; None if there are too few sections."""
     n = min(course.length for course in own)
     if n < LEG:
         return None
@@ -139,7 +155,7 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
     most = min(most, max(256, 20_000_000 // n_states**2))
     n_cells = max(1, min(len(own), most // min(n, most)))
     n = min(n, most // n_cells)
-    # the last ones: transients are over
+    # use the last sections, when transients are over
     paths = np.stack([course.extension[-n:] for course in own[:n_cells]])
     before = paths[:, :-1].reshape(-1, n_states)
     after, slopes = yield Slopes(before)
@@ -153,7 +169,7 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:
-    """Least period above the longest looked for that the cells of a contracting set come back after."""
+    """Return the least period beyond the search limit with which a contracting set recurs; 0 if none."""
     if growth is None or not growth.contracts:
         return 0
     path = min((c.extension for c in own), key=len)

@@ -1,4 +1,4 @@
-"""Cells of one parameter point in blocks, and the guesses of closed orbits that they make."""
+"""Hold the cells of one parameter point in blocks, and collect guesses of closed orbits from them."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Block:
     rest : ndarray, (cell, state), or None
         States in which cells waited in vain for a return, if sections are crossings of a flow.
     seconds : ndarray, (cell, period_index), or None
-        Time since the section before each [s].
+        Time from the previous section to each [s].
     step : ndarray, (cell,), or None
-        Step size with which each goes on from its last section, bit for bit [s].
+        Step size that continues each cell bit for bit from its last section [s].
     """
 
     cells: slice
@@ -39,20 +39,20 @@ class Block:
     step: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Block:
-        """Cells by row; their places are no longer those of `cells`."""
+        """Return the cells of some rows; `cells` no longer gives their places."""
         return Block(
             self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows]
         )
 
     @property
     def is_closed(self) -> np.ndarray:
-        """Cells whose sections close, or that were inferred to lie among such cells."""
+        """Whether each cell's sections close, or its period was inferred from its neighbours."""
         closed = np.isin(self.status, (Status.PERIODIC, Status.INFERRED))
         return np.asarray(closed & (self.orbit_period > 0) & self._finite)
 
     @property
     def is_bounded(self) -> np.ndarray:
-        """Cells that were computed to the end and do not close."""
+        """Whether each cell was computed to the end and does not close."""
         computed = np.isin(self.status, (Status.PERIODIC, Status.BOUNDED))
         return np.asarray(computed & self._finite & ~self.is_closed)
 
@@ -63,20 +63,20 @@ class Block:
 
 @dataclass(frozen=True)
 class Guesses:
-    """Cells that may lie on an orbit: the best one of each box.
+    """Guesses for closed orbits: the best cell of each box.
 
     Attributes
     ----------
     key : ndarray of uint64
         The box.
     score : ndarray
-        The smaller, the better.
+        Smaller is better.
     mark : ndarray of uint64
         Hash of the cell's own sections; decides between equal scores.
     point : ndarray, (n, state)
         Last section point.
     period : ndarray of int64
-        0 if it is not known: then the point is to be run on until it closes.
+        Period; 0 if unknown, and then the point is integrated further until it closes.
     """
 
     key: np.ndarray
@@ -87,13 +87,13 @@ class Guesses:
 
     @classmethod
     def none(cls, n_states: int) -> Guesses:
-        """No guess."""
+        """Return an empty collection."""
         empty = np.zeros(0)
         whole = np.zeros(0, np.uint64)
         return cls(whole, empty, whole, np.zeros((0, n_states)), np.zeros(0, np.int64))
 
     def take(self, rows: np.ndarray) -> Guesses:
-        """Guesses by row."""
+        """Return the guesses of some rows."""
         return Guesses(self.key[rows], self.score[rows], self.mark[rows], self.point[rows], self.period[rows])
 
     def best(self, key: np.ndarray | None = None) -> Guesses:
@@ -105,20 +105,20 @@ class Guesses:
         return self.take(order[first])
 
     def least(self, n: int) -> Guesses:
-        """Return the `n` of least score, in the order of their marks."""
+        """Return the `n` guesses of least score, in the order of their marks."""
         least = np.lexsort((self.mark, self.score))[:n]
         return self.take(least[np.argsort(self.mark[least], kind="stable")])
 
     def without_period(self) -> Guesses:
-        """Return the same points, their period unknown."""
+        """Return the same guesses with unknown periods."""
         return Guesses(self.key, self.score, self.mark, self.point, np.zeros_like(self.period))
 
     def joined(self, other: Guesses) -> Guesses:
-        """Both, reduced to the best per key."""
+        """Return the best guess per key of this collection and another."""
         return self.followed_by(other).best()
 
     def followed_by(self, other: Guesses) -> Guesses:
-        """Both, one after the other."""
+        """Return this collection followed by another."""
         names = ("key", "score", "mark", "point", "period")
         return Guesses(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
@@ -127,10 +127,10 @@ class Guesses:
 class ClosedCells:
     """Groups of closed cells, by the boxes that their last sections fall into.
 
-    A cell of period p has its last p sections (cyclic: which of them comes last does not matter).
-    Boxes of side `tolerance` that touch belong together, and so do all boxes of one cell; cells of
-    one period whose boxes are connected are a group. Cells with a point closer than `tolerance` to
-    each other are therefore in one group, whatever the order in which they come.
+    A cell of period p contributes the boxes of its last p sections, whose order does not matter.
+    Boxes of side `tolerance` that touch are connected, and so are all boxes of one cell. Cells of
+    one period whose boxes are connected form a group. So two cells with points closer than `tolerance`
+    are in one group, in whatever order cells are added.
     """
 
     geometry: Geometry
@@ -141,7 +141,7 @@ class ClosedCells:
     _edges: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block) -> None:
-        """Take in the closed cells of a block."""
+        """Add the closed cells of a block."""
         for p in np.unique(block.orbit_period[block.is_closed]):
             cells = np.flatnonzero(block.is_closed & (block.orbit_period == p))
             section = block.section[cells]
@@ -164,7 +164,7 @@ class ClosedCells:
         self._keys.append(unique)
 
     def close(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return all boxes' keys in rising order and the group of each."""
+        """Return the keys of all boxes in rising order, and the group of each box."""
         if not self._keys:
             return np.zeros(0, np.uint64), np.zeros(0, np.int64)
         keys, first = np.unique(np.concatenate(self._keys), return_index=True)
@@ -176,7 +176,7 @@ class ClosedCells:
         return keys, groups(len(keys), np.concatenate(pairs))
 
     def group_of(self, block: Block, keys: np.ndarray, group: np.ndarray) -> np.ndarray:
-        """Group of each cell of a block, -1 if it is not closed."""
+        """Return the group of each cell of a block; -1 for cells that are not closed."""
         found = np.full(len(block.status), -1, np.int64)
         for p in np.unique(block.orbit_period[block.is_closed]):
             cells = np.flatnonzero(block.is_closed & (block.orbit_period == p))
@@ -186,12 +186,12 @@ class ClosedCells:
 
 
 def _rows_of(points: np.ndarray, p: int, geometry: Geometry, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Period and box of each point, as rows of whole numbers and as keys."""
+    """Return the period and box of each point, as rows of integers and as hashed keys."""
     boxes = geometry.boxes(points, side)
     rows = np.concatenate([np.full((*boxes.shape[:-1], 1), p, np.int64), boxes], axis=-1)
     return rows, hashes(rows)
 
 
 def marks_of(section: np.ndarray) -> np.ndarray:
-    """Hash of each cell's sections."""
+    """Return a hash of each cell's sections (cell, period_index, state)."""
     return hashes(section.reshape(len(section), section.shape[1] * section.shape[2]))

@@ -1,15 +1,15 @@
-"""Section points of sets that do not close: whether two samples show one set, and which set a cell is on.
+"""Decide by nearest neighbours whether two samples show one set, and which set a cell is on.
 
-Two trajectories on one ergodic set visit the same points equally often; two sets that attract have a
-distance. So the later half of either sample looks for its nearest neighbours among equally many points
-of the earlier half of its own sample and of the other one. The share of neighbours in the other sample
-is one half for samples of one set, and falls to 0 for two sets once the points are denser than the gap.
-That a half looks at another half keeps neighbours in time, which every trajectory finds in itself, out
+Two trajectories on one ergodic set visit the same points equally often; two attractors are a distance
+apart. So each point of the later half of a sample looks for its nearest neighbour among equally many points
+of the earlier half of its own sample and of the other sample. The share of neighbours in the other sample
+is one half for samples of one set. For two sets it falls to 0 once the points are denser than the gap.
+Comparing one half with the other excludes neighbours in time, which every trajectory finds in itself
 (Schilling, J. Am. Stat. Assoc. 81, 799, 1986, has the statistic for independent points).
 
-Samples are one set from `SAME` on, two below `OTHER`; in between more points decide, and in the end one
-set is assumed: two sets with a distance do not stay there. The measured rate of errors is in
-docs/attractors.md.
+A share of `SAME` or more means one set, and a share below `OTHER` means two. In between more points decide.
+If a share stays in between, one set is assumed, since the share of two separate sets would keep falling. The
+measured rate of errors is in docs/attractors.md.
 """
 
 from __future__ import annotations
@@ -23,19 +23,20 @@ from scipy.spatial import cKDTree
 from pipeline.analysis.sets import Geometry
 
 SAME, OTHER = 0.25, 0.05
-"""Shares of neighbours in the other sample from which two samples are one set, and below which two."""
+"""Share of neighbours in the other sample from which two samples are one set, and below which two sets."""
 
 MOST_POINTS = 4096
-"""Most points of a sample that are compared."""
+"""Most points per sample in a comparison."""
 
 INSIDE, REACHED = 0.9, 3.0
-"""A cell is on a set if this share of its points lies within this many times the set's own spacing."""
+"""A cell is on a set if the share `INSIDE` of its points lies within `REACHED` times the set's spacing."""
 
 
 def thinned(points: np.ndarray, n: int) -> np.ndarray:
-    """At most `n` points of a sample, in the order of time.
+    """Return at most `n` points of a sample (m, state), in the order of time.
 
-    They are drawn at random, always the same: every second one of a set in two pieces is one piece.
+    Points are drawn at random with a fixed seed. A regular stride would be wrong: on a set of two pieces that
+    alternate, every second point lies on one piece.
     """
     if len(points) <= n:
         return points
@@ -44,16 +45,16 @@ def thinned(points: np.ndarray, n: int) -> np.ndarray:
 
 
 def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0) -> float:
-    """Share of the nearest neighbours that lie in the other of two samples, the smaller of both ways.
+    """Compute the share of nearest neighbours in the other sample, the smaller of both directions.
 
     Parameters
     ----------
     a, b
         Section points in the order of time, shapes (n, state) and (m, state).
     geometry
-        Of the states.
+        Geometry of the states.
     least
-        Scaled distances up to this count as none: two cells that close on one orbit are on one set.
+        Scaled distances up to this count as 0: two cells that close on one orbit are on one set.
 
     Returns
     -------
@@ -68,16 +69,16 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0)
 
 
 def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float) -> float:
-    """Share of the later half of `own` whose nearest neighbour lies in `other`."""
-    # points from all of the other sample's time
+    """Compute the share of points in the later half of `own` whose nearest neighbour lies in `other`."""
+    # take points from the whole duration of the other sample
     trees = [geometry.tree(points) for points in (own[:n], thinned(other, n))]
     near = [np.maximum(tree.query(geometry.scaled(own[n : 2 * n]), p=np.inf)[0], least) for tree in trees]
-    # points that are near both count half
+    # a point equally near to both counts half
     return float((near[1] < near[0]).mean() + 0.5 * (near[1] == near[0]).mean())
 
 
 def is_stationary(path: np.ndarray, geometry: Geometry, least: float = 0.0) -> bool:
-    """Whether the early and the late half of a trajectory fill the same points."""
+    """Return whether the early and the late half of a trajectory show the same set."""
     half = len(path) // 2
     share = mixing(path[:half], path[half:], geometry, least)
     return bool(share >= OTHER)
@@ -91,16 +92,16 @@ def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0)
     samples
         Points of each cell in the order of time, shape (n, state) each.
     geometry
-        Of the states.
+        Geometry of the states.
     least
-        As for `mixing`.
+        Scaled distances up to this count as 0, see `mixing`.
 
     Returns
     -------
     set : ndarray of int64
         Number of the set of each sample, in the order in which they appear.
     is_sure : bool
-        Whether no pair of sets was in doubt.
+        Whether no share lay between `OTHER` and `SAME`.
     """
     sets: list[list[int]] = []
     is_sure = True
@@ -111,7 +112,7 @@ def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0)
         if not near:
             sets.append([i])
             continue
-        # a sample that is near several joins them
+        # a sample near several sets joins them
         joined = sorted(k for n in near for k in sets[n])
         sets = [own for n, own in enumerate(sets) if n not in near]
         sets.append([*joined, i])
@@ -122,7 +123,7 @@ def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0)
 
 
 def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
-    """Points of several samples as one, an equal part of each, the times interleaved."""
+    """Merge samples into one: equally many points of each, interleaved in time."""
     each = max(4, MOST_POINTS // len(samples))
     parts = [thinned(sample, each) for sample in samples]
     n = min(len(part) for part in parts)
@@ -131,12 +132,12 @@ def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Section points of one set, as other cells are held against it.
+    """Section points of one set, to compare other cells with.
 
     Attributes
     ----------
     tree : cKDTree
-        Of the scaled points.
+        Tree of the scaled points.
     spacing : float
         Scaled distance within which nearly every point of the set finds another.
     """
@@ -146,22 +147,22 @@ class Cloud:
 
     @classmethod
     def of(cls, samples: Sequence[np.ndarray], geometry: Geometry, least: float) -> Cloud:
-        """Cloud of the points of some cells, its spacing `least` or more."""
+        """Build the cloud of some cells' points, with a spacing of at least `least`."""
         points = _pooled(samples)
-        # from the one half to the other: the whole is twice as dense
+        # distances from one half to the other: a safe spacing, since the whole is twice as dense
         order = np.random.default_rng(0).permutation(len(points))
         half, rest = np.array_split(points[order], 2)
         away = geometry.tree(half).query(geometry.scaled(rest), p=np.inf)[0] if len(rest) else np.zeros(1)
         return cls(geometry.tree(points), max(float(np.quantile(away, 0.99)), least))
 
     def distances(self, section: np.ndarray, geometry: Geometry) -> np.ndarray:
-        """Distance of each section point (..., state) from the set, in units of its spacing."""
+        """Return the distance of each section point (..., state) from the set, in units of its spacing."""
         away = self.tree.query(geometry.scaled(section), p=np.inf)[0]
         return np.asarray(away / self.spacing)
 
 
 def members(section: np.ndarray, clouds: Sequence[Cloud], geometry: Geometry) -> np.ndarray:
-    """Set that each cell is on by its kept sections (cell, period_index, state), -1 for none."""
+    """Return the set that each cell is on by its sections (cell, period_index, state); -1 for none."""
     if not clouds or not len(section):
         return np.full(len(section), -1, np.int64)
     away = np.stack([cloud.distances(section, geometry) for cloud in clouds])

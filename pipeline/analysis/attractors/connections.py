@@ -1,4 +1,4 @@
-"""Which appearances of closed orbits, at different parameter points, lie on one followed branch."""
+"""Connect closed orbits at different parameter points by following their branches."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ Place = tuple[tuple[int, ...], int]
 
 @dataclass(frozen=True, eq=False)
 class Connections:
-    """What continuation says of appearances, which are numbered by their index in a list.
+    """Connections between appearances of attractors, numbered by their index in a list.
 
     Attributes
     ----------
     group : ndarray
-        Least number of what is connected with each.
+        Least number among the appearances that are connected with each.
     branch : ndarray
-        Likewise, connected without a period doubling.
+        Least number among those that are connected without a period doubling.
     followed : ndarray of bool
-        Whether it was followed.
+        Whether each was followed.
     outcomes : dict
-        By axis, way (1 or -1) and number; values of `pipeline.analysis.branches.connecting.Links`.
+        How following ended, by axis, direction (1 or -1) and number; values as in
+        `pipeline.analysis.branches.connecting.Links`.
     """
 
     group: np.ndarray
@@ -40,11 +41,11 @@ class Connections:
 
     @classmethod
     def none(cls, n: int) -> Connections:
-        """Nothing is connected, since nothing was followed."""
+        """Return `n` appearances that were not followed and are not connected."""
         return cls(np.arange(n), np.arange(n), np.zeros(n, bool))
 
     def may_be_one(self, axis: int, first: tuple[int, int], second: tuple[int, int]) -> bool:
-        """Whether distance may decide on two appearances, the first at the lower value of an axis.
+        """Return whether distance may match two appearances, the first at the lower value of an axis.
 
         Parameters
         ----------
@@ -61,7 +62,7 @@ class Connections:
 
 
 def followable(attractors: xr.Dataset, at: Place) -> bool:
-    """Whether an appearance is a closed orbit that Newton's method has found."""
+    """Return whether an appearance is a closed orbit on which Newton's method converged."""
     index, row = at
     if "is_polished" not in attractors:
         return False
@@ -88,11 +89,11 @@ def connections(
     dims
         Parameter dims.
     packed
-        Packed parameters; axes replace their own.
+        Packed parameters; the axes replace the values of the same name.
     frequency
-        Drive frequency [Hz], if that is no axis.
+        Drive frequency [Hz], used if it is not an axis.
     system
-        What was integrated.
+        System of the run.
     """
     orbits = {n: _orbit(attractors, place) for n, place in enumerate(places) if followable(attractors, place)}
     followed = np.zeros(len(places), bool)

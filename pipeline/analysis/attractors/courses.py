@@ -1,4 +1,4 @@
-"""Sampled cells on their way from the last section that a run kept, and where they end."""
+"""Follow sampled cells from the last section that a run kept to where they end."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 LEAST_SEEN = 8
-"""Fewest section points of a cell on a set that it left."""
+"""Fewest section points on a set for a cell to count as having left it."""
 
 ON_SET, FAILED, DIVERGED, AT_REST = -1, -2, -3, -4
-"""Ends of extended cells that are no orbits; `AT_REST` minus a number is an equilibrium."""
+"""Ends of extended cells other than orbits; `AT_REST` minus k is the equilibrium number k."""
 
 
 @dataclass
 class Course:
-    """A sampled cell on its way.
+    """A sampled cell and its extension.
 
     Attributes
     ----------
@@ -24,17 +24,17 @@ class Course:
     key : int
         Box of its last kept section.
     kept : ndarray, (n, state)
-        Sections of the run.
+        Sections that the run kept.
     state, step
-        With which it goes on.
+        State (state,) and step size [s] with which the integration continues.
     legs : list of ndarray
-        Sections since.
+        Sections of the extension, leg by leg.
     end : int
         Number of an orbit, or one of the codes above.
     periods : float
-        Drive periods or returns from its last kept section until it came near where it ended.
+        Drive periods or returns from its last kept section until it came near its end.
     is_leaving : bool
-        Whether it was near there from the start.
+        Whether it was near its end from the start.
     """
 
     cell: int
@@ -54,27 +54,27 @@ class Course:
 
     @property
     def extension(self) -> np.ndarray:
-        """All sections since, shape (n, state)."""
+        """All sections of the extension, shape (n, state)."""
         return np.concatenate([self.kept[:0], *self.legs])
 
     @property
     def stayed(self) -> np.ndarray:
-        """Section points on the set: the whole extension, or of a cell that left what was before."""
+        """Section points on the set: the whole extension, or the part before the cell left."""
         if self.goes_on:
             return self.extension if self.legs else self.kept
         return np.asarray(self.extension[: int(self.periods)])
 
     @property
     def has_left(self) -> bool:
-        """Whether it ended, and stayed elsewhere for some time before."""
+        """Whether it ended after at least `LEAST_SEEN` sections elsewhere."""
         return not self.goes_on and not self.is_leaving and len(self.stayed) >= LEAST_SEEN
 
     @property
     def length(self) -> int:
-        """Sections since."""
+        """Number of sections of the extension."""
         return sum(len(leg) for leg in self.legs)
 
 
 def rest_number(end: int) -> int | None:
-    """Number of the equilibrium that an end stands for, None if it is another end."""
+    """Return the number of the equilibrium that an end code stands for; None for other ends."""
     return AT_REST - end if end <= AT_REST else None

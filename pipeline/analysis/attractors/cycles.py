@@ -1,10 +1,10 @@
-"""Limit cycles of flows that are looked at at even times: each is one, however many phases it is seen at.
+"""Find the limit cycles of autonomous flows that are sampled at equal times.
 
-Seen once per period of a strobe, a limit cycle is a curve that sections fill if the two periods have no
-common multiple. If they have, every cell closes at the phase that it happens to have: as many closed orbits
-as cells, with a multiplier 1 along the flow at which Newton's method on the stroboscopic map fails. So cells
-are looked at where they cross a level instead, that of one of them: the return map there has the cycle as a
-periodic point (`magpend_core.orbits`), and all cells on the cycle cross the level at the same points.
+Sampled once per strobe period, a limit cycle is a curve, which sections fill if the two periods have no
+common multiple. If they have one, every cell closes at its own phase: there are as many closed orbits as
+cells, and Newton's method on the stroboscopic map fails at the multiplier 1 along the flow. So this module
+takes the crossings of a level of one state instead, the level of one of the cells. The return map there has
+the cycle as a periodic point (`magpend_core.orbits`), and all cells on the cycle cross at the same points.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ RETURNS = 32
 """Most crossings of the level per period."""
 
 CLOSE = 1e-2
-"""Scaled distance at which a return is tried as that of a cycle."""
+"""Scaled distance within which a return is tried as the period of a cycle."""
 
 TRIES = 3
-"""Cells that may turn out to be on no cycle, one after the other, until the others are left as they are."""
+"""Cells without a cycle after which the search at a parameter point ends."""
 
 RTOL = 1e-9
-"""Tolerance of the trajectories to the level."""
+"""Tolerance of the trajectories between crossings."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Cycle:
     multipliers : ndarray of complex, (state,)
         Floquet multipliers by falling modulus; one is 1, along the flow.
     residual : float
-        Certificate of `polish_orbits`.
+        Residual of `polish_orbits`.
     """
 
     seconds: float
@@ -54,14 +54,14 @@ class Cycle:
 
 
 class _Crossings:
-    """Looks at cells of a parameter point where one state crosses a level upwards.
+    """The crossings of a level by one state, upwards, for cells of a parameter point.
 
     Parameters
     ----------
     point
-        Of the cells.
+        Parameter point of the cells.
     state
-        Number of the state that crosses.
+        Index of the state that crosses.
     longest_s
         Longest wait for a crossing [s].
     """
@@ -72,7 +72,7 @@ class _Crossings:
         self.state = state
 
     def of(self, states: np.ndarray, level: float) -> np.ndarray:
-        """Crossings one after the other, shape (cell, RETURNS, state); NaN where there are not so many."""
+        """Return successive crossings, shape (cell, RETURNS, state), padded with NaN."""
         n = len(states)
         found = run_branches(
             np.tile(np.append(self._packed, level), (n, 1, 1)), np.full((n, 1), self._rate), states,
@@ -83,10 +83,10 @@ class _Crossings:
     def cycle_of(
         self, start: np.ndarray, geometry: Geometry, residual: float
     ) -> tuple[Cycle, np.ndarray] | None:
-        """Return the stable cycle that a state is on and its crossings of the level there, or None."""
+        """Return the stable cycle that a state is on and the cycle's crossings of the level, or None."""
         level = float(start[self.state])
         path = self.of(start[None], level)[0]
-        # a state that the level only just passes may begin with a crossing of its own
+        # a state almost tangent to the level may start with a crossing that is not the cycle's
         near = np.flatnonzero(geometry.distance(path[1:], path[0]) <= CLOSE)
         if not len(near):
             return None
@@ -96,7 +96,7 @@ class _Crossings:
         )
         if not found.converged[0] or not found.is_stable[0]:
             return None
-        own = found.multipliers[0][:-1]  # the last is 0 and stands for the flow's
+        own = found.multipliers[0][:-1]  # the last one is 0: the direction of the flow
         cycle = Cycle(float(found.seconds[0]), np.append(1.0 + 0.0j, own), float(found.residual[0]))
         return cycle, self.of(found.section, level)[0, : int(found.orbit_period[0])]
 
@@ -109,7 +109,7 @@ def tell_cycles(
     Parameters
     ----------
     points
-        Of a flow at even times, with their equilibria told.
+        Parameter points of a flow sampled at equal times, with known equilibria.
     tolerance
         Scaled distance within which a cell is on a cycle.
     longest
@@ -117,7 +117,7 @@ def tell_cycles(
     residual
         Scaled residual that Newton's method is to reach.
     geometry
-        Of the states.
+        Geometry of the states.
     """
     for point in points:
         _tell(point, tolerance, longest, residual, geometry)
@@ -130,7 +130,7 @@ def _tell(point: Point, tolerance: float, longest: int, residual: float, geometr
         return
     spread = np.ptp(geometry.scaled(states[rows]), axis=0)
     crossings = _Crossings(point, int(np.argmax(spread)), longest / point.frequency)
-    # closed cells first, and those that pass the level fast: where one only just passes it, crossings scatter
+    # try closed cells first, then fast crossings: crossings almost tangent to the level scatter
     speed = np.abs(rates_at(point.integrates, states[rows], point.packed)[:, crossings.state])
     left = rows[np.lexsort((hashes(states[rows]), -speed, ~is_closed[rows]))]
     on_cycle = np.full(point.n_cells, -1, np.int64)
@@ -143,7 +143,7 @@ def _tell(point: Point, tolerance: float, longest: int, residual: float, geometr
             continue
         cycle, where = found
         seen = crossings.of(states[left], float(states[left[0]][crossings.state]))
-        # the first crossings of a cell that is near the level may be those of its own distance from the cycle
+        # compare last crossings: the first ones may still show the cell's distance from the cycle
         away = np.stack([geometry.distance(seen[:, -1], x) for x in where]).min(axis=0)
         own = np.nan_to_num(away, nan=np.inf) <= tolerance
         own[0] = True
@@ -154,7 +154,7 @@ def _tell(point: Point, tolerance: float, longest: int, residual: float, geometr
 
 
 def _ends(point: Point) -> tuple[np.ndarray, np.ndarray]:
-    """Last state of each cell, NaN where it says nothing, and whether the cell is closed."""
+    """Return the last state of each cell, NaN unless bounded, and whether the cell is closed."""
     states = np.full((point.n_cells, point.n_states), np.nan)
     is_closed = np.zeros(point.n_cells, bool)
     for block in point.blocks():

@@ -1,10 +1,11 @@
-"""Equilibria of flows, and which cells are at one or on their way to it.
+"""Find the equilibria of flows, and the cells that are at an equilibrium or approach one.
 
-Newton's method on the rates looks for equilibria from the last states of cells, near or far. A cell belongs
-to a stable one if it waits near it for a return in vain, if it is on it within the tolerance of closed
-cells, or if its sections follow the equilibrium's linear flow towards it (`approaching`): a slow focus is
-crossed by the section thousands of times. It belongs to any other one only if it is on it exactly. Cells
-that wait far from all of them wait on, up to `WAITS` times as long, until they are near or do come back.
+Newton's method on the rates starts from the last states of cells, near or far. A cell belongs to a stable
+equilibrium in three cases: it had no return and stopped near the equilibrium; it lies on it within the
+tolerance of closed cells; or its sections follow the linear flow towards it (`approaching`), since a
+trajectory crosses the section thousands of times around a slow focus. A cell belongs to any other
+equilibrium only if it lies on it within `ON_IT`. Cells without a return far from all equilibria are
+integrated further, up to `WAITS` times as long, until they come near one or return.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from pipeline.analysis.sets import Geometry, hashes, rounded_points
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL
 
 NEAR = 0.1
-"""Largest scaled distance from a stable equilibrium of a state in which a cell waited in vain."""
+"""Largest scaled distance from a stable equilibrium at which a cell without a return counts as at rest."""
 
 WAITS = 16
-"""How often a cell that is near no equilibrium yet waits again for as long."""
+"""Most repetitions of the wait for a return, for cells that are near no equilibrium yet."""
 
 RTOL = 1e-8
-"""Tolerance of the trajectories of cells that wait."""
+"""Tolerance of the trajectories of cells that wait for a return."""
 
 ON_IT = 1e-9
 """Scaled distance from an equilibrium, stable or not, within which a cell is on it."""
@@ -40,30 +41,30 @@ SAME = 1e-6
 """Equilibria at most this far apart are one, and an orbit at most this far from one is that equilibrium."""
 
 MOST = 64
-"""Most equilibria of a parameter point: where whole lines of them attract there is no end of them."""
+"""Most equilibria of a parameter point: a line of equilibria has infinitely many."""
 
 ITERATIONS = 100
-"""Newton steps: at a degenerate equilibrium each takes only a part of the way."""
+"""Most Newton steps: near a degenerate equilibrium convergence is only linear."""
 
 GUESSES, GUESS_BOX = 64, 0.1
-"""Most states from which equilibria are looked for far away, and the side of the boxes that share one."""
+"""Most far states from which Newton's method starts, and the side of the boxes with one start each."""
 
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """A state that stays as it is.
+    """A state at which the rate is zero.
 
     Attributes
     ----------
     state : ndarray, (state,)
     eigenvalues : ndarray of complex, (state,)
-        Of the Jacobian [1/s], by falling real part.
+        Eigenvalues of the Jacobian [1/s], by falling real part.
     residual : float
         Scaled length of the last Newton step.
     jacobian : ndarray, (state, state)
-        In units of the scales [1/s].
+        Jacobian in units of the scales [1/s].
     approached_within : float
-        Scaled distance from which trajectories on both sides were seen to come nearer; 0 if not tried.
+        Scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen.
     """
 
     state: np.ndarray
@@ -75,7 +76,7 @@ class Equilibrium:
     @cached_property
     def eigenvalue_error(self) -> float:
         """Error of the largest real part of the eigenvalues [1/s]."""
-        # the state errs by its residual, or by more where it is degenerate, and the Jacobian with it
+        # the error of the state is its residual, or more if degenerate, and carries over to the Jacobian
         size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * float(
             np.abs(self.jacobian).max(initial=1.0)
         )
@@ -83,7 +84,7 @@ class Equilibrium:
 
     @cached_property
     def stability(self) -> int:
-        """By the eigenvalues' real parts and their error, or by trajectories beside it; see `stability`."""
+        """Stability by the real parts of the eigenvalues and their error, or by trajectories beside it."""
         found = by_margin(float(self.eigenvalues.real[0]), 0.0, self.eigenvalue_error)
         return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
 
@@ -94,7 +95,7 @@ class Equilibrium:
 
     @cached_property
     def _norm(self) -> tuple[np.ndarray, float] | None:
-        """Root S of a norm |S x| that falls by exp(-rate t) at least, and the rate; None if there is none."""
+        """Root S of a norm |S x| that falls at least as exp(-rate t), and the rate; None if there is none."""
         rate = -0.5 * float(self.eigenvalues.real[0])
         shifted = self.jacobian + rate * np.eye(len(self.jacobian))
         try:
@@ -106,23 +107,23 @@ class Equilibrium:
     def is_approached(
         self, section: np.ndarray, seconds: np.ndarray, noise: float, geometry: Geometry
     ) -> np.ndarray:
-        """Say which trajectories follow the linear flow towards it.
+        """Return which trajectories follow the linear flow towards it, shape (n,).
 
         With A the Jacobian, t the time between two sections and r = exp(-rate t) the bound on the linear
         flow in its norm, let d be the distances and e = ``|d' - exp(A t) d|`` the error of the linear flow.
-        A trajectory is on its way if e is at most half of (1 - r)|d| over the younger half of the sections:
-        nearer by the error is smaller still.
+        A trajectory approaches if e is at most half of (1 - r)|d| over the younger half of the sections:
+        closer to the equilibrium the error is smaller still.
 
         Parameters
         ----------
         section
-            Shape (n, k, state).
+            Sections, shape (n, k, state).
         seconds
-            Time since the section before each, shape (n, k) [s].
+            Time from the previous section to each, shape (n, k) [s].
         noise
             Scaled error of the sections.
         geometry
-            Of the states.
+            Geometry of the states.
         """
         if self.approached_within or self._norm is None or section.shape[1] < 3:
             return np.zeros(len(section), bool)
@@ -138,9 +139,9 @@ class Equilibrium:
         return np.asarray((error <= allowed + known).all(axis=1) & (size[:, -1] <= size[:, 0] + known))
 
     def _flow(self, times: np.ndarray) -> np.ndarray:
-        """Linear flow over each of some times, shape (..., state, state)."""
+        """Return the linear flow over each time, shape (..., state, state)."""
         values, vectors = np.linalg.eig(self.jacobian)
-        if np.linalg.cond(vectors) > 1e8:  # an eigenvalue without a direction of its own
+        if np.linalg.cond(vectors) > 1e8:  # nearly defective: the eigenvectors are no basis
             return np.asarray(expm(self.jacobian * times[..., None, None]))
         found = (vectors * np.exp(values * times[..., None])[..., None, :]) @ np.linalg.inv(vectors)
         return np.asarray(found.real)
@@ -152,11 +153,11 @@ def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> 
     Parameters
     ----------
     points
-        Of a flow.
+        Parameter points of a flow.
     tolerance
-        Scaled distance within which a closed cell is on what it closed on.
+        Scaled distance within which a closed cell is on a stable equilibrium.
     geometry
-        Of the states.
+        Geometry of the states.
     """
     for point in points:
         states, reach = _ends(point, tolerance)
@@ -167,7 +168,7 @@ def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> 
 
 
 def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Last state of each cell, NaN where it says nothing, and how near an equilibrium has to be."""
+    """Return each cell's last state, NaN if it has none, and the largest distance that counts as at rest."""
     states = np.full((point.n_cells, point.n_states), np.nan)
     reach = np.full(point.n_cells, tolerance)
     for block in point.blocks():
@@ -181,7 +182,7 @@ def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _waited(point: Point, states: np.ndarray) -> np.ndarray:
-    """States of cells that waited in vain once they are near an equilibrium; NaN for those that come back."""
+    """Integrate cells without a return until they are near an equilibrium; NaN for those that do return."""
     states, system = states.copy(), point.integrates
     far = np.flatnonzero(np.isfinite(states).all(axis=1))
     for _ in range(WAITS):
@@ -201,12 +202,12 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
 
 
 def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
-    """Equilibria that Newton's method finds from some states, in canonical order."""
+    """Find equilibria by Newton's method from near states and a sample of far ones, in canonical order."""
     if not len(states):
         return []
     steps, _ = newton_steps(point.integrates, states, point.packed)
     length = np.abs(steps / np.asarray(geometry.scales)).max(axis=1, initial=0.0)
-    # beyond twice the reach the linear step cannot end within it but by chance
+    # a state with a Newton step beyond twice its reach is unlikely to be within reach of an equilibrium
     near = np.flatnonzero(length <= 2.0 * reach)
     _, first = np.unique(geometry.boxes(states[near], SAME), axis=0, return_index=True)
     _, other = np.unique(hashes(geometry.boxes(states, GUESS_BOX)), return_index=True)
@@ -215,7 +216,7 @@ def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geomet
 
 
 def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
-    """Different equilibria that Newton's method finds from some states, `MOST` at most."""
+    """Return the distinct equilibria that Newton's method finds from states (n, state), at most `MOST`."""
     found = find_equilibria(point.integrates, states, point.packed, max_iterations=ITERATIONS)
     scales = np.asarray(geometry.scales)
     kept: list[Equilibrium] = []
@@ -234,7 +235,7 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
 
 
 def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Which equilibrium each cell is at; -1 for none."""
+    """Return the equilibrium that each cell is at; -1 for none."""
     at_rest = np.full(len(states), -1, np.int64)
     rows = np.flatnonzero(np.isfinite(states).all(axis=1))
     for k, one in enumerate(point.equilibria):
@@ -244,7 +245,7 @@ def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geom
 
 
 def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Put cells at the degenerate equilibria that were seen to attract, in place."""
+    """Label the cells near degenerate equilibria that were seen to attract, in place."""
     states, _ = _ends(point, tolerance)
     assert point.at_rest is not None
     for k, one in enumerate(point.equilibria):
@@ -254,7 +255,7 @@ def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
 
 
 def _label_approaching(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Put cells that are on their way to a stable equilibrium there, in place."""
+    """Label the cells that approach a stable equilibrium, in place."""
     assert point.at_rest is not None
     for block in point.blocks():
         rows = np.flatnonzero(block.is_closed | block.is_bounded)
@@ -267,18 +268,18 @@ def _label_approaching(point: Point, tolerance: float, geometry: Geometry) -> No
 def approaching(
     point: Point, section: np.ndarray, seconds: np.ndarray, tolerance: float, geometry: Geometry
 ) -> np.ndarray:
-    """Stable equilibrium of a point that each trajectory is on its way to, -1 for none.
+    """Return the stable equilibrium that each trajectory approaches; -1 for none.
 
     Parameters
     ----------
     point
-        With its equilibria.
+        Parameter point with its equilibria.
     section, seconds
-        See `Equilibrium.is_approached`.
+        Sections (n, k, state) and times between them (n, k) [s], see `Equilibrium.is_approached`.
     tolerance
-        Scaled distance within which a cell is on what it closes on.
+        Scaled distance within which a closed cell is on a set; sections err by a hundredth of it.
     geometry
-        Of the states.
+        Geometry of the states.
     """
     found = np.full(len(section), -1, np.int64)
     for k, one in enumerate(point.equilibria):
@@ -290,7 +291,7 @@ def approaching(
 
 
 def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Number of the stable equilibrium near a state in which a cell waited in vain; it may be a new one."""
+    """Return the stable equilibrium near the last state of a cell without a return; add it if it is new."""
     if not np.isfinite(state).all():
         return None
     state = _waited(point, state[None])[0]
@@ -301,7 +302,7 @@ def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None
 
 
 def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
-    """Place of an equilibrium among those of a point, which it joins if it is new."""
+    """Return the index of an equilibrium among those of a point; append it if it is new."""
     for k, other in enumerate(point.equilibria):
         if geometry.distance(one.state, other.state) <= SAME:
             return k
@@ -310,7 +311,7 @@ def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
 
 
 def rest_of_orbit(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Number of the equilibrium that a polished orbit with this section point is; None if it moves."""
+    """Return the number of the equilibrium that a polished orbit degenerates to; None if the orbit moves."""
     steps, _ = newton_steps(point.integrates, state[None], point.packed)
     if not np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME:
         return None

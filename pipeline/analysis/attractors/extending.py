@@ -1,13 +1,15 @@
-"""Cells that no orbit or equilibrium accounts for are extended until it is known what they are on.
+"""Extend cells that are on no known orbit or equilibrium, until their set is known.
 
-A sample of them goes on from its last section, leg by leg. After each leg cells leave that have reached an
-orbit or an equilibrium, found before or by now. Those that stay are grouped into sets (`clouds`), and each
-set gets a kind (`growth`) and a stability (`stability`). It goes on until the sample has stayed long enough,
-nothing is in doubt any more, or the budget is spent; then the other cells are told by the points of the sets
-that were found, and what is left is sampled again.
+A sample of these cells is integrated further from the last section, leg by leg. After each leg, cells that
+reached an orbit or an equilibrium, known or new, leave the sample. The others are grouped into sets
+(`clouds`), and each set gets a kind (`growth`) and a stability (`stability`). A round ends when the sample
+has stayed long enough and no set is in doubt, or when the budget is spent. Then the remaining cells are
+compared with the points of the sets. Cells that match none are sampled again, in the next round.
 
-Budget: `options.budget` times the periods that the run itself integrated at the parameter point, and
-`LEAST_BUDGET` periods at least. Nothing here depends on the clock, so the same run gives the same verdicts.
+The budget is `options.budget` times the periods that the run integrated at the parameter point, and at least
+`LEAST_BUDGET` periods. Nothing here depends on the clock, so the same run gives the same verdicts.
+
+Reading order: `extend` has the rounds, `_Extension.run` a round, `_take` one leg, `_tell_sets` the verdicts.
 """
 
 from __future__ import annotations
@@ -34,34 +36,36 @@ from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
 
 LEAST_BUDGET = 16_384
-"""Periods of a parameter point that may be integrated whatever the run itself took."""
+"""Least budget of a parameter point [periods], however short the run was."""
 
 LEAST_STAY = 512
-"""Least extension of a cell [sections]: so many points tell two sets apart, and chaos from a torus."""
+"""Least extension of a cell [sections]: enough points to separate two sets, and chaos from a torus."""
 
 DOUBLINGS = 3
-"""How often the extension is doubled while a set is in doubt."""
+"""Most doublings of the extension while a set is in doubt."""
 
 ROUNDS = 6
 """Most samples of a parameter point; each is twice as large as the one before."""
 
 SEARCH_EACH = 32
-"""Orbits are looked for after 1, 2, 4, ... legs and after each multiple of this: Newton steps are dear."""
+"""Orbits are searched after 1, 2, 4, ... legs and every `SEARCH_EACH` legs: Newton steps are expensive."""
 
 LOOK_BACK = 4
-"""Legs in which a period is looked for: those of up to twice as many sections as a leg has are seen."""
+"""Legs searched for a period: four legs show periods of up to two legs."""
 
 
 @dataclass
 class Outcome:
-    """What the extension of a parameter point found.
+    """Result of the extension of a parameter point.
 
     Attributes
     ----------
     orbits : list of Orbit
-        All that are known now.
+        Known orbits, old and new.
     courses : list of Course
+        Sampled cells.
     sets : list of BoundedSet
+        Sets that do not close.
     spent : int
         Periods integrated.
     ran_out : bool
@@ -78,22 +82,22 @@ class Outcome:
 def extend(
     point: Point, orbits: Sequence[Orbit], label: np.ndarray, settings: Settings, budget: float, n_sample: int
 ) -> Work[Outcome]:
-    """Extend samples of the cells of a point that are labelled -1 until it is known what they are on.
+    """Extend samples of a point's cells with label -1 until their sets are known.
 
     Parameters
     ----------
     point
-        With its equilibria.
+        Parameter point with its equilibria.
     orbits
-        Known ones.
+        Known orbits.
     label
-        Of each cell; read, not written.
+        Label of each cell, shape (cell,); not changed.
     settings
-        How trajectories go on.
+        Tolerances and the integration.
     budget
-        In units of the run's own work; 0 extends nothing.
+        Budget in units of the periods that the run integrated; 0 extends nothing.
     n_sample
-        Cells of the first sample.
+        Number of cells in the first sample.
     """
     work = _Extension(point, list(orbits), settings, budget)
     loose = np.flatnonzero(label < 0)
@@ -129,13 +133,13 @@ class _Extension:
 
     @property
     def has_budget(self) -> bool:
-        """Whether anything may be integrated yet."""
+        """Whether some of the budget is left."""
         return self.spent < self.budget
 
     # ---- samples -------------------------------------------------------------------------------
 
     def sample(self, loose: np.ndarray, n: int) -> list[Course]:
-        """Next `n` cells by rising hash of their sections, of each box of last sections one."""
+        """Return the next `n` cells by rising hash of their sections, one per box of last sections."""
         known = {course.key for course in self.courses}
         best: dict[int, tuple[int, int, np.ndarray, float]] = {}
         is_loose = np.zeros(self.point.n_cells, bool)
@@ -148,20 +152,20 @@ class _Extension:
                 if key not in known and (key not in best or mark < best[key][0]):
                     step = 0.0 if block.step is None else float(np.nan_to_num(block.step[row]))
                     best[key] = mark, int(row) + block.cells.start, block.section[row], step
-            if len(best) > 4 * n:  # those of least hash are enough
+            if len(best) > 4 * n:  # keep those of least hash, to bound the memory
                 best = dict(sorted(best.items(), key=lambda item: item[1][0])[: 2 * n])
         chosen = sorted(best.items(), key=lambda item: item[1][0])[:n]
         return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
-        """Cells that are on no set that was found to stay, nor beside a sampled one."""
+        """Return the loose cells that were not sampled and lie on no final set."""
         done = np.zeros(self.point.n_cells, bool)
         done[self.told(loose)[0]] = True
         done[[course.cell for course in self.courses]] = True
         return np.asarray(loose[~done[loose]])
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Loose cells that lie on sets that need no further look, and the numbers of these."""
+        """Return the loose cells on sets whose verdict is final, and the sets' numbers."""
         final = [
             i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget
         ]
@@ -177,7 +181,7 @@ class _Extension:
         return np.concatenate(cells), np.concatenate(numbers)
 
     def add_transient(self) -> None:
-        """Add the set that cells have left, if that is none of those on which others stayed."""
+        """Add the set that cells have left, unless it is a set on which other cells stayed."""
         left = [course for course in self.courses if course.has_left]
         if left and not any(one.n_left for one in self.sets):
             self.sets.append(left_behind(left, self.settings))
@@ -185,7 +189,7 @@ class _Extension:
     # ---- legs ----------------------------------------------------------------------------------
 
     def run(self) -> Work[None]:
-        """Extend what goes on until the sample has stayed, and longer while a set is in doubt."""
+        """Extend unfinished cells until the sample has stayed, and longer while a set is in doubt."""
         target = LEAST_STAY
         for _ in range(DOUBLINGS + 1):
             yield from self._extend(target)
@@ -198,7 +202,7 @@ class _Extension:
             target = 2 * max(c.length for c in self.courses if c.goes_on)
 
     def conclude(self) -> Work[None]:
-        """Tell the sets of what goes on, as it stands."""
+        """Describe the sets of unfinished cells without extending them."""
         yield from self._tell_sets()
 
     def _extend(self, target: int) -> Work[None]:
@@ -209,7 +213,7 @@ class _Extension:
             if not self.has_budget:
                 self.ran_out = True
                 return
-            # those that are behind first: the sample of a later round
+            # extend the shortest courses first: those of a later round
             least = min(course.length for course in going)
             going = [course for course in going if course.length == least]
             leg: Extended = yield Leg(np.array([c.state for c in going]), np.array([c.step for c in going]))
@@ -217,7 +221,7 @@ class _Extension:
             yield from self._take(going, leg)
 
     def _has_stayed(self, going: Sequence[Course], target: int) -> bool:
-        """Whether the cells that go on have stayed for long enough."""
+        """Whether the unfinished cells have stayed long enough for a verdict."""
         least = min(course.length for course in going)
         if least < target:
             return False
@@ -226,12 +230,12 @@ class _Extension:
         return least >= longest or lifetime_interval(0, at_risk)[0] >= longest
 
     def _longest_transient(self) -> float:
-        """Longest time that a cell of the point was seen to be elsewhere than where it ended."""
+        """Return the longest time that a cell of the point was seen away from its end."""
         left = [c.periods for c in self.courses if not c.goes_on and not c.is_leaving]
         return self.settings.seen + max(left, default=0.0)
 
     def _take(self, going: Sequence[Course], leg: Extended) -> Work[None]:
-        """Note what became of cells during a leg."""
+        """Record the results of a leg, and end the cells that reached an orbit or an equilibrium."""
         computed = np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED))
         for course, state, step, section, ok in zip(
             going, leg.state, leg.step, leg.section, computed, strict=True
@@ -259,7 +263,7 @@ class _Extension:
         self._leap(own, leg.section[rows])
 
     def _fail(self, course: Course, status: int) -> None:
-        """End a cell that did not finish its leg: at rest, diverged, or not integrated."""
+        """End a cell that did not finish its leg: at rest, diverged, or failed."""
         course.periods = float(course.length)
         course.is_leaving = not course.length
         course.end = DIVERGED if status == Status.DIVERGED else FAILED
@@ -269,7 +273,7 @@ class _Extension:
                 course.end = AT_REST - number
 
     def _search(self, own: Sequence[Course], block: Block) -> Work[None]:
-        """Find orbits that cells close on, or come back to."""
+        """Find orbits by Newton's method, from cells that close or nearly close."""
         label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
         rest = np.flatnonzero(label < 0).tolist()
         closed = ClosedCells(
@@ -296,11 +300,11 @@ class _Extension:
                 self.orbits.append(orbit)
 
     def _rests(self, orbit: Orbit) -> bool:
-        """Whether an orbit is an equilibrium that the section runs through."""
+        """Whether an orbit is an equilibrium that lies on the section."""
         return self.point.can_rest and rest_of_orbit(self.point, orbit.points[0], self.geometry) is not None
 
     def _leave(self, course: Course, number: int) -> None:
-        """Note when a cell came near an orbit for good."""
+        """End a cell on an orbit, and record when it came near the orbit for good."""
         orbit, states = self.orbits[number], np.concatenate([course.kept, course.extension])
         phase = int(np.argmin(self.geometry.distance(orbit.points, states[-1])))
         back = np.arange(len(states))
@@ -311,7 +315,7 @@ class _Extension:
         course.is_leaving = entered <= len(course.kept)
 
     def _rest(self, own: Sequence[Course], section: np.ndarray, seconds: np.ndarray) -> None:
-        """End the cells that are on their way to a stable equilibrium."""
+        """End the cells that approach a stable equilibrium."""
         if not self.point.can_rest:
             return
         going = [i for i, course in enumerate(own) if course.goes_on]
@@ -324,7 +328,7 @@ class _Extension:
                 own[i].is_leaving = len(own[i].legs) <= 1
 
     def _leap(self, own: Sequence[Course], section: np.ndarray) -> None:
-        """Let cells that leave an unstable orbit slowly go on farther from it."""
+        """Move cells that leave an unstable orbit slowly farther from it along their way."""
         rows = [i for i, course in enumerate(own) if course.goes_on]
         if not rows:
             return
@@ -336,7 +340,7 @@ class _Extension:
     # ---- sets ----------------------------------------------------------------------------------
 
     def _tell_sets(self) -> Work[bool]:
-        """Group the cells that go on into sets and describe them; returns whether anything is in doubt."""
+        """Group the unfinished cells into sets and describe them; return whether a set is in doubt."""
         going = [course for course in self.courses if course.goes_on]
         has_stayed = bool(going[0].legs) and self._has_stayed(going, LEAST_STAY)
         numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
@@ -355,7 +359,7 @@ class _Extension:
     def _with_those_left(
         self, groups: Sequence[list[Course]], gone: Sequence[Course]
     ) -> list[tuple[list[Course], list[Course]]]:
-        """Groups with the cells that left each; those that were left by any are one set."""
+        """Pair each group with the cells that left it; merge all groups that cells left into one set."""
         left = [[course for course in gone if were_on(course, own, self.settings)] for own in groups]
         joined = [course for own, some in zip(groups, left, strict=True) if some for course in own]
         found = [(own, some) for own, some in zip(groups, left, strict=True) if not some]

@@ -1,14 +1,14 @@
-"""What is said of an attractor: ranges, rotation, side, energy, mirror partner.
+"""Compute the features of an attractor: ranges, rotation, side, energy, mirror partner.
 
 Half a drive period
 -------------------
 A drive whose second half is minus its first gives many systems a symmetry that takes half a period, such as
-``y(t) -> -y(t + T/2)``. On the section (t = 0) the image of a point x is then minus the state that the motion
-from x has at t = T/2, not minus x itself. The model says what its symmetry is. The image of a closed orbit is
-found in this way from its polished orbit, that of a bounded set from its stored points; the mirror partner is
-the attractor nearest to the image whose rotation agrees with the image's. A motion that is its own image is
-its own partner. Where the symmetry is approximate (a duty cycle of 0.4927 instead of one half),
-`mirror_distance` says how well it holds.
+``y(t) -> -y(t + T/2)``. On the section (t = 0) the image of a point x is then minus the state at t = T/2 of
+the motion from x, not minus x itself. The model declares its symmetry. The image of a closed orbit is
+computed from its polished orbit, the image of a bounded set from its stored points. The mirror partner is the
+attractor nearest to the image, where a difference in rotation adds to the distance. A motion that is its own
+image is its own partner. If the symmetry is approximate (a duty cycle of 0.4927 instead of one half),
+`mirror_distance` measures how well it holds.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from pipeline.analysis.sides import UNKNOWN
 from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
 
 ENERGY = "energy"
-"""Quantity of a model of which attractors have ranges."""
+"""Name of the model's quantity whose range is computed for each attractor."""
 
 SAMPLES = 256
 """Times per drive period or return at which a polished orbit is sampled for its ranges; even."""
 
 RTOL = 1e-9
-"""Tolerance of these trajectories: their errors stay far below what their sampling leaves open."""
+"""Tolerance of these trajectories: integration errors stay far below those of the sampling."""
 
 
 @dataclass
 class Cells:
-    """Running numbers of the cells of one attractor; independent of the order of the blocks.
+    """Statistics of one attractor's cells, accumulated block by block in any order.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Cells:
     seconds: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
-        """Take in some cells of a block; `labels` are the codes of the classifier for all its cells."""
+        """Add some cells of a block; `labels` has the classifier's code of every cell of the block."""
         section = block.section[cells]
         self.n += len(cells)
         flat = section.reshape(-1, section.shape[-1])
@@ -91,7 +91,7 @@ class Cells:
 
     @property
     def mean_rotation(self) -> np.ndarray:
-        """Mean over cells; summed in rising order, so that the last bit does not depend on theirs."""
+        """Mean over cells, summed in rising order so that the order of cells does not change the last bit."""
         return np.asarray(np.sort(np.concatenate(self.rotations), axis=0).mean(axis=0))
 
     @property
@@ -100,9 +100,9 @@ class Cells:
         return float(np.sort(np.concatenate(self.seconds)).mean()) if self.seconds else np.nan
 
     def side(self, parameters: Parameters, frequency: float) -> int:
-        """Code of the set: that of all its cells, or else that of their points together.
+        """Return the set's code: the common code of its cells, or else the code of their pooled points.
 
-        The set turns if most of its cells do.
+        The pooled points are classified with the median of the cells' turns.
         """
         known = [code for code in self.sides if code != UNKNOWN]
         if len(known) <= 1:
@@ -154,7 +154,7 @@ class Features:
 
 
 def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Mean rotation of each angle over the kept sections [turns per drive period], shape (cell, angle)."""
+    """Compute the mean rotation over the kept sections [turns per drive period], shape (cell, angle)."""
     angles = np.asarray(geometry.is_angle)
     change = section[:, -1, angles] - section[:, 0, angles]
     n = max(section.shape[1] - 1, 1)
@@ -164,7 +164,7 @@ def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) ->
 def sides_of(
     section: np.ndarray, turns: np.ndarray, frequency: float, parameters: Parameters | None
 ) -> np.ndarray:
-    """Codes of the model's classifier for rows of sections; unknown where it has none, or a state is NaN."""
+    """Classify rows of sections by the model's classifier; unknown without a classifier or with a NaN."""
     classifier = parameters.model.classifier if parameters is not None else None
     if classifier is None or parameters is None:
         return np.full(len(section), UNKNOWN, np.int64)
@@ -173,9 +173,9 @@ def sides_of(
 
 
 def follow_orbit(found: Features, parameters: Parameters, frequency: float, geometry: Geometry) -> None:
-    """Fill in what the whole of a polished orbit shows: ranges, exact rotation, energy, image.
+    """Integrate a polished orbit over its period and fill in ranges, exact rotation, energy and image.
 
-    `frequency` is that of the drive, or the mean one of the returns [Hz].
+    `frequency` is the drive frequency, or the mean frequency of the returns [Hz].
     """
     p, flow = found.orbit_period, of_flow(parameters)
     times = np.arange(p * SAMPLES + 1) / (SAMPLES * frequency)
@@ -193,7 +193,7 @@ def follow_orbit(found: Features, parameters: Parameters, frequency: float, geom
 
 
 def fill_cycle(found: Features, cycle: Cycle) -> None:
-    """Fill in what is known of a limit cycle seen at even times: it has no section points of its own."""
+    """Fill in the features of a limit cycle of a flow sampled at equal times."""
     found.kind, found.period_s, found.residual = PERIODIC_ORBIT, cycle.seconds, cycle.residual
     found.stability, found.evidence = ATTRACTS, BY_MULTIPLIERS
     found.multipliers, found.lyapunov_max = cycle.multipliers, 0.0
@@ -201,7 +201,7 @@ def fill_cycle(found: Features, cycle: Cycle) -> None:
 
 
 def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: int) -> Features:
-    """Describe an equilibrium: its exponents are the real parts of its eigenvalues."""
+    """Return the features of an equilibrium; its largest exponent is an eigenvalue's real part."""
     x = Features(
         found.state[None], EQUILIBRIUM, 0, np.zeros(n_angles), UNKNOWN, found.state, found.state,
         residual=found.residual, is_polished=True, stability=found.stability,
@@ -216,7 +216,7 @@ def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: 
 
 
 def follow_points(found: Features, parameters: Parameters, frequency: float) -> None:
-    """Fill in energy and image of a set from its stored points."""
+    """Fill in the energy range and the mirror image of a set, from its stored points."""
     _fill_energy(found, np.zeros(len(found.points)), found.points, of_flow(parameters), frequency)
     mirror = parameters.model.mirror
     if mirror is None:
@@ -231,7 +231,7 @@ def follow_points(found: Features, parameters: Parameters, frequency: float) -> 
 
 
 def has_energy(parameters: Parameters) -> bool:
-    """Whether the model names an energy among its quantities."""
+    """Return whether the model has a quantity named energy."""
     return any(quantity.name == ENERGY for quantity in parameters.model.quantities)
 
 
@@ -244,7 +244,7 @@ def _fill_energy(
 
 
 def pair_mirrors(found: list[Features], mirror: Mirror, threshold: float, geometry: Geometry) -> None:
-    """Fill in the mirror partners: the attractor nearest to the image, if within `threshold`."""
+    """Fill in each attractor's mirror partner: the one nearest to its image, if within `threshold`."""
     turned = np.array(mirror.signs)[list(geometry.is_angle)]
     for a in found:
         if a.image is None:
@@ -260,6 +260,6 @@ def pair_mirrors(found: list[Features], mirror: Mirror, threshold: float, geomet
 
 
 def sorted_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Points in lexicographic order of their rounded, scaled values."""
+    """Sort points (n, state) in lexicographic order of their rounded, scaled values."""
     rounded = rounded_points(points, geometry)
     return np.asarray(points[np.lexsort(rounded.T[::-1])])

@@ -1,15 +1,15 @@
-"""Kind of a set that does not close: chaotic, a torus, or neither, by the growth of small distances on it.
+"""Classify a set that does not close as chaotic, torus or neither, by the growth of small distances.
 
-The derivatives of the section map along the extended cells give the exponents, per section (Eckmann and
-Ruelle, Rev. Mod. Phys. 57, 617, 1985, sec. V). The direction of a flow is not among them where sections are
-crossings, and neither is the phase of a drive; of a flow looked at in even times one exponent is always 0.
+The derivatives of the section map along extended cells give the exponents per section (Eckmann and
+Ruelle, Rev. Mod. Phys. 57, 617, 1985, sec. V). These exponents exclude the phase of the drive, and the
+direction of the flow if sections are crossings. A flow sampled at equal times has one exponent that is
+always 0.
 
-* A *chaotic set* has a largest exponent above 0 by three standard errors, and distances that grew by
-  exp(`GROWN`) at least: a shear alone lets them grow with the time, too.
-* A *torus* has a largest exponent of 0, by weighted Birkhoff averages, which converge faster than any power
-  on it (Das, Saiki, Sander and Yorke, Nonlinearity 30, 4111, 2017), and a section on closed curves.
-* A flow *preserves volume* if the logarithm of the change of a volume is 0 in the mean:
-  then nothing attracts.
+* A *chaotic set* has a largest exponent above 0 by three standard errors, and distances that grew by at least
+  exp(`GROWN`). The second condition excludes a shear, in which distances grow linearly with time.
+* A *torus* has a largest exponent of 0 by weighted Birkhoff averages, which converge faster than any power
+  there (Das, Saiki, Sander and Yorke, Nonlinearity 30, 4111, 2017), and a section on closed curves.
+* A flow *preserves volume* if the mean logarithm of the change of a volume is 0. Then nothing attracts.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, TORUS
 
 N_SIGMA = 3.0
-"""Standard errors at either side of an exponent's interval, if they were known; see `_mean`."""
+"""Half width of an exponent's interval in standard errors; `_mean` widens it if blocks are few."""
 
 GROWN = 5.0
-"""Least growth of a small distance over a cell's extension, as a logarithm, that shows chaos."""
+"""Least logarithm of the growth of a small distance over a cell's extension that shows chaos."""
 
 N_BLOCKS, LEAST_BLOCKS = 4, 16
-"""Blocks of each cell for the error of an exponent, and least number of all."""
+"""Blocks per cell for the error of an exponent, and least number of blocks in total."""
 
 ZERO = 1e-4
 """Largest modulus of an exponent that counts as 0 on a torus [per section]."""
 
 NEIGHBOURS, THIN, ON_CURVE = 10, 0.2, 0.95
-"""Neighbours that must lie on a line, their largest relative scatter about it, and the share of points."""
+"""Neighbours tested for a line, their largest relative scatter about it, and the least share of points."""
 
 GONE = -660.0
-"""Logarithm of the growth of a direction or a volume that vanishes, as at rest on a surface."""
+"""Logarithm of the growth of a direction or a volume that shrinks to zero."""
 
 Rates = Callable[[np.ndarray], np.ndarray]
 
 LOST, LOST_ERROR = 1e-6, 1e-3
-"""Largest mean change of the logarithm of a volume [per section] that counts as none; and the largest error
-of a mean that is 0 within its interval."""
+"""Largest mean change of a volume's logarithm [per section] that counts as 0; and the largest error at which
+an interval around 0 counts as 0."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,13 @@ class Growth:
     rate, low, high : float
         Largest exponent that is not 0 by construction, and its interval.
     weighted : float
-        Its weighted Birkhoff average; the cell of the largest modulus.
+        Weighted Birkhoff average of this exponent, from the cell with the largest modulus.
     weighted_error : float
-        Difference of those of both halves of the cells, the largest.
+        Largest difference between the averages of the two halves of a cell.
     volume, volume_error : float
-        Mean change of the logarithm of a volume along the flow, and a third of its interval's half.
+        Mean change of the logarithm of a volume along the flow, and its standard error (`_mean`).
     length : int
-        Sections of each cell.
+        Number of sections of each cell.
     """
 
     rate: float
@@ -77,46 +77,46 @@ class Growth:
 
     @property
     def is_chaotic(self) -> bool:
-        """Whether small distances grow, shown by the interval."""
+        """Whether small distances grow: the interval lies above 0 and the growth reaches `GROWN`."""
         return bool(self.low > 0.0 and self.rate * self.length >= GROWN)
 
     @property
     def contracts(self) -> bool:
-        """Whether small distances shrink: what is seen is still closing."""
+        """Whether small distances shrink, so that the trajectories are still closing."""
         shown = self.weighted < -max(ZERO, 3.0 * self.weighted_error)
         return bool(shown or (self.high < 0.0 and self.rate * self.length <= -GROWN))
 
     @property
     def is_zero(self) -> bool:
-        """Whether the exponent is 0 within its interval."""
+        """Whether the weighted average is 0 within `ZERO`."""
         return bool(abs(self.weighted) <= ZERO and self.weighted_error <= 3.0 * ZERO)
 
     @property
     def preserves_volume(self) -> bool:
-        """Whether volumes stay as they are."""
+        """Whether the mean change of volumes is 0 within its error."""
         near = abs(self.volume) <= N_SIGMA * self.volume_error and self.volume_error <= LOST_ERROR
         return bool(near or abs(self.volume) <= LOST)
 
 
 def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Growth:
-    """Exponents of the section map from its derivatives along some cells.
+    """Compute the exponents of the section map from its derivatives along some cells.
 
     Parameters
     ----------
     derivatives
-        Shape (cell, section, state, state), those of consecutive sections.
+        Derivatives at consecutive sections, shape (cell, section, state, state).
     n_known
-        Exponents that are 0 by construction: 1 for a flow in even times.
+        Number of exponents that are 0 by construction: 1 for a flow sampled at equal times.
     volumes
-        Logarithm of the change of a volume over each, shape (cell, section); see `volumes_of`.
+        Logarithm of the change of a volume per section, shape (cell, section); see `volumes_of`.
     """
     steps, volumes = _logarithms(derivatives), np.maximum(volumes, GONE)
     n = steps.shape[1]
-    # the first quarter turns the basis into its directions
+    # drop the first quarter, in which the basis aligns with the growing directions
     steps = steps[:, n // 4 :]
     n = steps.shape[1]
     order = np.argsort(-steps.mean(axis=(0, 1)), kind="stable")
-    # of those that are 0 by construction the ones nearest to 0 are left out
+    # leave out the `n_known` exponents nearest to 0: they are 0 by construction
     known = np.argsort(np.abs(steps[..., order].mean(axis=(0, 1))), kind="stable")[:n_known]
     first = np.delete(steps[..., order], known, axis=-1)[..., 0]
     rate, error = _mean(first)
@@ -130,9 +130,10 @@ def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Gro
 
 
 def _mean(values: np.ndarray) -> tuple[float, float]:
-    """Mean of values (cell, section), and the standard error by which `N_SIGMA` is a safe interval.
+    """Compute the mean of values (cell, section) and its standard error from block means.
 
-    An error that few blocks tell is itself uncertain: Student's distribution widens it.
+    The error of few blocks is itself uncertain. Student's distribution widens it, so that `N_SIGMA` errors
+    keep the confidence that they have for a normal distribution.
     """
     n_cells, n_sections = values.shape
     n_blocks = min(max(N_BLOCKS, -(-LEAST_BLOCKS // n_cells)), n_sections)
@@ -145,21 +146,21 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
 def volumes_of(
     derivatives: np.ndarray, before: np.ndarray, after: np.ndarray, crossed: int | None, flow: Rates
 ) -> np.ndarray:
-    """Logarithm of the change of a volume along the flow over a period or return.
+    """Compute the logarithm of the change of a volume along the flow over a period or return, shape (n,).
 
-    On a section by crossing the map changes areas by the flow's change of volume and the ratio of the speeds
-    with which the section is crossed.
+    On a section of crossings the map's change of areas differs from the flow's change of volumes by the ratio
+    of the crossing speeds.
 
     Parameters
     ----------
     derivatives
-        Of the section map, shape (n, state, state).
+        Derivatives of the section map, shape (n, state, state).
     before, after
         Points and their images, shape (n, state).
     crossed
-        Number of the state that crosses; None at even times.
+        Index of the state that crosses; None if sections are at equal times.
     flow
-        Gives the rates at states (n, state).
+        Function that returns the rates at states (n, state).
     """
     if crossed is None:
         return np.asarray(np.linalg.slogdet(derivatives)[1])
@@ -170,7 +171,7 @@ def volumes_of(
 
 
 def _logarithms(derivatives: np.ndarray) -> np.ndarray:
-    """Logarithms of the growth of each orthonormal direction at each section; `GONE` where one vanishes."""
+    """Compute the log growth of orthonormal directions at each section by QR; `GONE` where one vanishes."""
     basis = np.broadcast_to(np.eye(derivatives.shape[-1]), derivatives[:, 0].shape)
     grown = np.empty(derivatives.shape[:-1])
     for i in range(derivatives.shape[1]):
@@ -181,23 +182,23 @@ def _logarithms(derivatives: np.ndarray) -> np.ndarray:
 
 
 def _weighted(values: np.ndarray) -> np.ndarray:
-    """Weighted Birkhoff average along the second axis."""
+    """Compute the weighted Birkhoff average along the second axis."""
     t = (np.arange(values.shape[1]) + 1.0) / (values.shape[1] + 1.0)
     weight = np.exp(-1.0 / (t * (1.0 - t)))
     return np.asarray(values @ (weight / weight.sum()))
 
 
 def on_closed_curves(points: np.ndarray, geometry: Geometry) -> bool:
-    """Whether section points lie on closed curves.
+    """Return whether section points lie on closed curves.
 
-    Nearly every point must find its nearest neighbours on a line, and some of them on either side.
+    The nearest neighbours of nearly every point must lie on a line, with some on either side of the point.
 
     Parameters
     ----------
     points
-        Shape (n, state).
+        Section points, shape (n, state).
     geometry
-        Of the states.
+        Geometry of the states.
     """
     if len(points) < 8 * NEIGHBOURS:
         return False
@@ -212,7 +213,7 @@ def on_closed_curves(points: np.ndarray, geometry: Geometry) -> bool:
 
 
 def kind_of(growth: Growth, points: np.ndarray, geometry: Geometry) -> int:
-    """Kind of a set by its exponents and its section points (n, state)."""
+    """Return the kind of a set from its exponents and its section points (n, state)."""
     if growth.is_chaotic:
         return CHAOTIC_SET
     if growth.is_zero and on_closed_curves(points, geometry):

@@ -1,6 +1,6 @@
-"""Hysteresis: attractors that a continuation meets in one direction only, and where its branches jump.
+"""Find hysteresis: attractors that a continuation meets in one direction only, and jumps of its branches.
 
-Reads ids, integrates nothing.
+The functions read attractor ids and integrate nothing.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from pipeline.analysis.outcomes import outcomes
 
 
 def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
-    """Where a continuation finds other attractors going up than going down.
+    """Find where a continuation meets different attractors going up and going down.
 
     Parameters
     ----------
     ds
-        Cube of a continuation in both directions; names the axis that the branches walk (attribute
-        ``path``, else its only parameter dim).
+        Cube of a continuation in both directions. Its attribute ``path`` names the axis of the continuation;
+        without it, the axis is the only parameter dim.
     ids
         Result of `match` for it.
 
@@ -30,14 +30,17 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
     Dataset
         ``present`` (parameter dims, direction, attractor): whether a branch of that direction is on
         the attractor. ``differs`` (parameter dims): whether the sets of ids of both directions
-        differ, where both have any. Loops, runs of neighbouring points of the path that differ, one per
-        `loop`: ``loop_from``, ``loop_to`` (first and last value of the path), ``loop_points`` (their
-        number), ``only_up`` and ``only_down`` (loop, attractor: at how many of its points the
-        attractor is met in that direction only), and the values of the other parameters under their
-        names with the prefix ``loop_at_``. Jumps, changes of a branch's id between neighbouring points of
-        the path as it walks, one row per kind in `jump`: ``jump_from``, ``jump_to`` (values of the path),
-        ``jump_direction`` (1 up, -1 down), ``jump_from_id``, ``jump_to_id``, ``jump_count`` (branches);
-        points where a branch has no id are passed over.
+        differ, if both have any.
+
+        A loop is a sequence of neighbouring points of the path that differ. Dim `loop`: ``loop_from``,
+        ``loop_to`` (first and last value of the path), ``loop_points`` (number of points), ``only_up`` and
+        ``only_down`` (loop, attractor: number of points where only that direction meets the attractor), and
+        the values of the other parameters under their names with the prefix ``loop_at_``.
+
+        A jump is a change of a branch's id between successive points of its continuation; points where the
+        branch has no id are skipped. Dim `jump`, one row per kind: ``jump_from``, ``jump_to`` (values of the
+        path), ``jump_direction`` (1 up, -1 down), ``jump_from_id``, ``jump_to_id``, ``jump_count``
+        (branches).
 
         The attribute ``path`` names the axis.
 
@@ -47,7 +50,7 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
         If the cube has no branches in both directions.
     """
     check_directions(ds)
-    # of sets that do not attract, and of cells that diverge, nothing is said
+    # ignore sets that do not attract and cells that diverge
     cells = outcomes(ids).clip(min=-1)
     dims = [str(d) for d in cells.dims if d != "branch"]
     path = str(ds.attrs.get("path", dims[0] if len(dims) == 1 else ""))
@@ -89,7 +92,7 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
 
 
 def check_directions(ds: xr.Dataset) -> None:
-    """Refuse a cube without branches in both directions."""
+    """Raise ValueError unless the cube has branches in both directions."""
     if "branch" not in ds["status"].dims or set(ds["direction"].values) != {"up", "down"}:
         raise ValueError('hysteresis needs a continuation with direction = "both".')
 

@@ -1,4 +1,4 @@
-"""Hysteresis as an analysis of a run (`pipeline.products.attractors`)."""
+"""Compute hysteresis as an analysis of a run (`pipeline.products.attractors`)."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 
 def needs_directions(run: Run, options: AttractorOptions) -> None:
-    """Refuse a run that is no continuation in both directions."""
+    """Raise ValueError unless the run is a continuation in both directions."""
     from pipeline.analysis.attractors.hysteresis import check_directions
 
     check_directions(run.cube())
 
 
 def hysteresis(run: Any, options: AttractorOptions) -> xr.Dataset:
-    """Loops, and jumps between attractors."""
+    """Compute the hysteresis loops of a run and the jumps between its attractors."""
     from pipeline.analysis.attractors.hysteresis import hysteresis as compute
 
     return compute(run.cube(), run.derive("attractors", **options.plain()))

@@ -1,4 +1,4 @@
-"""Table of jumps and loops."""
+"""Tabulate the jumps and loops of a hysteresis."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from pipeline.products.product import Table
 
 
 def hysteresis_table(ds: xr.Dataset) -> Table:
-    """Table of the jumps, and lines of the loops."""
+    """Return the table of jumps, with lines that describe the loops."""
     rows = jump_rows(ds)
     return Table(rows, hysteresis_lines(ds, rows))
 
 
 def jump_rows(ds: xr.Dataset) -> list[Row]:
-    """Return a row per kind of jump: from where to where, which way, from which to which attractor."""
+    """Return a row per kind of jump: direction, path values and attractor ids before and after, count."""
     names = ("jump_from", "jump_to", "jump_from_id", "jump_to_id", "jump_count")
     rows = []
     for i in range(ds.sizes["jump"]):
@@ -32,7 +32,7 @@ def jump_rows(ds: xr.Dataset) -> list[Row]:
 
 
 def hysteresis_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """Return the loops, then the from-to table."""
+    """Return lines of text: the loops, then the table of jumps."""
     n = ds.sizes["loop"]
     lines = [f"{n or 'no'} loop{'s' * (n != 1)}: neighbouring points where up and down meet other attractors"]
     path = ds.attrs["path"]

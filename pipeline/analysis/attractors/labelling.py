@@ -1,4 +1,4 @@
-"""All that is found at one parameter point: cells labelled, sets described with their evidence."""
+"""Label the cells of one parameter point, and describe its sets with their evidence."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ from pipeline.layout.vocabulary import (
 )
 
 PRESERVED, VOLUME_RTOL = 1e-7, 1e-11
-"""Largest logarithm of the change of a volume over a period that counts as none, and the tolerance for it."""
+"""Largest log change of a volume over a period that counts as 0, and the tolerance of its integration."""
 
 MOST_PROBES = 8
-"""Most degenerate orbits or equilibria of a point beside which trajectories are started."""
+"""Most degenerate orbits, and most degenerate equilibria, of a point that are probed by trajectories."""
 
 
 @dataclass
@@ -53,15 +53,16 @@ class Found:
 
     Attributes
     ----------
-    label : ndarray of int64, (cell,)
-        Place in `features`, -1 for none.
+    label : ndarray of int32, (cell,)
+        Index into `features`, -1 for none.
     decision : ndarray of int8, (cell,)
-        See `deciding.DECISIONS`.
+        Codes of `vocabulary.DECISIONS`.
     features : list of Features
+        Features of each set.
     counts : list of int
-        Cells on each.
+        Number of cells on each set.
     ran_out : bool
-        Whether the budget of the extension ended before all was told.
+        Whether the budget of the extension ended before all cells were decided.
     """
 
     label: np.ndarray
@@ -73,7 +74,7 @@ class Found:
 
 @dataclass
 class _Labels:
-    """Labels of the cells while they are given: orbits, raw orbits, sets, equilibria, cycles, in order."""
+    """Provisional labels of the cells, numbered in the order orbits, raw orbits, sets, equilibria, cycles."""
 
     label: np.ndarray
     decision: np.ndarray
@@ -87,7 +88,7 @@ class _Labels:
 
 
 def analyse(point: Point, search: Search) -> Work[Found]:
-    """Find the sets that the cells of a parameter point are on, and show what can be shown of them."""
+    """Find the sets that the cells of a parameter point are on, with their kind, stability and evidence."""
     labels = _Labels.of(point.n_cells)
     if search.options.polish and (yield from _preserves_volume(point, search)):
         return _describe(point, [], [_conservative(point, labels)], labels, search)
@@ -109,7 +110,7 @@ def analyse(point: Point, search: Search) -> Work[Found]:
 
 
 def _is_elsewhere(point: Point) -> np.ndarray:
-    """Cells at an equilibrium or on a cycle of a flow in even times."""
+    """Return which cells are at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
     found = np.zeros(point.n_cells, bool)
     for told in (point.at_rest, point.on_cycle):
         if told is not None:
@@ -121,11 +122,11 @@ def _is_elsewhere(point: Point) -> np.ndarray:
 
 
 def _preserves_volume(point: Point, search: Search) -> Work[bool]:
-    """Whether the flow, or the section map, leaves volumes as they are wherever it was looked at."""
+    """Return whether the flow or the section map preserves volumes at a sample of points."""
     before = _some_points(point)
     if not len(before):
         return False
-    # not to the next section that the run kept, which has the error of the run's tolerance
+    # integrate anew: the run's own next section has the error of the run's tolerance
     after, derivatives = yield Slopes(before, VOLUME_RTOL)
     if not np.isfinite(derivatives).all():
         return False
@@ -133,7 +134,7 @@ def _preserves_volume(point: Point, search: Search) -> Work[bool]:
 
 
 def _some_points(point: Point, n: int = 16) -> np.ndarray:
-    """Last section points of cells that go on, those of least hash, shape (n, state)."""
+    """Return the last section points of the `n` bounded cells with the least hashes, shape (n, state)."""
     found = np.zeros((0, 1, point.n_states))
     for block in point.blocks():
         more = np.concatenate([found, block.section[block.is_closed | block.is_bounded, -1:]])
@@ -142,7 +143,7 @@ def _some_points(point: Point, n: int = 16) -> np.ndarray:
 
 
 def _conservative(point: Point, labels: _Labels) -> BoundedSet:
-    """All cells of a flow that preserves volume, as one set."""
+    """Label all cells of a flow that preserves volume as one neutral set."""
     for block in point.blocks():
         own = np.flatnonzero(block.is_closed | block.is_bounded)
         labels.put(own + block.cells.start, 0, SAME_SET)
@@ -153,7 +154,7 @@ def _conservative(point: Point, labels: _Labels) -> BoundedSet:
 
 
 def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -> np.ndarray:
-    """Label the cells on orbits; returns the group of each closed cell on none, -1 for all others."""
+    """Label the cells on orbits; return the group of each closed cell without an orbit, -1 for all others."""
     groups = np.full(point.n_cells, -1, np.int64)
     for block in point.blocks():
         own = block.cells
@@ -169,7 +170,7 @@ def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -
 
 
 def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[None]:
-    """Start trajectories beside degenerate orbits and equilibria, and label the cells that come nearer."""
+    """Probe degenerate orbits and equilibria by nearby trajectories, and label the cells that approach."""
     neutral = [i for i, orbit in enumerate(state.orbits) if orbit.is_polished and orbit.stability == NEUTRAL]
     for i in neutral[:MOST_PROBES]:
         within = yield from probe_orbit(state.orbits[i], search.geometry)
@@ -189,7 +190,7 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
 
 
 def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
-    """Label the sampled cells that ended, and those beside them, by where they went."""
+    """Label the sampled cells that reached an end, and all cells in their boxes or groups, by this end."""
     ends = {course.key: course.end for course in found.courses if not course.goes_on}
     if not ends:
         return
@@ -213,7 +214,7 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
 def _label_raw(
     point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search
 ) -> list[Orbit]:
-    """Label the closed cells that Newton's method has no orbit for: each group by itself."""
+    """Label the closed cells without a polished orbit, one raw orbit per group."""
     left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
     best: dict[int, tuple[float, int, np.ndarray]] = {}
     for block in point.blocks():
@@ -226,7 +227,7 @@ def _label_raw(
 def _label_sets(
     point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
 ) -> None:
-    """Label the sampled cells of the sets, and the others by the points that they share with one."""
+    """Label the sampled cells of each set, and all other cells whose section points lie on the set."""
     for i, one in enumerate(sets):
         own = one.cells[labels.label[one.cells] < 0]
         labels.put(own, first + i, SAME_SET)
@@ -241,7 +242,7 @@ def _label_sets(
 
 
 def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
-    """Label the closed cells that were run on by where they went, in place."""
+    """Label the closed cells that were integrated further by their ends, in place."""
     rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
     for row, mark in zip(rest, marks_of(block.section[rest]), strict=True):
         if int(mark) in ends:
@@ -272,7 +273,7 @@ def _representatives(
 def _describe(
     point: Point, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], labels: _Labels, search: Search
 ) -> Found:
-    """Features of all labels that have cells, and labels in canonical order."""
+    """Compute the features of all sets that have cells, and renumber the labels in canonical order."""
     resting = len(orbits) + len(sets)
     _label_elsewhere(point, resting, labels)
     cells: dict[int, Cells] = {}
@@ -302,7 +303,7 @@ def _describe(
 
 
 def _label_elsewhere(point: Point, first: int, labels: _Labels) -> None:
-    """Label the cells at equilibria, and then those on cycles of a flow in even times."""
+    """Label the cells at equilibria, then those on limit cycles of a flow sampled at equal times."""
     for told, known, code in (
         (point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED),
     ):  # fmt: skip
@@ -320,7 +321,7 @@ def _number_ends(
     resting: int,
     table: np.ndarray,
 ) -> None:
-    """Number the ends of the cells that left each set as the sets of the point are numbered, in place."""
+    """Fill `n_to`: count the cells that left each set by the final number of the set they reached."""
     for features, number in zip(ranked, order, strict=True):
         if first <= number < resting:
             ended = np.zeros(len(order), np.int64)
@@ -340,7 +341,7 @@ def _features_of(
     point: Point,
     search: Search,
 ) -> Features:
-    """Describe what some cells are on, by its number among all labels."""
+    """Return the features of the set with a provisional number, from its cells."""
     resting = len(orbits) + len(sets)
     if number < len(orbits):
         return _of_orbit(cells, orbits[number], point, search)
@@ -355,7 +356,7 @@ def _features_of(
 
 
 def _of_points(cells: Cells, kind: int, period: int, point: Point, search: Search) -> Features:
-    """Describe a set by the section points of its cells."""
+    """Return the features that the section points of a set's cells show."""
     assert cells.points is not None
     points = feature.sorted_points(cells.points, search.geometry)
     found = Features(points, kind, period, cells.mean_rotation, UNKNOWN, cells.low, cells.high)
@@ -378,7 +379,7 @@ def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Feat
             one.n_left, one.time_at_risk, search.options.lifetime_confidence
         )
     if one.growth is not None:
-        # the exponent along a flow seen at crossings is 0 and not among those of the section map
+        # at crossings the section map lacks the exponent along the flow, which is 0
         rates = np.array([one.growth.rate, one.growth.low, one.growth.high]) / cells.mean_seconds
         rates = np.maximum(rates, 0.0) if point.is_flow else rates
         found.lyapunov_max, found.lyapunov_low, found.lyapunov_high = rates.tolist()
@@ -414,5 +415,5 @@ def _fill_orbit(found: Features, orbit: Orbit, is_flow: bool) -> None:
     exponents = orbit_exponents(orbit.multipliers, orbit.seconds, is_flow)
     found.lyapunov_max = found.lyapunov_low = found.lyapunov_high = float(exponents[0])
     found.period_s = orbit.seconds
-    # whole turns over its period: the cells' mean has not closed to the last digit
+    # round to whole turns per period: the mean over cells has not closed to the last digit
     found.rotation = np.round(found.rotation * orbit.period) / orbit.period + 0.0  # no -0.0

@@ -1,11 +1,11 @@
-"""How long motions stay on a set that they leave: the mean lifetime from a sample, with its interval.
+"""Estimate the mean lifetime on a set that motions leave, with its confidence interval.
 
 Escape from a chaotic saddle forgets the past, so lifetimes beyond the first few periods are exponential
-(Kantz and Grassberger, Physica D 17 (1985) 75; Lai and Tel, Transient Chaos, 2011, ch. 1). With r escapes in
-the total time at risk T, of all sampled cells together, the mean lifetime is T/r, and its interval at
-confidence 1 - a runs from ``2 T/chi2(1 - a/2; 2 r + 2)`` to ``2 T/chi2(a/2; 2 r)`` (Epstein and Sobel,
-J. Am. Stat. Assoc. 48 (1953) 486, and Garwood, Biometrika 28 (1936) 437, for observation that ends at a given
-time). If none leaves, the one-sided bound is ``T/(-ln a)``, a third of T at 95 %.
+(Kantz and Grassberger, Physica D 17 (1985) 75; Lai and Tel, Transient Chaos, 2011, ch. 1). Let r be the
+number of escapes and T the time at risk, summed over all sampled cells. The mean lifetime is T/r, and its
+interval at confidence 1 - a runs from ``2 T/chi2(1 - a/2; 2 r + 2)`` to ``2 T/chi2(a/2; 2 r)`` (Epstein and
+Sobel, J. Am. Stat. Assoc. 48 (1953) 486, and Garwood, Biometrika 28 (1936) 437, for observation that ends at
+a given time). If none leaves, the one-sided bound is ``T/(-ln a)``, a third of T at 95 %.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from scipy.stats import chi2
 
 
 def lifetime_interval(n_left: int, time_at_risk: float, confidence: float = 0.95) -> tuple[float, float]:
-    """Confidence interval of the mean lifetime from escapes and the total time at risk.
+    """Compute the confidence interval of the mean lifetime from escapes and the total time at risk.
 
     Parameters
     ----------
     n_left
-        Escapes.
+        Number of escapes.
     time_at_risk
-        Sum over cells until they left, or were looked at last, in any unit.
+        Sum over cells of the time until escape or the end of observation, in any unit.
     confidence
-        Between 0 and 1. The interval is two-sided if any left, else a lower bound.
+        Confidence, between 0 and 1. The interval is two-sided if any cell left, else a lower bound.
 
     Returns
     -------

@@ -1,21 +1,21 @@
-"""Ids that follow attractors along the swept parameters.
+"""Give attractors ids that follow them along the swept parameters.
 
-What an id is
--------------
-An id is an attractor that varies continuously with the parameters: a branch of closed orbits over the
-parameters, stable wherever it is listed and perhaps unstable between, together with the orbits of twice the
-period that spring from it where a period doubling hands stability on. So
+Meaning of an id
+----------------
+An id stands for an attractor that varies continuously with the parameters. It is a branch of closed orbits,
+stable where it is listed and possibly unstable in between. It includes the orbits of twice the period that
+take over stability at a period doubling. So
 
-* orbits that continuation connects have one id, however long the unstable part between them is (the chaotic
-  band inside of a branch, say); at a fold a branch turns back, and what lies beyond is another attractor;
-* an orbit of twice the period keeps the id of the one that it springs from, unless both attract at one
+* orbits that continuation connects have one id, however long the unstable part between them is (for example a
+  chaotic band inside a branch); at a fold the branch turns back, and the attractor beyond it is another one;
+* an orbit of twice the period keeps the id of the orbit that it branches from, unless both attract at one
   parameter point: attractors that coexist anywhere have different ids;
-* sets that no branch connects are matched by their distance, and only sets of one kind: a bounded set never
-  takes the id of an orbit. An orbit never takes the id of an orbit whose period no doubling relates to its
-  own, which moves on another side, or which was followed to its end without a meeting.
+* sets that no branch connects are matched by distance, and only with sets of the same kind: a bounded set
+  never takes the id of an orbit. An orbit never takes the id of another orbit if no doubling relates their
+  periods, if their sides differ, or if following a branch to its end did not connect them.
 
-`match_basis` says for every appearance what its id rests on, nearest evidence first: a branch that was
-followed, a doubling, or distance alone.
+`match_basis` states the evidence for every appearance's id, strongest first: a followed branch, a doubling,
+or distance alone.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _, _FIRST, _BRANCH, _DOUBLING, _DISTANCE = range(len(BASES))
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """An attractor where it was seen: one row of the stored features."""
+    """An appearance: an attractor at one parameter point, from one row of the stored features."""
 
     number: int
     kind: int
@@ -55,13 +55,13 @@ class _Seen:
 
     @property
     def family(self) -> int:
-        """Odd part of the period: 1, 2, 4 ... belong to one cascade; 0 for bounded sets."""
+        """Odd part of the period, equal for all orbits of one doubling cascade; 0 for bounded sets."""
         return self.period // (self.period & -self.period) if self.period else 0
 
 
 @dataclass(frozen=True, eq=False)
 class _Rule:
-    """When distance may decide, and by how much."""
+    """The rule for matching by distance: which appearances may match, and up to which distance."""
 
     threshold: float
     geometry: Geometry
@@ -69,7 +69,7 @@ class _Rule:
     known: Connections
 
     def distance(self, axis: int, before: _Seen, here: _Seen) -> float:
-        """Distance of an appearance from an earlier one along an axis; infinite between unlike things."""
+        """Return the distance from an earlier appearance along an axis; infinite if they may not match."""
         ends = (before.number, before.period), (here.number, here.period)
         if not self._alike(before, here) or not self.known.may_be_one(axis, *ends):
             return np.inf
@@ -90,35 +90,37 @@ def match(
     parameters: Parameters | np.ndarray | None = None,
     system: System | None = None,
 ) -> xr.Dataset:
-    """Give attractors ids that follow them along the sweep; the text of this module says what an id is.
+    """Give attractors ids that follow them along the sweep; the text of this module defines an id.
 
     Closed orbits are first connected by continuation (`pipeline.analysis.branches.connecting`). Then the
-    parameter points are taken in the order of their axes. At each, what is connected with nothing seen
-    before is assigned to the ids seen at the neighbours: up to `look_back` steps back along each axis, each
-    id by its nearest such appearance. The assignment minimises the sum of the distances, a distance beyond
-    the threshold (and no partner at all) costing the threshold (Hungarian algorithm). The distance is the
-    mean distance of the stored points from those of the other set, the larger of both directions, plus the
-    difference of the mean rotations in turns per drive period; unlike things are infinitely far apart. What
-    is not assigned within the threshold gets the next new id; new ids at one point come in lexicographic
-    order of the attractors' least section points. So ids depend on the attractors alone.
+    parameter points are visited in the order of their axes. An appearance that is connected with an earlier
+    one takes its id. The others are assigned to ids at neighbouring points: up to `look_back` steps back
+    along each axis, with the nearest appearance of each id. The assignment minimises the sum of the
+    distances (Hungarian algorithm); a distance beyond the threshold, or no partner, costs the threshold.
+
+    The distance is the mean distance of the stored points from those of the other set, the larger of both
+    directions, plus the difference of the mean rotations in turns per drive period. It is infinite between
+    appearances that may not match. An appearance without a partner within the threshold gets a new id; new
+    ids at one point follow the lexicographic order of the least section points. So ids depend on the
+    attractors alone.
 
     Parameters
     ----------
     attractors
         Result of `identify`, or of `match`.
     threshold
-        Largest distance between two appearances of one id that nothing but distance connects.
+        Largest distance between two appearances that are matched by distance alone.
     look_back
-        Steps of each axis over which such an id may be absent, plus one.
+        Most steps back along each axis to an appearance that is matched by distance.
     connect
-        Whether to follow polished orbits along the axes, which integrates; without it, ids rest on distance.
+        Whether to follow polished orbits along the axes, which integrates; otherwise ids rest on distance.
     parameters, system
-        What was integrated, as for `identify`; by default as the attributes say.
+        Parameters and system of the run, see `identify`; by default from the attributes.
 
     Returns
     -------
     Dataset
-        As `attractors`; the dim `attractor` runs over the ids. Besides, `match_basis`.
+        `attractors` with the dim `attractor` over the ids, and the variable `match_basis`.
 
     Raises
     ------
@@ -159,7 +161,7 @@ def _connections(
     attractors: xr.Dataset, places: Sequence[Place], dims: Sequence[str],
     parameters: Parameters | np.ndarray | None, system: System | None,
 ) -> Connections:  # fmt: skip
-    """Follow the closed orbits, if there are any that can be."""
+    """Follow the closed orbits along the axes, if at least two can be followed."""
     if not dims or sum(followable(attractors, place) for place in places) < 2:
         return Connections.none(len(places))
     base = parameters_of(attractors) if parameters is None else parameters
@@ -174,26 +176,26 @@ def _connections(
 
 
 def _geometry(attractors: xr.Dataset, system: System | None) -> Geometry:
-    """Of the given system's states, else the model's."""
+    """Return the geometry of the states of the given system, or else of the model."""
     told: Any = system or model_of(attractors)
     return Geometry(told.is_angle, told.scales)
 
 
 def _neutral(attractors: xr.Dataset) -> frozenset[int]:
-    """Codes of `side` that say nothing of a motion."""
+    """Return the codes of `side` that are compatible with every other code."""
     classifier = model_of(attractors).classifier
     return frozenset(classifier.neutral if classifier else ())
 
 
 class _Ids:
-    """Ids as they are given, parameter point by parameter point.
+    """The ids given so far, parameter point by parameter point.
 
     Attributes
     ----------
     ids, basis : ndarray, (*parameter dims, row)
-        Of each appearance; -1 and 0 where there is none.
+        Id and basis of each appearance; -1 and 0 where there is none.
     taken : list of set
-        Of each id the parameter points at which it is, or will be, listed.
+        For each id, the parameter points at which it is, or will be, listed.
     """
 
     def __init__(self, shape: tuple[int, ...], n_rows: int, places: Sequence[Place], rule: _Rule) -> None:
@@ -210,7 +212,7 @@ class _Ids:
         self._met: set[int] = set()
 
     def at(self, here: Sequence[_Seen], known: Mapping[int, list[tuple[int, _Seen]]]) -> dict[int, _Seen]:
-        """Give ids to the appearances at one point, the next one in order; returns them by id."""
+        """Give ids to the appearances at the next parameter point; return the appearances by id."""
         free = [one for one in here if self._group[one.number] not in self._by_group]
         for one in here:
             if one not in free:
@@ -228,7 +230,7 @@ class _Ids:
         return {self._by_group[self._group[one.number]]: one for one in here}
 
     def _has_room(self, one: _Seen, identity: int) -> bool:
-        """Whether an id is listed nowhere where what is connected with an appearance is."""
+        """Whether an id is free at every parameter point where the appearance's group is listed."""
         return not self._where[self._group[one.number]] & self.taken[identity]
 
     def _give(self, one: _Seen, identity: int) -> None:
@@ -256,7 +258,7 @@ def _seen(attractors: xr.Dataset, number: int, place: Place) -> _Seen:
 def _known(
     seen: dict[tuple[int, ...], dict[int, _Seen]], index: tuple[int, ...], look_back: int
 ) -> dict[int, list[tuple[int, _Seen]]]:
-    """Appearances to hold against: of each id the nearest along each axis, with the axis."""
+    """Return the appearances to compare with: for each id, the axis and the nearest appearance along it."""
     known: dict[int, list[tuple[int, _Seen]]] = {}
     for axis in range(len(index)):
         along: dict[int, _Seen] = {}
@@ -275,7 +277,7 @@ def _assign(
     rule: _Rule,
     is_free: Callable[[_Seen, int], bool],
 ) -> list[int | None]:
-    """Id of each attractor by distance, None for a new one."""
+    """Assign each attractor to an id by distance; None for a new attractor."""
     given: list[int | None] = [None] * len(here)
     if not here or not known:
         return given
@@ -287,7 +289,7 @@ def _assign(
         return min(rule.distance(axis, b, a) for axis, b in known[identity])
 
     cost = np.array([[cost_of(a, identity) for identity in identities] for a in here])
-    # clipped, so that an assignment beyond the threshold is as good as none
+    # clip, so that an assignment beyond the threshold costs as much as none
     for row, column in zip(*linear_sum_assignment(np.minimum(cost, rule.threshold)), strict=True):
         if cost[row, column] < rule.threshold:
             given[row] = identities[column]
@@ -295,7 +297,7 @@ def _assign(
 
 
 def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple[str, ...]) -> xr.Dataset:
-    """Put every attractor into the row of its id, and its id into the cells."""
+    """Move every attractor to the row of its id, and write the ids into the cells."""
     present = np.nonzero(ids >= 0)
     target = (*present[:-1], ids[present])
     variables: dict[str, Any] = {}
@@ -329,13 +331,13 @@ def _fill(name: str, dtype: np.dtype[Any]) -> float:
 
 
 def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Ids of row numbers at one parameter point, -1 where there is none."""
+    """Return the ids of row numbers at one parameter point; -1 for no row."""
     table = np.append(ids, -1)
     return np.asarray(table[rows])
 
 
 def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Counts by row numbers as counts by ids."""
+    """Convert counts by row number into counts by id."""
     moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
     for *index, row in np.argwhere(ids >= 0).tolist():
         point = tuple(index)

@@ -1,7 +1,7 @@
-"""Closed orbits of one parameter point: polished, run on, held against each other.
+"""Polish closed orbits by Newton's method, integrate guesses until they close, and compare orbits.
 
-`polish` runs Newton's method of the core and `run_on` the engine; what they need of a cube is one
-section point per guess.
+`polish` runs Newton's method of the core, and `run_on` runs the engine. Both take one section point per
+guess.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from pipeline.analysis.sets import Geometry, rounded_points
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
 
 SAME_ORBIT = 1e-7
-"""Polished orbits at most this far apart are one, on top of the error that their residuals allow."""
+"""Largest distance between two polished orbits that are one, on top of the errors from their residuals."""
 
 PLACE_ERROR = 30.0
-"""Error of a multiplier beside a fold over the residual's root: twice the root of the map's curvature."""
+"""Error of a multiplier near a fold per root of the residual: twice the root of the map's curvature."""
 
 NEAR, NEARLY, NEAR_STEPS, NEAR_RTOL = 1e-5, 1e-3, 8, 1e-8
-"""Scaled residual to which all guesses are polished, that with which they go on, steps and tolerance for it.
+"""First polish: target residual, largest residual that continues, most Newton steps, tolerance.
 
-Many lead to the same orbit, and only one of these is polished further.
+Many guesses lead to the same orbit, and only one of them is polished further.
 """
 
 RUN_ON_PERIODS, RUN_ON_TOLERANCE, RUN_ON_RTOL = 2000, 1e-5, 1e-8
-"""How `run_on` integrates: drive periods at most, closure tolerance, tolerance of the steps."""
+"""Integration of `run_on`: most drive periods, closure tolerance, tolerance of the steps."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class Orbit:
     multipliers : ndarray of complex, (state,)
         NaN if not polished.
     residual : float
-        Certificate of `polish_orbits`; NaN if not polished.
+        Residual of `polish_orbits`; NaN if not polished.
     derivative : ndarray, (state, state)
         Monodromy matrix at the first point; NaN if not polished.
     seconds : float
         Period [s]; NaN if not polished.
     approached_within : float
-        Scaled distance from which trajectories on both sides were seen to come nearer; 0 if not tried.
+        Scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen.
     """
 
     points: np.ndarray
@@ -64,27 +64,27 @@ class Orbit:
 
     @property
     def period(self) -> int:
-        """Drive periods, or returns, until the orbit closes."""
+        """Number of drive periods, or returns, until the orbit closes."""
         return len(self.points)
 
     @property
     def is_polished(self) -> bool:
-        """Whether Newton's method found it."""
+        """Whether Newton's method converged on it."""
         return bool(np.isfinite(self.residual))
 
     @cached_property
     def multiplier_error(self) -> float:
         """Error of the largest modulus of the multipliers.
 
-        That of the monodromy matrix, and of the orbit's place: beside a fold the multiplier goes with the
-        root of the residual.
+        It adds the error of the monodromy matrix and the error of the orbit's place: near a fold the
+        multiplier changes with the square root of the residual.
         """
         of_matrix = MATRIX_ERROR * float(np.abs(self.derivative).max(initial=1.0))
         return largest_error(self.derivative, of_matrix) + PLACE_ERROR * float(np.sqrt(self.residual))
 
     @cached_property
     def stability(self) -> int:
-        """By its multipliers and their error, or by trajectories on both sides; see `stability`."""
+        """Stability by the multipliers and their error, or by trajectories on both sides."""
         if not self.is_polished:
             return NOT_SETTLED
         found = by_margin(float(np.abs(self.multipliers).max()), 1.0, self.multiplier_error)
@@ -97,18 +97,18 @@ class Orbit:
 
     @property
     def error(self) -> float:
-        """Distance from the true orbit that the residual allows for, roughly."""
+        """Estimate of the distance from the true orbit, from the residual."""
         return float(10.0 * self.residual / max(np.abs(1.0 - self.multipliers).min(), 1e-6))
 
 
 def scaled_derivative(orbit: Orbit, geometry: Geometry) -> np.ndarray:
-    """Monodromy matrix for states in units of their scales."""
+    """Return the monodromy matrix for states in units of their scales."""
     scales = np.asarray(geometry.scales)
     return np.asarray(orbit.derivative * scales[None, :] / scales[:, None])
 
 
 def raw_orbit(points: np.ndarray, geometry: Geometry) -> Orbit:
-    """Return the orbit of given section points as it is."""
+    """Make an unpolished orbit of section points (period, state)."""
     n = points.shape[1]
     return Orbit(_rolled(points, geometry), np.full(n, np.nan + 0j), np.nan, np.full((n, n), np.nan))
 
@@ -128,14 +128,14 @@ def polish(
     system: System,
     tolerance: float,
 ) -> list[Orbit | None]:
-    """Polish guesses at any parameter points, all at once.
+    """Polish guesses at any parameter points in one call.
 
     Parameters
     ----------
     packed, frequency, points, period
-        A row per guess; see `polish_orbits`.
+        Parameters, frequency [Hz], section point and period, a row per guess; see `polish_orbits`.
     geometry, system
-        Of the states, and what is integrated.
+        Geometry of the states, and the system to integrate.
     tolerance
         Scaled residual to reach.
 
@@ -155,13 +155,13 @@ def polish(
     images, _ = _images(packed[own], frequency[own], first[own], near.orbit_period[own], NEAR_RTOL, system)
     for row, image in zip(own, images, strict=True):
         first[row] = _rolled(image, geometry)[0]
-    # of an orbit that is very unstable the loose tolerance shows no more than that it is there
+    # very unstable orbits miss NEAR at the loose tolerance: keep them up to NEARLY and polish on
     good = np.flatnonzero(near.residual <= NEARLY)
     rounded = rounded_points(first[good], geometry)
     key = np.column_stack([packed[good], frequency[good], near.orbit_period[good], rounded])
     _, once, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
     rows = good[once]
-    # from the rounded point, so that an orbit does not depend on which guess of it came first
+    # start from the rounded point, so that an orbit does not depend on which guess came first
     orbits = _polished(
         packed[rows], frequency[rows], rounded[once] * np.asarray(geometry.scales), near.orbit_period[rows],
         geometry, system, tolerance,
@@ -176,7 +176,7 @@ def _polished(
     packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, geometry: Geometry,
     system: System, tolerance: float, turned: bool = False,
 ) -> list[Orbit | None]:  # fmt: skip
-    """Polish guesses to a residual; each orbit begins at its first point, unless it has just been turned."""
+    """Polish guesses to a residual; polish an orbit again from its least point if it started elsewhere."""
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
     orbits: list[Orbit | None] = [None] * len(points)
     rows = np.flatnonzero(found.converged)
@@ -200,7 +200,7 @@ def _polished(
 def run_on(
     packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, max_orbit_period: int, system: System
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Run section points on until they close within `RUN_ON_TOLERANCE`.
+    """Integrate section points (n, state) until they close within `RUN_ON_TOLERANCE`.
 
     Returns
     -------
@@ -223,7 +223,7 @@ def _images(
     packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, rtol: float,
     system: System,
 ) -> tuple[list[np.ndarray], np.ndarray]:  # fmt: skip
-    """Section points after 1, ..., period drive periods, and the derivative of the last, per row."""
+    """Return per row the section points after 1, ..., period drive periods and the last one's derivative."""
     images: list[np.ndarray] = [points[:0]] * len(points)
     derivatives = np.full((len(points), system.n_states, system.n_states), np.nan)
     for p in np.unique(period):
@@ -237,7 +237,7 @@ def _images(
 
 
 def distinct(orbits: Sequence[Orbit], geometry: Geometry) -> list[Orbit]:
-    """Merge orbits that coincide, in an order that does not depend on theirs."""
+    """Merge orbits that coincide; return them sorted, whatever their order was."""
 
     def key(orbit: Orbit) -> tuple[int, tuple[float, ...], bytes]:
         least = rounded_points(orbit.points[:1], geometry)[0]
@@ -251,7 +251,7 @@ def distinct(orbits: Sequence[Orbit], geometry: Geometry) -> list[Orbit]:
 
 
 def number_of(orbit: Orbit, orbits: Sequence[Orbit], geometry: Geometry) -> int:
-    """Place of an orbit among others; their number if it is not there."""
+    """Return the index of an orbit in a list, or the length of the list if it is not there."""
     return next((i for i, other in enumerate(orbits) if _coincide(orbit, other, geometry)), len(orbits))
 
 

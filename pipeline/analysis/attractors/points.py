@@ -1,4 +1,4 @@
-"""The parameter points of a cube: their cells in blocks, and what is integrated there."""
+"""Read the parameter points of a cube: their cells in blocks, their parameters and their system."""
 
 from __future__ import annotations
 
@@ -28,26 +28,27 @@ if TYPE_CHECKING:
 _READ = (
     "section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size",
 )  # fmt: skip
-"""Variables of a cube that are read."""
+"""Variables that are read from a cube."""
 
 BUDGET = 256 * 2**20
-"""Bytes of sections held at once."""
+"""Most memory for sections held at once [bytes]."""
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What a cube's cells obey.
+    """The model, parameters and system of a cube's cells.
 
     Attributes
     ----------
     model : Model or None
-        None if another system was given: then nothing is known of it but its equations.
+        None if another system was given.
     parameters : Parameters, ndarray or None
-        Of the run; swept ones are replaced at each point. A packed vector with a system of its own. None
-        if nothing is to be integrated.
+        Parameters of the run; swept values are replaced at each point. A packed vector if another system was
+        given. None if nothing is integrated.
     system : System or None
-        None, too, if nothing is to be integrated: it would bring the compiler with it.
+        None if nothing is integrated, since a system imports the compiler.
     geometry : Geometry
+        Geometry of the states.
     """
 
     model: Model | None
@@ -60,12 +61,12 @@ class Dynamics:
         cls, ds: xr.Dataset, parameters: Parameters | np.ndarray | None = None, system: System | None = None,
         *, needed: bool = True,
     ) -> Dynamics:  # fmt: skip
-        """Those given, else those of the run.
+        """Collect the parameters and the system that are given, or else those of the run.
 
         Raises
         ------
         ValueError
-            If the parameters are `needed` and not there.
+            If the parameters are `needed` and missing.
         """
         if system is not None:
             return cls(None, parameters, system, Geometry.of(system))
@@ -82,7 +83,7 @@ class Dynamics:
 
     @property
     def can_rest(self) -> bool:
-        """Whether equilibria are told apart: of flows without a drive whose equations are integrated."""
+        """Whether equilibria are searched: for autonomous models whose equations are integrated."""
         return self.model is not None and self.model.autonomous and self.system is not None
 
     @property
@@ -98,32 +99,34 @@ class Dynamics:
 
 @dataclass
 class Point:
-    """One parameter point: where its cells are, and what is integrated there.
+    """One parameter point: its cells, parameters and system.
 
     Attributes
     ----------
     parameters : Parameters or None
-        With the values of the swept ones; None for a system without a model.
+        Parameters with the swept values of this point; None for a system without a model.
     packed : ndarray
-        The same as the engine takes them.
+        Packed parameter vector for the engine.
     frequency : float
-        Of the drive [Hz]; of a flow seen at crossings one over the longest wait.
+        Drive frequency [Hz]; for a flow seen at crossings, one over the longest wait for a return.
     system : System or None
-        What is integrated.
+        System to integrate.
     equilibria : list of Equilibrium
-        Those that cells are at, see `equilibria.tell_rest`.
+        Equilibria that cells are at, see `equilibria.tell_rest`.
     at_rest : ndarray, (cell,), or None
-        Which of them each cell is at, -1 for none: it is neither closed nor bounded then.
+        Index of the equilibrium that each cell is at, -1 for none. Cells at rest count as neither closed nor
+        bounded.
     cycles : list of Cycle
-        Of a flow at even times: limit cycles that cells are on, see `cycles.tell_cycles`.
+        Limit cycles that cells are on, for a flow sampled at equal times; see `cycles.tell_cycles`.
     on_cycle : ndarray, (cell,), or None
-        Which of them each cell is on, likewise.
+        Index of the limit cycle that each cell is on, -1 for none. These cells, too, count as neither closed
+        nor bounded.
     n_periods : int
-        Drive periods or returns that the run integrated here, of all cells together.
+        Drive periods or returns that the run integrated here, summed over cells.
     is_flow : bool
         Whether sections are crossings of a flow.
     can_rest : bool
-        Whether equilibria are told apart.
+        Whether equilibria are searched.
     """
 
     cube: xr.Dataset
@@ -144,11 +147,11 @@ class Point:
 
     @property
     def n_neutral(self) -> int:
-        """Exponents of the section map that are 0 by construction: along a flow seen at even times."""
+        """Number of the section map's exponents that are 0 by construction: 1 for a flow at equal times."""
         return int(self.can_rest and not self.is_flow)
 
     def volumes(self, derivatives: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Logarithm of the change of a volume along the flow over each step of the section map."""
+        """Compute the log change of a volume along the flow over each step of the section map, shape (n,)."""
 
         def flow(states: np.ndarray) -> np.ndarray:
             return rates_at(self.integrates, states, self.packed)
@@ -172,7 +175,7 @@ class Point:
         return int(self.cube.sizes["state"])
 
     def blocks(self) -> Iterator[Block]:
-        """All cells in blocks, in the order of the start dims."""
+        """Yield all cells in blocks, in the order of the start dims."""
         first = self.start_dims[0] if self.start_dims else None
         length = self.cube.sizes[first] if first else 1
         inner = self.n_cells // max(length, 1)
@@ -203,7 +206,7 @@ class Point:
 
 
 def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
-    """Parameter points, some at a time: what fits is loaded at once, since chunks span many points."""
+    """Yield groups of parameter points by index; a group that fits the budget is loaded in one read."""
     names = [name for name in _READ if name in ds]
     cube = ds[names].reset_coords(drop=True) if FREQUENCY_DIM in ds.dims else ds[names]
     dims, start_dims = split_dims(ds["status"])
@@ -226,7 +229,7 @@ def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tupl
 
 
 def _fixed(ds: xr.Dataset) -> dict[str, float]:
-    """Parameters of which one value was chosen."""
+    """Return the parameters that are scalar coordinates."""
     return {str(name): float(c) for name, c in ds.coords.items() if not c.ndim and c.dtype.kind in "fiu"}
 
 

@@ -1,4 +1,4 @@
-"""The full motion on each attractor of one parameter point: what phase portraits are drawn from."""
+"""Integrate the motion on each attractor of one parameter point, for phase portraits."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def portraits(
     n_samples: int = 256,
     n_periods: int = 20,
 ) -> xr.Dataset:
-    """Integrate each set of a parameter point: one period of an orbit, some periods of another set.
+    """Integrate each set of a parameter point: an orbit for one period, any other set for `n_periods`.
 
     Parameters
     ----------
     attractors
         Result of `pipeline.analysis.attractors.attractors.match`.
     at
-        Values of the swept parameters; the nearest ones are taken.
+        Value of each swept parameter; it must lie on its axis.
     parameters
-        What was integrated; by default as the attributes say. Swept parameters replace those of the same
+        Parameters of the run, by default from the attributes. Swept parameters replace those of the same
         name.
     n_samples
         Samples per drive period, or per return.
@@ -52,13 +52,13 @@ def portraits(
     Returns
     -------
     Dataset
-        Dim ``attractor`` runs over those present at the point. ``orbit`` (attractor, sample, state): states,
-        angles not wrapped, every 1 / (`n_samples` f) from a section on, NaN beyond the end (of an equilibrium
-        after the first); ``points``
-        (attractor, sample, place, axis): the moving points of the model's drawing, ``x`` to the right, ``y``
-        upwards, in its unit, and ``fixed`` (fixed_place, axis), those that do not move, both absent if the
-        model has no drawing; ``attractor_points``, ``share``, ``n_cells``, ``orbit_period``, ``kind`` and, if
-        there, ``side`` as given.
+        Dim ``attractor`` runs over the sets present at the point. ``orbit`` (attractor, sample, state) has
+        the states at equal times from a section on, `n_samples` per drive period or return; angles are not
+        wrapped, and samples beyond the end (for an equilibrium, after the first) are NaN. ``points``
+        (attractor, sample, place, axis) has the moving points of the model's drawing, ``x`` to the right and
+        ``y`` upwards, in the drawing's unit; ``fixed`` (fixed_place, axis) has the points that do not move.
+        Both are absent if the model has no drawing. ``attractor_points``, ``share``, ``n_cells``,
+        ``orbit_period``, ``kind``, ``stability`` and, if present, ``side`` are copied.
 
     Raises
     ------
@@ -83,10 +83,10 @@ def portraits(
 
 
 def _step(here: xr.Dataset, parameters: Parameters, frequency: float, n_samples: int) -> float:
-    """Time between two samples [s]: a part of the drive's period, or of a typical return.
+    """Return the time between two samples [s]: a fraction of the drive period or of a typical return.
 
-    Returns of a flow are not of one length: all attractors are sampled alike, by the shortest return of a
-    closed orbit, else by that of the first set.
+    Returns of a flow differ in length. All attractors share one step, from the shortest mean return of a
+    closed orbit, or else from the mean return of the first set that does not close.
     """
     if np.isnan(frequency):
         raise ValueError("the dataset has no coordinate 'frequency' [Hz]; assign the drive frequency")
@@ -103,7 +103,7 @@ def _step(here: xr.Dataset, parameters: Parameters, frequency: float, n_samples:
 
 
 def _mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) -> float:
-    """Mean time between some crossings [s]."""
+    """Integrate 16 crossings and return the mean time between them [s]."""
     result = run_branches(
         parameters.pack()[None, None], np.full((1, 1), frequency), starts, n_transient=0, n_keep=16,
         rtol=RTOL, atol=RTOL, system=parameters.model.system,
@@ -147,7 +147,7 @@ def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters,
 
 
 def _drawn(result: xr.Dataset, table: np.ndarray, parameters: Parameters) -> xr.Dataset:
-    """With the places of the model's points."""
+    """Add the positions of the points of the model's drawing, if it has one."""
     drawing = parameters.model.drawing
     if drawing is None:
         return result

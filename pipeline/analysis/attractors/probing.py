@@ -1,8 +1,8 @@
-"""Degenerate orbits: does the motion beside them come nearer?
+"""Test whether degenerate orbits and equilibria attract, by trajectories beside them.
 
-Where a multiplier lies on the unit circle within its error, the linear map does not tell. Trajectories are
-started on both sides along the critical directions; if all of them come nearer, the orbit attracts, as at
-``x' = -x**3``, where distances fall with the root of time. In a centre they keep theirs.
+If a multiplier lies on the unit circle within its error, the linear map does not decide stability.
+Trajectories start on both sides along the critical directions. If all come nearer, the orbit attracts, as for
+``x' = -x**3``, where distances fall as one over the square root of time. In a centre distances do not fall.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from pipeline.analysis.attractors.requests import LEG, Extended, Leg, Work
 from pipeline.analysis.sets import Geometry
 
 DISTANCES = (0.05, 0.01)
-"""Scaled distances at which trajectories begin, the first that shows an approach."""
+"""Scaled distances at which trajectories start, tried in turn until one shows an approach."""
 
 LEGS, FALL = 32, 0.7
-"""Legs that they go on for, and the largest share of the distance that may be left."""
+"""Number of legs, and the largest share of the distance left after them that shows an approach."""
 
 
 def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
-    """Return the scaled distance from which trajectories on both sides come nearer to an orbit, or 0."""
+    """Return the scaled distance from which trajectories on both sides approach an orbit, or 0."""
     matrix = scaled_derivative(orbit, geometry)
     values, vectors = np.linalg.eig(matrix)
     critical = vectors[:, np.abs(np.abs(values) - 1.0) <= orbit.multiplier_error]
@@ -31,7 +31,7 @@ def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
 
 
 def probe_equilibrium(one: Equilibrium, geometry: Geometry) -> Work[float]:
-    """Return the same for an equilibrium."""
+    """Return the scaled distance from which trajectories on both sides approach an equilibrium, or 0."""
     values, vectors = np.linalg.eig(one.jacobian)
     critical = vectors[:, np.abs(values.real) <= one.eigenvalue_error]
     return (yield from _probe(one.state[None], critical, geometry))
@@ -51,7 +51,7 @@ def _probe(points: np.ndarray, critical: np.ndarray, geometry: Geometry) -> Work
 
 
 def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometry) -> Work[bool]:
-    """Whether all of some trajectories come nearer to some points, leg by leg, from a distance on."""
+    """Return whether all trajectories come nearer to the points, leg by leg, from a distance `size`."""
     step, before = np.zeros(len(state)), np.full(len(state), np.inf)
     for _ in range(LEGS):
         leg: Extended = yield Leg(state, step)
@@ -68,13 +68,13 @@ def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometr
 
 
 def _distance(section: np.ndarray, points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Largest distance of each trajectory's sections from the nearest of some points."""
+    """Return each trajectory's largest distance from the points, over its sections."""
     away = np.stack([geometry.distance(section, point) for point in points])
     return np.asarray(away.min(axis=0).max(axis=1))
 
 
 def is_approaching(section: np.ndarray, orbit: Orbit, geometry: Geometry) -> np.ndarray:
-    """Cells whose sections (cell, period_index, state) come nearer to an orbit within the distance shown."""
+    """Return which cells approach a probed orbit, by their sections (cell, period_index, state)."""
     half = section.shape[1] // 2
     early = _distance(section[:, :half], orbit.points, geometry) if half else np.full(len(section), np.inf)
     late = _distance(section[:, half:], orbit.points, geometry)

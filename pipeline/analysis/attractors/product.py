@@ -1,4 +1,4 @@
-"""Attractors as an analysis of a run (`pipeline.products.attractors`)."""
+"""Compute attractors as an analysis of a run (`pipeline.products.attractors`)."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 
 def identified(run: Run, options: IdentifyOptions) -> xr.Dataset:
-    """Attractors of each parameter point by itself: all that integrates."""
+    """Find the attractors of each parameter point of a run separately."""
     from pipeline.analysis.attractors.attractors import identify
 
     return identify(run.cube(), options)
 
 
 def attractors(run: Any, options: AttractorOptions) -> xr.Dataset:
-    """Attractors of a run, found, named and followed along its axes."""
+    """Find the attractors of a run and give them ids that follow them along its axes."""
     from pipeline.analysis.attractors.attractors import match
 
     found = run.derive("identified", **options.part(IdentifyOptions))

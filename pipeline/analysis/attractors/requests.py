@@ -1,7 +1,7 @@
-"""What the analysis of a parameter point asks of the engine, and one call that answers all points at once.
+"""Collect the engine requests of all parameter points, and answer them in common calls.
 
-The work on a point is a generator: it yields a request and is sent the answer. Points go in step, so that
-the trajectories of all fill the engine's lanes together.
+The work on a point is a generator: it yields a request and receives the answer. All points advance in step,
+so that their trajectories fill the engine's lanes together.
 """
 
 from __future__ import annotations
@@ -24,15 +24,18 @@ from pipeline.analysis.sets import Geometry, hashes
 from pipeline.products.reporting import report
 
 LEG = 64
-"""Drive periods or returns between two looks at where extended cells are."""
+"""Number of drive periods or returns in a leg of an extension."""
 
 SLOPE_RTOL = 1e-8
-"""Tolerance of the derivatives along extended cells: exponents need no more."""
+"""Tolerance of the derivatives along extended cells, sufficient for exponents."""
 
 
 @dataclass(frozen=True)
 class Leg:
-    """Extend trajectories by `LEG` sections: states (n, state) and step sizes (n,), 0 to choose them."""
+    """A request to extend trajectories by `LEG` sections, from states (n, state) and step sizes (n,).
+
+    With a step size of 0 the engine chooses the step.
+    """
 
     state: np.ndarray
     step: np.ndarray
@@ -40,7 +43,7 @@ class Leg:
 
 @dataclass(frozen=True)
 class Extended:
-    """Answer to a `Leg`.
+    """The answer to a `Leg`.
 
     Attributes
     ----------
@@ -48,9 +51,9 @@ class Extended:
     status, orbit_period : ndarray, (n,)
     turns : ndarray, (n, angle)
     state, step : ndarray
-        With which the next leg goes on, bit for bit.
+        State (n, state) and step size (n,) that continue the trajectory bit for bit.
     seconds : ndarray, (n, LEG)
-        Time since the section before [s].
+        Time from the previous section to each [s].
     """
 
     section: np.ndarray
@@ -64,9 +67,9 @@ class Extended:
 
 @dataclass(frozen=True)
 class Polish:
-    """Find the orbits near some guesses; the answer is a list of `Orbit` or None.
+    """A request to polish guesses; the answer is a list of `Orbit` or None, one per guess.
 
-    Guesses without a period are first run on until they close.
+    Guesses without a period are first integrated until they close.
     """
 
     guesses: Guesses
@@ -74,7 +77,10 @@ class Polish:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Images of points (n, state) under the section map, and its derivatives there, (n, state, state)."""
+    """A request for the images of points (n, state) under the section map, and its derivatives there.
+
+    The answer is a pair of arrays, shapes (n, state) and (n, state, state).
+    """
 
     point: np.ndarray
     rtol: float = SLOPE_RTOL
@@ -83,31 +89,33 @@ class Slopes:
 Request = Leg | Polish | Slopes
 T = TypeVar("T")
 Work = Generator[Request, Any, T]
-"""Analysis of a point: yields requests, is sent answers, returns what it found."""
+"""The analysis of a point: a generator that yields requests, receives answers and returns its result."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How trajectories of a run go on.
+    """The settings by which trajectories of a run are extended.
 
     Attributes
     ----------
     rtol, atol : float
+        Tolerances of the run.
     max_steps : int
-        Of one period.
+        Most steps per period.
     closure : float
         Scaled distance at which extended cells count as closed.
     longest : int
-        Longest orbit period looked for.
+        Longest orbit period in the search.
     residual : float
         Scaled residual that Newton's method is to reach.
     seen : int
-        Drive periods or returns that a cell of the run was integrated for.
+        Drive periods or returns for which the run integrated a cell.
     system : System or None
-        What is integrated.
+        System to integrate.
     method : str
-        Of the run, by which legs go on.
+        Integration method of the run, also used for legs.
     geometry : Geometry
+        Geometry of the states.
     """
 
     rtol: float
@@ -123,7 +131,7 @@ class Settings:
 
     @classmethod
     def of(cls, ds: xr.Dataset, system: System | None, geometry: Geometry, **asked: Any) -> Settings:
-        """Settings of the run that a cube comes from."""
+        """Read the settings of the run from a cube's attributes."""
         given = ds.attrs
         method = str(given.get("method", system.method if system is not None else ""))
         seen = int(given.get("n_transient", 0)) + int(given.get("n_keep", ds.sizes["period_index"]))
@@ -138,7 +146,7 @@ def answer_all(
     works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings,
     what: str,
 ) -> dict[tuple[int, ...], T]:  # fmt: skip
-    """Carry out the work on all points in step; returns what each found."""
+    """Carry out the work on all points in step, and return the result of each point."""
     answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
     results: dict[tuple[int, ...], T] = {}
     while answers:
@@ -162,7 +170,7 @@ def answer_all(
 def _gathered(
     sizes: Sequence[int], asked: Mapping[tuple[int, ...], Any], points: Mapping[tuple[int, ...], Point]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Packed parameters and frequency of each row, and where the rows of each point end."""
+    """Return the packed parameters and the frequency of each row, and the end of each point's rows."""
     packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
     frequency = np.repeat([points[i].frequency for i in asked], sizes)
     return packed, frequency, np.cumsum(sizes)
@@ -228,9 +236,10 @@ def _each_once(
     search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray,
     geometry: Geometry,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Rows to polish, and for each row the place of its own among them, -1 for none.
+    """Choose the rows to polish; return them, and for each row the index of its representative (-1: none).
 
-    Of rows that were run on and ended in one box, on one orbit that is, the one of least hash.
+    Rows that were integrated further and ended in one box are on one orbit; the row of least hash represents
+    them. Rows without a period have no representative.
     """
     rows = np.arange(len(period))
     key = mark.copy()

@@ -1,7 +1,7 @@
-"""The search for orbits of a parameter point, in blocks of cells.
+"""Search for the closed orbits of a parameter point, block by block.
 
-Cells are read block by block, several times over; what is kept between blocks (boxes, best guesses,
-least hashes, sums) does not depend on how they were cut.
+Cells are read in blocks, several times. The data kept between blocks (boxes, best guesses, least hashes,
+sums) do not depend on how the cells were cut into blocks.
 """
 
 from __future__ import annotations
@@ -22,21 +22,23 @@ from pipeline.analysis.sets import Geometry
 from pipeline.products.attractors import IdentifyOptions
 
 ROUNDS, ROUNDS_LOOSE = 3, 6
-"""Most rounds of guessing and polishing, with a strict and a loose tolerance."""
+"""Most rounds of guessing and polishing, with a strict and with a loose tolerance."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """What the search is asked for, and of what.
+    """The options of a search, with the run's dynamics and settings.
 
     Attributes
     ----------
     options : IdentifyOptions
+        Options of `identify`.
     tolerance : float
-        That of the options, or what follows from the run.
+        Tolerance of the options, or the default that follows from the run.
     dynamics : Dynamics
+        Model, parameters and system.
     settings : Settings
-        How trajectories of the run go on.
+        Settings by which trajectories are extended.
     """
 
     options: IdentifyOptions
@@ -46,17 +48,17 @@ class Search:
 
     @property
     def geometry(self) -> Geometry:
-        """Of the states."""
+        """Geometry of the states."""
         return self.dynamics.geometry
 
     @property
     def longest(self) -> int:
-        """Longest period guessed."""
+        """Longest orbit period in the search."""
         return self.options.max_orbit_period
 
     @property
     def is_loose(self) -> bool:
-        """Whether closed cells may be too far from their orbit for an orbit of their own."""
+        """Whether the tolerance is too loose for a closed cell to show an orbit without Newton's method."""
         return self.options.polish and self.tolerance > STRICT
 
     @property
@@ -67,17 +69,18 @@ class Search:
 
 @dataclass
 class State:
-    """What the search knows of one point before its cells are labelled.
+    """The result of the search at one point, before its cells are labelled.
 
     Attributes
     ----------
     orbits : list of Orbit
-        In the order in which they were found.
+        Orbits, those of the last rounds last.
     keys, group : ndarray
-        Boxes of the closed cells, and the group of each.
+        Keys of the boxes of closed cells, and the group of each box.
     closed : ClosedCells
+        Closed cells by group.
     ends : dict
-        Orbit by the mark of a closed cell that was run on.
+        Index of the orbit that a closed cell reached after further integration, by the cell's mark.
     """
 
     orbits: list[Orbit]
@@ -88,7 +91,7 @@ class State:
 
 
 def search_orbits(point: Point, search: Search) -> Work[State]:
-    """Find the orbits that cells of a point have closed on, or are on their way to."""
+    """Find the orbits that cells of a point have closed on or approach."""
     n_states = len(search.geometry.scales)
     closed = ClosedCells(search.geometry, search.box, Guesses.none(n_states))
     for block in point.blocks():
@@ -124,7 +127,7 @@ def search_orbits(point: Point, search: Search) -> Work[State]:
 
 
 def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> list[Orbit | None]:
-    """Orbits without those that are equilibria: these are added to the point's, in place."""
+    """Replace orbits that are equilibria by None, and add these equilibria to the point, in place."""
     if not point.can_rest:
         return list(orbits)
     return [
@@ -133,7 +136,7 @@ def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> 
 
 
 def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Return the closed cells that none of the orbits accounts for, to be run on."""
+    """Return the closed cells that are on no known orbit, as guesses without a period."""
     found = Guesses.none(len(search.geometry.scales))
     for block in point.blocks():
         label, _ = decide(block, orbits, search.tolerance, search.geometry)
@@ -147,7 +150,7 @@ def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> 
 
 
 def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Guesses from cells that none of the orbits accounts for."""
+    """Make guesses from the cells that are on no known orbit."""
     closed = ClosedCells(search.geometry, search.box, Guesses.none(len(search.geometry.scales)))
     near = Guesses.none(len(search.geometry.scales))
     for block in point.blocks():
@@ -159,7 +162,7 @@ def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses
     keys, group = closed.close()
     own = closed.guesses.best(group[np.searchsorted(keys, closed.guesses.key)].astype(np.uint64))
     if search.is_loose:
-        # the period seen may be half the true one, and the orbit an unstable one: the future tells
+        # the observed period may be half the true one, or the orbit unstable: try without a period as well
         own = closed.guesses.least(MAX_GUESSES)
         own = own.followed_by(own.without_period())
     if len(near.key):

@@ -1,4 +1,4 @@
-"""Settling as an analysis of a run (`pipeline.products.attractors`)."""
+"""Select the settling data of a run's attractors, as an analysis (`pipeline.products.attractors`)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ VARIABLES = (
     "mean_lifetime", "lifetime_low", "lifetime_high", "lyapunov_max", "lyapunov_low", "lyapunov_high",
     "closes_above", "orbit_period", "ran_out",
 )  # fmt: skip
-"""What the table of settling shows of the attractors of a run."""
+"""Variables of the attractors that the settling table shows."""
 
 
 def settling(run: Any, options: AttractorOptions) -> xr.Dataset:
-    """Transient or attractor: what the extended cells of each set that does not close showed."""
+    """Return the evidence on whether each set that does not close is transient or attracts."""
     found: xr.Dataset = run.derive("attractors", **options.plain())
     return found[list(VARIABLES)]

@@ -1,4 +1,4 @@
-"""Table of the sets that do not close, and what their extended cells showed."""
+"""Tabulate the sets that do not close, with the evidence from their extended cells."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from pipeline.products.product import Table
 
 
 def settling_table(ds: xr.Dataset) -> Table:
-    """Table of the sets that do not close."""
+    """Return the table of the sets that do not close."""
     rows = settling_rows(ds)
     return Table(rows, settling_lines(ds, rows))
 
 
 def settling_rows(ds: xr.Dataset) -> list[Row]:
-    """Return a row per set that does not close and parameter point: what became of its extended cells."""
+    """Return a row per parameter point and set that does not close, with the fate of its extended cells."""
     dims = [str(d) for d in ds["kind"].dims if d != "attractor"]
     kinds, stabilities = words_of(ds["kind"]), words_of(ds["stability"])
     rows = []
@@ -45,7 +45,7 @@ def settling_rows(ds: xr.Dataset) -> list[Row]:
 
 
 def settling_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """Return the table of sets that do not close."""
+    """Return the table of the sets that do not close as lines of text."""
     if not rows:
         return ["sets that do not close: none, so there is nothing to extend"]
     periods = periods_of(model_of(ds))

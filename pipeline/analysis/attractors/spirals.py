@@ -1,10 +1,10 @@
-"""Cells that do not close but come back near: what orbit they may be on their way to.
+"""Guess the orbits that slowly spiralling cells approach.
 
 A slow spiral looks like a bounded set: near a bifurcation of its orbit a motion takes thousands of periods
-to close. Its sections show it in two ways. They recur: sections p apart lie close together, whether the
-distance falls (towards the orbit) or still rises (away from an unstable one that it passed). Or they
-contract: the sections of each phase scatter less and less about their mean, however fast they turn about
-it. Both make guesses for Newton's method; and what no orbit accounts for then is run on.
+to close. Its sections show the spiral in two ways. They recur: sections p apart lie close together, whether
+the distance falls (towards the orbit) or still rises (away from an unstable orbit). Or they contract: the
+sections of each phase scatter less and less about their mean, however fast they turn about it. Both give
+guesses for Newton's method. Cells that are on no orbit afterwards are extended.
 """
 
 from __future__ import annotations
@@ -19,47 +19,47 @@ from pipeline.analysis.attractors.orbits import Orbit, scaled_derivative
 from pipeline.analysis.sets import Geometry, hashes
 
 NEAR = 0.05
-"""Scaled distance between recurring sections of a cell that is not closed, at which it makes a guess."""
+"""Largest scaled distance between recurring sections at which a cell makes a guess."""
 
 SPREAD = 0.3
-"""Largest scaled distance of sections from the mean of their phase, at which this makes a guess."""
+"""Largest scaled distance of sections from the mean of their phase at which this mean is a guess."""
 
 N_PARTS, SHRINKS = 4, 0.7
-"""The spread shrinks if it falls from part to part of the sections, to at most this share of the first's."""
+"""Sections contract if their spread falls over `N_PARTS` parts, to at most `SHRINKS` times the first."""
 
 PER_PHASE = 4
 """Fewest sections of a phase in each part."""
 
 SAME_LAG = 1.5
-"""A shorter period is taken if its sections lie at most this much farther apart."""
+"""The shortest period is taken whose distance is at most this factor above the smallest distance."""
 
 MAX_GUESSES = 64
 """Most guesses per parameter point from cells that are not closed."""
 
 SLOWLY, BESIDE = 1.2, (0.005, 0.01, 0.02, 0.04, 0.08)
-"""Largest multiplier of an unstable orbit beside which others are looked for, and scaled distances there."""
+"""Largest multiplier of an unstable orbit near which other orbits are guessed, and the guesses' distances."""
 
 CHEAP = 4
-"""Longest period of which every recurrence is a guess: chaos passes many orbits, and long ones are dear."""
+"""Longest period at which every recurrence is a guess: chaos passes many orbits, and long ones cost more."""
 
 CLOSES_IN = 0.9
-"""Share of the distance between recurring sections that is left in the later half, at most."""
+"""Largest ratio of the distances between recurring sections, later half to earlier half, that closes in."""
 
 LEAP, LINEAR = 2.0, 0.1
-"""How far a cell that leaves an unstable orbit leaps, in its distance, and the error of the linear map that
-this allows, in units of the growth."""
+"""Factor by which a leap increases the distance from an unstable orbit; and the largest error of the linear
+map that allows it, in units of the growth."""
 
 
 @dataclass(frozen=True)
 class Recurrence:
-    """How the sections of cells come back.
+    """The recurrence of cells' sections.
 
     Attributes
     ----------
     period : ndarray of int64, (cell,)
-        After which the younger half of the sections lies within `NEAR` of itself; 0 if there is none.
+        Period after which the younger half of the sections recurs within `NEAR`; 0 if there is none.
     lag : ndarray, (cell,)
-        Last distance after that period; infinite if there is none.
+        Distance of the last section from that one period before; infinite without a period.
     centred : ndarray of int64, (cell,)
         Period at which sections contract to the mean of their phase; 0 if there is none.
     centre : ndarray, (cell, state)
@@ -73,14 +73,14 @@ class Recurrence:
 
     @classmethod
     def of(cls, section: np.ndarray, max_period: int, geometry: Geometry) -> Recurrence:
-        """Recurrence of cells with sections (cell, period_index, state)."""
+        """Compute the recurrence of sections (cell, period_index, state)."""
         period, lag = _recurring(section, max_period, geometry)
         centred, centre = _contracting(section, max_period, geometry)
         return cls(period, lag, centred, centre)
 
     @property
     def is_near(self) -> np.ndarray:
-        """Cells that may be on their way to an orbit."""
+        """Whether each cell may approach an orbit."""
         return np.asarray((self.period > 0) | (self.centred > 0))
 
 
@@ -100,12 +100,12 @@ def _recurring(section: np.ndarray, max_period: int, geometry: Geometry) -> tupl
 def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     n, k, n_states = section.shape
     period, centre = np.zeros(n, np.int64), section[:, -1].copy()
-    # of long periods one shrinks by chance
+    # limit the periods: among many long ones, one would shrink by chance
     for p in range(1, min(max_period, CHEAP, k // (N_PARTS * PER_PHASE)) + 1):
         m = k // (N_PARTS * p)
         rest = np.flatnonzero(period == 0)
         own = section[rest, k - N_PARTS * m * p :].reshape(len(rest), N_PARTS, m, p, n_states)
-        # about the last section of its phase, so that a circle is cut on its far side
+        # measure from the last section, so that a circle of angles is cut on its far side
         away = geometry.difference(own, own[:, -1:, -1:])
         mean = away.mean(axis=2, keepdims=True)
         spread = np.abs(away - mean).max(axis=(2, 3, 4))
@@ -117,10 +117,10 @@ def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tu
 
 
 def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Guesses:
-    """Guesses from cells that are not closed but come back near, the best one of each box.
+    """Return guesses from cells that are not closed but recur, the best one of each box.
 
-    From each the last section and the period after which the sections lie nearest; and, if they contract,
-    the mean of its phase.
+    Each cell gives its last section with the period of recurrence and, if its sections contract, the mean of
+    the last section's phase.
     """
     found = Recurrence.of(section, max_period, geometry)
     marks = marks_of(section)
@@ -129,7 +129,7 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Gue
     spirals = _guesses(
         found.period[recurring], found.lag[recurring], marks[recurring], section[recurring, -1], geometry
     )
-    # after those that recur: a mean is no section
+    # rank means after recurring sections, since a mean is not a section
     away = geometry.distance(found.centre[contracting], section[contracting, -1]) + NEAR
     means = _guesses(
         found.centred[contracting], away, marks[contracting], found.centre[contracting], geometry
@@ -138,7 +138,7 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Gue
 
 
 def closes_in(section: np.ndarray, max_period: int, geometry: Geometry) -> np.ndarray:
-    """Cells that come nearer to themselves: what passes an orbit of a chaotic set is worth no Newton step."""
+    """Return which cells recur at falling distances, unlike chaos that merely passes an orbit."""
     found = Recurrence.of(section, max_period, geometry)
     closes = found.centred > 0
     half = section.shape[1] // 2
@@ -153,17 +153,17 @@ def closes_in(section: np.ndarray, max_period: int, geometry: Geometry) -> np.nd
 def _guesses(
     period: np.ndarray, score: np.ndarray, mark: np.ndarray, point: np.ndarray, geometry: Geometry
 ) -> Guesses:
-    # by decades of the score: what was no good guess from afar may be one from near by
+    # separate decades of the score: a cell may guess well nearby after failing from far
     decade = np.floor(np.log10(np.maximum(score, 1e-12))).astype(np.int64)
     rows = np.concatenate([period[:, None], decade[:, None], geometry.boxes(point, NEAR)], axis=1)
     return Guesses(hashes(rows), score, mark, point, period).best()
 
 
 def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Guesses:
-    """Guesses of the orbits that sprang from unstable ones, along their unstable directions.
+    """Guess the orbits that bifurcated from slightly unstable orbits, along their unstable directions.
 
-    A cell that left an orbit which lost its stability a little way back goes on to the one that took its
-    place: of twice the period where the multiplier is below -1, of the same where it is above 1.
+    Cells that leave an orbit shortly after it lost stability go to the orbit that replaced it. That orbit has
+    twice the period if the multiplier is below -1, and the same period if it is above 1.
     """
     points, periods = [], []
     for orbit in orbits:
@@ -186,38 +186,38 @@ def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Gues
 
 
 def keys_of(section: np.ndarray, side: float, geometry: Geometry) -> np.ndarray:
-    """Hash of the box that the last section of each cell lies in."""
+    """Return a hash of the box that the last section of each cell lies in."""
     return hashes(geometry.boxes(section[:, -1], side))
 
 
 def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np.ndarray:
-    """Where cells that leave an unstable orbit slowly will be when they are `LEAP` times as far from it.
+    """Move cells that leave an unstable orbit slowly to about `LEAP` times their distance from it.
 
-    Beside a bifurcation that takes thousands of periods, along which the orbit's monodromy matrix tells the
-    motion. Let u be the parts of a cell's distance along the unstable eigenvectors, at the sections that
-    share the phase of the orbit's first point, and lambda the multipliers. A cell leaps as long as
-    ``|u'' - lambda**2 u| <= 0.1 (|lambda|**2 - 1) |u|`` over the younger half of them, two returns apart:
-    near a doubling what is quadratic cancels over two.
+    Near a bifurcation leaving takes thousands of periods, in which the motion follows the orbit's monodromy
+    matrix. Let u be the components of a cell's distance along the unstable eigenvectors, at the sections that
+    share the phase of the orbit's first point, and lambda the multipliers. A cell leaps if
+    ``|u'' - lambda**2 u| <= 0.1 (|lambda|**2 - 1) |u|`` over the younger half of these sections. Here u'' is
+    u two returns later: near a period doubling the quadratic terms cancel over two returns.
 
     Parameters
     ----------
     section
-        A leg, shape (n, LEG, state).
+        Sections of a leg, shape (n, LEG, state).
     orbits
         Known orbits.
     geometry
-        Of the states.
+        Geometry of the states.
 
     Returns
     -------
     ndarray, (n, state)
-        NaN for cells that do not leap.
+        Predicted states; NaN for cells that do not leap.
     """
     states = np.full((len(section), section.shape[2]), np.nan)
     scales = np.asarray(geometry.scales)
     for orbit in orbits:
         growth = float(np.abs(orbit.multipliers).max())
-        # where it is fast, nothing is gained
+        # skip orbits that cells leave fast: a leap gains nothing
         if not 1.0 < growth < LEAP ** (orbit.period / section.shape[1]):
             continue
         values, vectors = np.linalg.eig(scaled_derivative(orbit, geometry))

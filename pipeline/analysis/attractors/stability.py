@@ -1,14 +1,14 @@
-"""Stability of a set: what has been shown of it, and by what.
+"""Decide the stability of a set, and name the evidence for it.
 
 ==============  ======================================================================================
-stability       shown by
+stability       evidence
 ==============  ======================================================================================
 attracts        eigenvalues with negative real parts, multipliers inside the unit circle, by more than
-                their error; of a degenerate orbit or equilibrium, trajectories on both sides that come
-                nearer; of any other set, a sample of its cells that stayed long enough
+                their error; for a degenerate orbit or equilibrium, trajectories on both sides that come
+                nearer; for any other set, a sample of its cells that stayed long enough
 unstable        an eigenvalue or a multiplier outside, by more than its error
 transient       cells of the set left it
-not settled     nothing: the time allowed was too short
+not settled     none: the budget was too short
 neutral         eigenvalues or multipliers on the axis or circle within their error, or a flow that
                 preserves volume
 ==============  ======================================================================================
@@ -31,10 +31,10 @@ BY_NOTHING, BY_EIGENVALUES, BY_MULTIPLIERS, BY_APPROACH, BY_STAYING, BY_LEAVING,
 """Values of `evidence`."""
 
 TIMES_LONGEST = 10.0
-"""A sample stays that has stayed so many times the longest transient seen."""
+"""A sample has stayed long enough after this many times the longest transient seen."""
 
 MATRIX_ERROR = 1e-9
-"""Relative error of a monodromy matrix: those of two methods at tolerance 1e-12 agree to 1e-10."""
+"""Relative error of a monodromy matrix: two methods at tolerance 1e-12 agree to 1e-10."""
 
 RATE_ERROR = 1e-9
 """Relative error of a Jacobian's entries at a polished equilibrium."""
@@ -45,17 +45,17 @@ _TRIALS = 8
 def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> float:
     """Estimate the error of the leading eigenvalue of a matrix whose entries err by `size` at most.
 
-    The matrix is perturbed a few times; so a multiple eigenvalue, which moves by a root of the
-    perturbation, gets the larger error that it has.
+    The matrix is perturbed a few times. So a multiple eigenvalue, which moves by a root of the perturbation,
+    gets its larger error.
 
     Parameters
     ----------
     matrix
-        Shape (n, n).
+        Matrix, shape (n, n).
     size
         Absolute error of an entry.
     real
-        Whether the largest real part is meant; else the largest modulus.
+        Whether the leading eigenvalue has the largest real part; else the largest modulus.
 
     Returns
     -------
@@ -71,9 +71,9 @@ def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> flo
 
 
 def by_margin(leading: float, bound: float, error: float) -> int:
-    """Stability from a leading modulus or real part: `ATTRACTS` below the bound, `UNSTABLE` above it.
+    """Return `ATTRACTS` if a leading modulus or real part is below its bound, and `UNSTABLE` if above.
 
-    `NEUTRAL` stands for within the error of the bound.
+    Within the error of the bound, return `NEUTRAL`.
     """
     if leading < bound - error:
         return ATTRACTS

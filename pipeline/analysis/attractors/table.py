@@ -1,4 +1,4 @@
-"""Table of attractors, and of the other sets that cells are on."""
+"""Tabulate the attractors and the other sets that cells are on."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _NUMBERS = (
 
 
 def attractors_table(ds: xr.Dataset) -> Table:
-    """Table of the attractors, per parameter point or per id."""
+    """Return the table of attractors, per parameter point or per id."""
     rows = attractor_rows(ds)
     return Table(rows, attractor_lines(ds, rows))
 
@@ -42,8 +42,8 @@ def attractors_table(ds: xr.Dataset) -> Table:
 def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence: float = 0.95) -> list[Row]:
     """Return a row per set and parameter point.
 
-    `fraction` is that of the cells that end on attractors or diverge, with its interval: NaN of a set that
-    does not attract. A continuation's branches are no sample of initial conditions, so they have none.
+    `fraction` is a share of the cells that attract or diverge, with its interval; it is NaN for a set that
+    does not attract. A continuation has no fractions: its branches are no sample of initial conditions.
     """
     dims, start_dims = split_dims(ds["attractor_id"])
     words = words_of(ds["decision"])
@@ -71,7 +71,7 @@ def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence:
 
 
 def _attractor(one: xr.Dataset) -> Row:
-    """Columns of one attractor; what its model does not have is left out."""
+    """Return the columns of one attractor, without those that its model lacks."""
     largest = np.hypot(one["multiplier_real"].values, one["multiplier_imag"].values)
     row: Row = {
         "attractor_id": int(one["attractor"]),
@@ -124,7 +124,7 @@ def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
 
 
 def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """What a reader must know beside the table: conservative, periods not looked for, budgets spent."""
+    """Return remarks below the table: conservative flow, periods beyond the search limit, spent budgets."""
     lines = []
     if any(row["evidence"] == "volume" for row in rows):
         lines.append("the flow preserves volume: a conservative system has no attractors")
@@ -162,7 +162,7 @@ def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
         "stability": row["stability"].replace("_", " "),
         "period": str(row["orbit_period"] or "-"),
     }
-    if "eigenvalue_real" in row:  # a flow: returns are not of one length
+    if "eigenvalue_real" in row:  # returns of a flow differ in length
         words["seconds"] = number(row["period_s"], ".6g")
     if "side" in row:
         words["side"] = row["side"]
@@ -191,7 +191,7 @@ _SHOWN_BY = {
 
 
 def _shown_by(row: Row) -> str:
-    """What the stability rests on."""
+    """Format the evidence for the stability."""
     low = number(row["lifetime_low"], ".0f")
     if row["evidence"] == "stayed":
         return f"{row['n_sampled']} stayed, lifetime above {low}"
@@ -202,14 +202,14 @@ def _shown_by(row: Row) -> str:
 
 
 def _exponent(row: Row) -> str:
-    """Largest exponent with its interval [1/s]."""
+    """Format the largest exponent with its interval [1/s]."""
     if not np.isfinite(row["lyapunov_max"]):
         return "-"
     return f"{row['lyapunov_max']:.3g} ({row['lyapunov_low']:.3g} to {row['lyapunov_high']:.3g})"
 
 
 def _eigenvalue(row: Row) -> str:
-    """The leading eigenvalue of an equilibrium [1/s]."""
+    """Format the leading eigenvalue of an equilibrium [1/s]."""
     if not np.isfinite(row["eigenvalue_real"]):
         return "-"
     imaginary = f" \u00b1 {row['eigenvalue_imag']:.4g}i" if row["eigenvalue_imag"] else ""
@@ -241,7 +241,7 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dic
 
 
 def _evidence(bases: Sequence[str]) -> str:
-    """Say what an id rests on: followed branches, doublings, or at how many points on distance alone."""
+    """Summarise the evidence for an id: followed branches, doublings, or points matched by distance alone."""
     evidence = [basis for basis in bases if basis != "first_appearance"]
     told = [name for name in ("branch", "doubling") if name in evidence]
     n = evidence.count("distance")

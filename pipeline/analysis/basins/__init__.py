@@ -1,1 +1,1 @@
-"""Basins of attraction: fractions, boundaries, Wada property."""
+"""Analyse basins of attraction: fractions, boundaries, Wada property."""

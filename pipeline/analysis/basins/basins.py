@@ -1,6 +1,6 @@
-"""Basins of attraction of a sweep: which cell goes where, how large each basin is, how tangled they are.
+"""Compute the basins of attraction of a sweep: outcomes of cells, basin fractions, basin boundaries.
 
-Reads the cube and the ids of its attractors, integrates nothing.
+The functions read the cube and the ids of its attractors, and integrate nothing.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from pipeline.products.basins import BasinOptions
 def basins(
     ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = None, **changes: Any
 ) -> xr.Dataset:
-    """Basins of attraction at each parameter point of a sweep, and their numbers.
+    """Compute the basins of attraction at each parameter point of a sweep, with fractions and boundaries.
 
     Parameters
     ----------
     ds
         Cube of a sweep.
     ids
-        Result of `match` for it, or of `identify`.
+        Result of `match` or `identify` for the cube.
     options
-        By default those of `BasinOptions`. For the intervals see `numbers.binomial_interval`, for the boxes
-        `boundaries.basin_entropy`, for the scaling `boundaries.uncertainty_exponent`, for the radius and the
-        metric `wada.wada_merge_test`.
+        By default the defaults of `BasinOptions`. See `numbers.binomial_interval` for the intervals,
+        `boundaries.basin_entropy` for the boxes, `boundaries.uncertainty_exponent` for the scaling, and
+        `wada.wada_merge_test` for radius and metric.
     changes
-        Fields of the options, instead of `options`.
+        Fields of `BasinOptions`, used if `options` is None.
 
     Returns
     -------
     Dataset
         On the cells: `attractor_id`, `decision`, `status`, `n_periods`, and `outcome`, the attractor that a
         cell ends on, -2 where it diverged, -1 else (`pipeline.analysis.outcomes`). On the parameter dims and
-        `label`, the ids of attractors and -2: `count`, `fraction` and all that
-        `basin_numbers.basin_fractions` returns, cells without an outcome being unfinished. On the
+        `label`, the ids of attractors and -2: `count`, `fraction` and the other variables of
+        `numbers.basin_fractions`, in which cells without an outcome count as unfinished. On the
         parameter dims: `n_pending`, `n_not_settled`, `n_transient`, `n_unstable`, `n_neutral` and `n_failed`
         (step limits), which add up to `n_unfinished`. On the parameter dims and `attractor`: `stability`.
 
@@ -52,8 +52,8 @@ def basins(
         `basin_entropy`, `boundary_basin_entropy`, `uncertainty_exponent`, `wada_beyond`, each with
         `_stderr`, `_low`, `_high`; `above_ln2_surely`, `boundary_dimension`, `exponent_r_squared`;
         `wada_distance`, the smallest radius [cells] that passes the Wada test; `wada`: 1 passes with
-        `radius`, 0 does not, -1 fewer than three labels; and, on `epsilon` too, `uncertain`. A number
-        that the grid does not allow is NaN, and the attribute ``not_computed`` says why.
+        `radius`, 0 does not, -1 fewer than three labels; and `uncertain`, also on `epsilon`. A number that
+        the grid does not allow is NaN, and the attribute ``not_computed`` gives the reason.
 
     Raises
     ------
@@ -90,11 +90,11 @@ def basins(
 _OWN = (
     "interval", "confidence", "box", "block", "scaling", "radius", "metric", "resamples", "seed",
 )  # fmt: skip
-"""Options that are not those of the attractors."""
+"""Options of basins alone, without those of the attractors."""
 
 
 def check_starts(ds: xr.Dataset) -> None:
-    """Refuse a cube whose cells are no independent initial conditions."""
+    """Raise ValueError unless the cells are independent initial conditions, several per point."""
     if "branch" in ds["status"].dims:
         raise ValueError(
             'basins need independent initial conditions, a sweep (kind = "sweep"): where a branch of a '
@@ -105,7 +105,7 @@ def check_starts(ds: xr.Dataset) -> None:
 
 
 def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
-    """Numbers of cells without an outcome, by what became of them."""
+    """Count the cells without an outcome, by their fate."""
     others = other_cells(ids)
     shape = outcomes(ids).transpose(*dims, ...).shape
     kinds = {
@@ -130,7 +130,7 @@ def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArra
 
 
 def _no_grid(ds: xr.Dataset, start_dims: tuple[str, ...]) -> str:
-    """Why the starts are no regular grid, empty if they are."""
+    """Return the reason why the starts are no regular grid; empty if they are one."""
     if "initial_condition" in start_dims:
         return "boundaries: the starts are no grid"
     for dim in start_dims:
@@ -162,7 +162,7 @@ _SCALARS = (
 
 
 class _Points:
-    """Numbers per parameter point, gathered one by one."""
+    """A collector of numbers per parameter point."""
 
     def __init__(self, dims: tuple[str, ...], shape: tuple[int, ...]) -> None:
         self.dims, self.shape = dims, shape
@@ -175,14 +175,14 @@ class _Points:
         self._uncertain: dict[tuple[int, ...], np.ndarray] = {}
 
     def add(self, index: tuple[int, ...], name: str, value: Any) -> None:
-        """Take in one number of a point."""
+        """Add one number of a point."""
         if name == "uncertain":
             self._epsilon, self._uncertain[index] = value["epsilon"].values, value.values
         else:
             self._scalars[name][index] = value
 
     def variables(self) -> dict[str, Any]:
-        """As xarray takes them."""
+        """Return the numbers as (dims, values, attributes) for xarray."""
         found: dict[str, Any] = {}
         for name, values in self._scalars.items():
             base = next((name.removesuffix(f"_{e}") for e in _ERRORS if name.endswith(f"_{e}")), name)
@@ -200,7 +200,7 @@ class _Points:
 
 
 def _boundary(grid: np.ndarray, options: BasinOptions, missing: set[str]) -> Iterator[tuple[str, Any]]:
-    """Numbers on the boundaries of one grid of labels, by name."""
+    """Yield the numbers on the boundaries of one grid of labels, with their names."""
     if not (grid != -1).any():
         return
     common: dict[str, Any] = {name: getattr(options, name) for name in ("resamples", "confidence", "seed")}

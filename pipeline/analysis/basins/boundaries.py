@@ -1,9 +1,9 @@
-"""How hard it is to tell the basin of a state: basin entropy and uncertainty exponent.
+"""Measure the complexity of basin boundaries: basin entropy and uncertainty exponent.
 
-Both read a grid of labels (see `basin_labels`) with one cell per initial condition, evenly spaced
-along each axis, in any number of dimensions. Their values depend on the resolution of the grid and on
-the boxes: compare basins at the same ones. Errors come from resampling parts of the grid; they tell how
-much the value would differ in another region that looks alike, not what a finer grid would show.
+Both read a grid of labels (see `labels`) with one cell per initial condition, evenly spaced along each axis,
+in any number of dimensions. Their values depend on the resolution of the grid and on the boxes: compare only
+basins with the same resolution and boxes. Errors come from resampling parts of the grid. They estimate the
+difference from a similar region, not from a finer grid.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _EXPONENT_REFERENCES = {
 
 
 class _Boxes(NamedTuple):
-    """Content of each box: entropy, number of labels, number of finished cells."""
+    """The content of each box: entropy [nat], number of labels, number of finished cells."""
 
     entropy: Floats
     n_labels: Ints
@@ -51,7 +51,7 @@ class _Boxes(NamedTuple):
 
 
 FEWEST_DRAWN = 5
-"""Fewest boxes that say something about the error of their mean: a single one is never drawn otherwise."""
+"""Fewest boxes for an error of their mean: with a single box all resamples are equal."""
 
 
 def basin_entropy(
@@ -64,14 +64,14 @@ def basin_entropy(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Basin entropy and boundary basin entropy, with bootstrap errors over boxes.
+    """Compute the basin entropy and the boundary basin entropy, with bootstrap errors over boxes.
 
-    The grid is cut into boxes; the entropy of a box is that of the labels in it,
-    ``S_i = sum_j p_ij ln(1/p_ij)``. The basin entropy is its mean over all boxes, the boundary basin
-    entropy its mean over the boxes with two labels or more (Daza, Wagemakers, Georgeot, Guéry-Odelin
-    and Sanjuán, Sci. Rep. 6, 31416, 2016). If the latter exceeds ln 2 the boundary is fractal: a smooth
-    one separates two basins in nearly every box. The converse does not hold, and two labels can never
-    exceed ln 2.
+    The grid is cut into boxes. The entropy of a box is the entropy of its labels,
+    ``S_i = sum_j p_ij ln(1/p_ij)``. The basin entropy is the mean over all boxes, and the boundary basin
+    entropy the mean over boxes with two labels or more (Daza, Wagemakers, Georgeot, Guéry-Odelin and
+    Sanjuán, Sci. Rep. 6, 31416, 2016). If the boundary basin entropy exceeds ln 2 the boundary is fractal,
+    since a smooth boundary separates two basins in nearly every box. The converse does not hold: two
+    labels never exceed ln 2.
 
     Parameters
     ----------
@@ -81,11 +81,11 @@ def basin_entropy(
         Side of a box [cells], one for all dims or one each. Cells at the far edges that fill no box are
         left out (`fraction_used`).
     unfinished
-        Codes of cells whose outcome is not known: left out of their box, and a box of nothing else is
-        left out of the means. With ``()`` they count as a label like any other.
+        Codes of cells whose outcome is not known. These cells are left out of their box, and a box that
+        has no others is left out of the means. With ``()`` all codes count as labels.
     block
-        Side of the square of boxes that the bootstrap draws as one. Boxes next to each other are alike;
-        with 1 they are drawn singly and the errors come out too small for structures wider than a box.
+        Side of the square of boxes that the bootstrap draws as one. Neighbouring boxes are similar: with 1
+        boxes are drawn singly, and the errors are too small for structures wider than a box.
     resamples, confidence, seed
         Bootstrap samples, level of the percentile intervals, seed.
 
@@ -93,11 +93,11 @@ def basin_entropy(
     -------
     Dataset
         `entropy` and `boundary_entropy` [nat], each with `_stderr`, `_low`, `_high`; `n_boxes`,
-        `n_boundary_boxes`, `n_labels`, `fraction_used`, `fraction_unfinished`; `above_ln2`: the boundary
-        entropy exceeds ln 2, `above_ln2_surely`: so does the lower end of its interval. Without a
-        boundary box the boundary entropy is NaN. Errors are NaN with fewer than `FEWEST_DRAWN` (boundary)
-        boxes, or squares of them, to draw from. That the boxes are small against the basins is not
-        validated.
+        `n_boundary_boxes`, `n_labels`, `fraction_used`, `fraction_unfinished`; `above_ln2`, whether the
+        boundary entropy exceeds ln 2; `above_ln2_surely`, whether the lower end of its interval does.
+        Without a boundary box the boundary entropy is NaN. Errors are NaN with fewer than `FEWEST_DRAWN`
+        (boundary) boxes, or squares of boxes, to draw from. Boxes should be small against the basins;
+        this is not validated.
 
     Raises
     ------
@@ -157,12 +157,12 @@ def uncertainty_exponent(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Uncertainty exponent alpha: the uncertain part of the region scales as ``f(eps) ~ eps**alpha``.
+    """Compute the uncertainty exponent alpha: the uncertain fraction scales as ``f(eps) ~ eps**alpha``.
 
-    alpha is the dimension of the region less that of the boundary: 1 for a smooth boundary, near 0 where
-    a better initial condition hardly helps to tell the outcome (McDonald, Grebogi, Ott and Yorke,
+    alpha is the dimension of the region minus that of the boundary: 1 for a smooth boundary, and near 0 if
+    more precise initial conditions hardly improve the prediction (McDonald, Grebogi, Ott and Yorke,
     Physica D 17, 125, 1985; Grebogi, McDonald, Ott and Yorke, Phys. Lett. A 99, 415, 1983). It is the
-    slope of ln f against ln eps by least squares.
+    least-squares slope of ln f against ln eps.
 
     Parameters
     ----------
@@ -172,15 +172,15 @@ def uncertainty_exponent(
         Perturbations or box sides [cells], at least three; None: twelve or fewer, evenly spaced in the
         logarithm, up to a tenth of the shortest side.
     method
-        What f is. ``"perturbation"``: the part of the cells whose outcome differs from that of the cell
-        `eps` before or after it along an axis, all axes pooled, the definition of 1985; every cell far
-        enough from the edge for the largest `eps` is a trial. ``"boxes"``: the part of the boxes of side
-        `eps` with more than one label, box counting; a small box sees its content through few cells,
-        so the smallest sides bias the slope. ``"entropy"``: the basin entropy with boxes of side `eps`,
-        of which Daza et al. (Sci. Rep. 6, 31416, 2016) show that it scales alike.
+        Definition of f. ``"perturbation"`` (the definition of 1985): the fraction of cells whose outcome
+        differs from that of the cell `eps` before or after it along an axis, all axes pooled; every cell
+        far enough from the edge for the largest `eps` is a trial. ``"boxes"`` (box counting): the fraction
+        of boxes of side `eps` with more than one label; small boxes have few cells, so the smallest sides
+        bias the slope. ``"entropy"``: the basin entropy with boxes of side `eps`, which scales in the same
+        way (Daza et al., Sci. Rep. 6, 31416, 2016).
     unfinished
-        Codes of cells whose outcome is not known: trials with such a cell are left out, boxes are judged
-        by the rest.
+        Codes of cells whose outcome is not known. Trials with these cells are left out; boxes use their
+        other cells.
     resamples, confidence, seed
         Bootstrap samples of tiles of the grid, level of the percentile interval, seed.
 
@@ -190,9 +190,9 @@ def uncertainty_exponent(
         `exponent`; `exponent_stderr_fit` from the scatter about the line, too small since all points
         come from the same grid; `exponent_stderr`, `exponent_low`, `exponent_high` from fits to about 64
         tiles drawn with replacement; `boundary_dimension`; `intercept`, `r_squared`;
-        `fraction_unfinished`. On `epsilon`: `uncertain`, which is f; `used`: f > 0, so part of the fit;
-        `fitted`. NaN if fewer than three points can be used, as without a boundary. That the points
-        follow a power law is not validated: look at them.
+        `fraction_unfinished`. On `epsilon`: `uncertain`, which is f; `used`, whether f > 0 and so part of
+        the fit; `fitted`. NaN with fewer than three usable points, for example without a boundary. A power
+        law is assumed and not validated: look at the points.
 
     Raises
     ------
@@ -249,7 +249,7 @@ def uncertainty_exponent(
 
 
 def _box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Sides of a box along each axis, checked against the grid."""
+    """Return the sides of a box along each axis, checked against the grid."""
     given = np.atleast_1d(np.asarray(box, dtype=np.int64)).tolist()
     sides = tuple(given) * (len(shape) if len(given) == 1 else 1)
     if len(sides) != len(shape):
@@ -262,7 +262,7 @@ def _box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, .
 
 
 def _fill_boxes(codes: Codes, sides: tuple[int, ...]) -> _Boxes:
-    """Entropy [nat] and number of labels in each box; unfinished cells are left out.
+    """Compute the entropy [nat] and the number of labels of each box, without unfinished cells.
 
     The cells of each box are sorted, so the work does not grow with the number of labels.
     """
@@ -285,7 +285,7 @@ def _fill_boxes(codes: Codes, sides: tuple[int, ...]) -> _Boxes:
 
 
 def _pool(values: npt.NDArray[np.generic], block: int) -> Floats:
-    """Sums over blocks of `block` elements a side, the last ones smaller; flat."""
+    """Sum values over blocks of `block` elements per side (smaller at the far edges), flattened."""
     out = values.astype(np.float64)
     for axis, n in enumerate(values.shape):
         out = np.add.reduceat(out, np.arange(0, n, block), axis=axis)
@@ -293,12 +293,12 @@ def _pool(values: npt.NDArray[np.generic], block: int) -> Floats:
 
 
 def _entropies(sums: Floats) -> Floats:
-    """Mean entropy over all boxes and over boundary boxes, from the sums of both kinds."""
+    """Compute the mean entropy over all boxes and over boundary boxes, from their sums."""
     return _ratio(np.array([sums[0], sums[0]]), sums[1:])
 
 
 def _ratio(hits: Floats, trials: Floats) -> Floats:
-    """Quotient, NaN where there is no trial."""
+    """Return hits / trials, NaN where there are no trials."""
     return np.where(trials > 0.0, hits / np.where(trials > 0.0, trials, 1.0), np.nan)
 
 
@@ -306,7 +306,7 @@ def _ratio(hits: Floats, trials: Floats) -> Floats:
 
 
 class _Line(NamedTuple):
-    """A straight line fitted to the logarithms."""
+    """A straight line fitted to ln f against ln eps."""
 
     slope: float
     intercept: float
@@ -315,7 +315,7 @@ class _Line(NamedTuple):
 
 
 def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Scaling) -> Ints:
-    """Perturbations or box sides [cells], ascending, checked against the grid."""
+    """Return the perturbations or box sides [cells] in rising order, checked against the grid."""
     first = 1 if method == "perturbation" else 2
     shortest = min(shape)
     # a perturbation needs room on both sides, a box must fit
@@ -336,10 +336,10 @@ def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Sc
 
 
 def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
-    """Trials and uncertain trials per epsilon and tile.
+    """Count the trials and the uncertain trials per epsilon and tile.
 
-    Every epsilon has the same trials, the cells that have room for the largest; else f would not be
-    a straight line even for a straight boundary.
+    Every epsilon has the same trials: the cells that have room for the largest epsilon. Otherwise f would not
+    be a straight line even for a straight boundary.
     """
     n_tiles = tiles_per_side(codes.shape) ** codes.ndim
     trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))
@@ -358,7 +358,7 @@ def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
 
 
 def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
-    """Boxes, and boxes with more than one label or the sum of their entropies, per epsilon and tile."""
+    """Count per epsilon and tile the boxes, and those with several labels (or sum their entropies)."""
     n_tiles = tiles_per_side(codes.shape) ** codes.ndim
     trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))
     for i, e in enumerate(eps):
@@ -370,12 +370,12 @@ def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
 
 
 def _window(codes: Codes, axis: int, start: int, stop: int) -> Codes:
-    """Part of the grid between two positions along an axis."""
+    """Return the part of the grid between two positions along an axis."""
     return codes[tuple(slice(start, stop) if k == axis else slice(None) for k in range(codes.ndim))]
 
 
 def _fit_line(eps: Ints, f: Floats) -> _Line:
-    """Least-squares line through ln f against ln eps where f > 0; NaN with fewer than three points."""
+    """Fit a line to ln f against ln eps where f > 0, by least squares; NaN with fewer than three points."""
     use = f > 0.0
     if use.sum() < 3:
         return _Line(np.nan, np.nan, np.nan, np.nan)

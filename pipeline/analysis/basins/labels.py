@@ -1,8 +1,8 @@
-"""Grids of labels as the numbers on basins read them: which cell went where, and which is unknown.
+"""Read grids of labels for basin analyses, and cut them into tiles for resampling.
 
-A label is the integer name of an outcome: an attractor's id, or any other code a caller counts as an
-outcome (diverged, say). Codes named as *unfinished* are no outcome: nobody knows where such a cell
-goes, so it is neither dropped in silence nor counted as a basin of its own.
+A label is the integer code of an outcome: an attractor's id, or another code that the caller counts as an
+outcome, such as divergence. *Unfinished* codes mark cells whose outcome is not known. These cells are neither
+dropped silently nor counted as a basin of their own.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ UNFINISHED = (-1,)
 
 @dataclass(frozen=True)
 class LabelGrid:
-    """Labels of a grid or sample, numbered without gaps.
+    """The labels of a grid or sample, numbered without gaps.
 
     Attributes
     ----------
     codes
         Index into `ids` per cell, any shape; -1 where the cell is unfinished.
     ids
-        The labels, ascending, without the unfinished ones.
+        The labels in rising order, without unfinished codes.
     """
 
     codes: Codes
@@ -54,7 +54,7 @@ def read_labels(
     unfinished
         Codes of cells whose outcome is not known.
     ids
-        Labels to list though no cell may have them.
+        Labels to list even if no cell has them.
 
     Raises
     ------
@@ -83,13 +83,13 @@ def read_labels(
 
 
 def check_confidence(confidence: float) -> None:
-    """Refuse a confidence level that is no probability between 0 and 1."""
+    """Raise ValueError unless a confidence level is between 0 and 1."""
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence is {confidence}, not between 0 and 1: give 0.95 for 95 %")
 
 
 def check_resamples(resamples: int) -> None:
-    """Refuse a bootstrap too short for a standard error."""
+    """Raise ValueError for fewer than two resamples, which give no standard error."""
     if resamples < 2:
         raise ValueError(f"resamples is {resamples}, below 2: a spread needs at least 2, an interval 200")
 
@@ -102,32 +102,32 @@ def bootstrap_weights(n: int, resamples: int, seed: int) -> Iterator[Floats]:
 
 
 def spread(resampled: Floats, confidence: float) -> tuple[Floats, Floats, Floats]:
-    """Standard error and ends of the percentile interval along the first axis; NaN if any is NaN."""
+    """Compute the standard error and the percentile interval along the first axis; NaN if any is NaN."""
     tail = 50.0 * (1.0 - confidence)
     low, high = np.percentile(resampled, [tail, 100.0 - tail], axis=0)
     return np.asarray(resampled.std(axis=0, ddof=1)), np.asarray(low), np.asarray(high)
 
 
 def tiles_per_side(shape: tuple[int, ...], total: int = 64) -> int:
-    """Tiles along each axis so that about `total` of them cover the grid, at least 2 a side."""
+    """Return the number of tiles along each axis, at least 2, for about `total` tiles in all."""
     return max(2, int(np.rint(total ** (1.0 / len(shape)))))
 
 
 def tile_numbers(
     shape: tuple[int, ...], grid: tuple[int, ...], step: int = 1, margin: tuple[int, ...] | None = None
 ) -> Ints:
-    """Number of the tile that holds the centre of each element of an array laid over the grid.
+    """Return the number of the tile that holds each element's centre, for an array laid over the grid.
 
     Parameters
     ----------
     shape
         Shape of the array.
     grid
-        Shape of the grid of cells that is cut into tiles.
+        Shape of the grid of cells that the tiles divide.
     step
         Side of an element [cells].
     margin
-        Cell at which the array starts, per axis; None: 0.
+        Cell at which the array starts, per axis; None stands for 0.
     """
     per_side = tiles_per_side(grid)
     number = np.zeros((), dtype=np.int64)
@@ -139,6 +139,6 @@ def tile_numbers(
 
 
 def tile_sums(values: npt.NDArray[np.generic], tile: Ints, n_tiles: int) -> Floats:
-    """Sum of the values in each tile."""
+    """Sum the values in each tile."""
     weights = values.ravel().astype(np.float64)
     return np.bincount(tile.ravel(), weights=weights, minlength=n_tiles).astype(np.float64)

@@ -1,8 +1,7 @@
-"""Numbers on basins of attraction, each with its error.
+"""Compute basin fractions and tipping probabilities, with their errors.
 
-Basin fractions and tipping probabilities are here; basin entropy and uncertainty exponent are in
-`basin_boundaries`, the Wada test in `basin_wada`, and all can be imported from here. They take labels:
-an integer per cell that names its outcome (see `basin_labels`).
+Basin entropy and uncertainty exponent are in `boundaries`, and the Wada test is in `wada`; all can also be
+imported from here. They take labels: an integer per cell that names its outcome (see `labels`).
 """
 
 from __future__ import annotations
@@ -39,12 +38,12 @@ def basin_fractions(
     confidence: float = 0.95,
     method: Interval = "wilson",
 ) -> xr.Dataset:
-    """Part of the cells that goes to each attractor, with its sampling error.
+    """Compute the fraction of cells that goes to each attractor, with its sampling error.
 
-    `fraction` is taken among the finished cells, as if the unfinished ones went the same ways; what
-    they may change at most is stated beside it. A label that no cell shows has the fraction 0 and an
-    interval that does not end there. For an attractor that is not listed at all `unseen_high` bounds
-    the fraction: the exact one-sided bound ``1 - (1 - confidence)**(1/N)``, at 95 % the "rule of
+    `fraction` refers to the finished cells, as if the unfinished cells were distributed alike. Further
+    variables state the largest change that the unfinished cells can make. A label without cells has the
+    fraction 0 and an interval that extends above 0. For an attractor that is not listed, `unseen_high`
+    bounds the fraction by the exact one-sided bound ``1 - (1 - confidence)**(1/N)``, at 95 % the "rule of
     three" 3/N (Hanley and Lippman-Hand, J. Am. Med. Assoc. 249, 1743, 1983).
 
     Parameters
@@ -52,14 +51,14 @@ def basin_fractions(
     labels
         Outcome per cell, integers of any shape.
     dims
-        Dims to count over, of a DataArray; None: all. The others stay: fractions along a sweep.
+        Dims of a DataArray to count over; None counts over all. Other dims stay, such as those of a sweep.
     ids
-        Labels to list though no cell may show them.
+        Labels to list even if no cell has them.
     unfinished
         Codes of cells whose outcome is not known; ``()`` if every code is an outcome.
     inferred
-        Which cells were not integrated but inferred (status ``INFERRED`` of a refined grid), in the shape
-        or on the dims of the labels. They are area like all others and count in full.
+        Whether each cell was inferred and not integrated (status ``INFERRED`` of a refined grid), in the
+        shape or on the dims of the labels. Inferred cells count like all others.
     confidence
         Two-sided level of the intervals, one-sided level of the `unseen` bounds.
     method
@@ -77,11 +76,11 @@ def basin_fractions(
 
     Notes
     -----
-    The intervals hold for cells drawn independently from the region, each label by itself, not for all
-    labels at once. Cells of a regular grid are not independent: there the error comes from the cells
-    along the boundary and is smaller, so the intervals are too wide rather than too narrow. What a refined
-    grid overlooked (`pipeline.compute.refinement`) is not in them. Whether
-    the cells were drawn at random is not validated, nor whether they cover the region evenly.
+    The intervals hold for cells drawn independently from the region, and for each label separately. Cells
+    of a regular grid are not independent: their error comes from the cells along the boundary and is
+    smaller, so the intervals are too wide rather than too narrow. The intervals do not include errors of
+    a refined grid (`pipeline.compute.refinement`). Random drawing and even coverage of the region are not
+    validated.
 
     Raises
     ------
@@ -126,9 +125,9 @@ def tipping_probabilities(
     confidence: float = 0.95,
     method: Interval = "wilson",
 ) -> xr.Dataset:
-    """Probability that a state in the basin of i lies in the basin of j after a parameter has changed.
+    """Compute the probability that a state in basin i lies in basin j after a parameter change.
 
-    The part of the cells of each basin before the change that belongs to each basin after it:
+    It is the fraction of each basin's cells before the change that belongs to each basin after it:
     ``P(i -> j) = |B_i(before) and B_j(after)| / |B_i(before)|`` (Kaszás, Feudel and Tél, Sci. Rep. 9,
     8654, 2019).
 
@@ -194,7 +193,7 @@ def tipping_probabilities(
 def _kept_dims(
     labels: npt.ArrayLike | xr.DataArray, dims: Sequence[str] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the dims that stay and of those counted over."""
+    """Return the names of the dims that stay and of the dims to count over."""
     if dims is None:
         over = tuple(str(dim) for dim in labels.dims) if isinstance(labels, xr.DataArray) else ()
         return (), over
@@ -209,7 +208,7 @@ def _kept_dims(
 def _count_rows(
     grid: LabelGrid, shape: tuple[int, ...]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Cells per label and unfinished cells, for each element of the leading axes `shape`."""
+    """Count the cells per label and the unfinished cells, for each element of the leading axes `shape`."""
     n_rows, width = int(np.prod(shape)), grid.ids.size + 1
     codes = grid.codes.reshape(n_rows, -1).astype(np.int64) + 1
     codes += width * np.arange(n_rows)[:, None]
@@ -220,7 +219,7 @@ def _count_rows(
 def _count_inferred(
     grid: LabelGrid, inferred: npt.NDArray[np.generic], shape: tuple[int, ...]
 ) -> npt.NDArray[np.int64]:
-    """Inferred cells per label."""
+    """Count the inferred cells per label."""
     if inferred.dtype != bool or inferred.shape != grid.codes.shape:
         raise ValueError(
             f"inferred is {inferred.dtype} of shape {inferred.shape}, the labels are of shape "
@@ -238,7 +237,7 @@ def _with_intervals(
     method: Interval,
     name: str = "fraction",
 ) -> dict[str, tuple[tuple[str, ...], npt.NDArray[np.generic]]]:
-    """Fractions of a table of counts (last axis: the outcomes), intervals, and the reach of the unknown."""
+    """Compute fractions, intervals and bounds due to unfinished cells, from counts (outcomes last)."""
     cells, unknown = n_cells[..., None], n_unfinished[..., None]
     finished = cells - unknown
     low, high = binomial_interval(count, finished, confidence=confidence, method=method)
@@ -260,13 +259,13 @@ def _with_intervals(
 def _upper_bound(
     count: npt.NDArray[np.int64], n: npt.NDArray[np.int64], confidence: float
 ) -> npt.NDArray[np.float64]:
-    """One-sided upper Clopper-Pearson bound; 1 where all of the `n` are hits, or there is none."""
+    """Compute the one-sided upper Clopper-Pearson bound; 1 if all `n` trials are hits, or `n` is 0."""
     bound = special.betaincinv(count + 1.0, np.maximum(n - count, 1), confidence)
     return np.where(count >= n, 1.0, bound)
 
 
 def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
-    """`after` with its dims in the order of `before`, once both are known to lie on the same cells."""
+    """Check that both arrays lie on the same cells, and transpose `after` to the dims of `before`."""
     if set(before.dims) != set(after.dims):
         raise ValueError(
             f"labels before have the dims {before.dims}, after {after.dims}: select one parameter value "
@@ -280,7 +279,7 @@ def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
 
 
 def _provenance(unfinished: Collection[int], confidence: float, method: Interval) -> dict[str, object]:
-    """What the numbers were made with."""
+    """Return the attributes with the options and references of the numbers."""
     return {
         "interval": method,
         "confidence": confidence,

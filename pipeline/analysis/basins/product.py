@@ -1,4 +1,4 @@
-"""Basins as an analysis of a run (`pipeline.products.basins`)."""
+"""Compute basins as an analysis of a run (`pipeline.products.basins`)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 def needs_starts(run: Run, options: BasinOptions) -> None:
-    """Refuse a run whose cells are no independent initial conditions."""
+    """Raise ValueError unless the run's cells are independent initial conditions."""
     from pipeline.analysis.basins.basins import check_starts
 
     check_starts(run.cube())
 
 
 def basins(run: Any, options: BasinOptions) -> xr.Dataset:
-    """Basins of a sweep: cells, fractions, boundaries."""
+    """Compute the basins of a sweep: outcomes of cells, fractions, boundaries."""
     from pipeline.analysis.basins.basins import basins as compute
 
     found = run.derive("attractors", **options.part(AttractorOptions))

@@ -1,4 +1,4 @@
-"""Table of basins."""
+"""Tabulate basin fractions and boundaries."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from pipeline.products.product import Table
 
 
 def basins_table(ds: xr.Dataset) -> Table:
-    """Table of the fractions, and lines of the numbers on boundaries."""
+    """Return the table of fractions, with lines on the boundaries."""
     rows = basin_rows(ds)
     return Table(rows, basin_lines(ds, rows))
 
 
 def basin_rows(ds: xr.Dataset) -> list[Row]:
-    """Return a row per outcome and parameter point: cells and fraction with its intervals."""
+    """Return a row per outcome and parameter point: number of cells, and fraction with its intervals."""
     dims, _ = split_dims(ds["attractor_id"])
     names = ("fraction", "low", "high", "fraction_if_none", "fraction_if_all", "low_if_none", "high_if_all")
     rows = []
@@ -46,7 +46,7 @@ def basin_rows(ds: xr.Dataset) -> list[Row]:
 
 
 def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """Return fractions and numbers on boundaries: a table per point if there are few, or ranges."""
+    """Return lines on fractions and boundaries: a table per point if there are few, otherwise ranges."""
     dims, _ = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
     seen = [row for row in rows if row["n_cells"]]
@@ -90,7 +90,7 @@ def _basin_words(row: Row) -> dict[str, str]:
 
 
 def _inferred(rows: Sequence[Row]) -> dict[str, str]:
-    """How many cells were not integrated, if any."""
+    """Return the column with the number of inferred cells, if there are any."""
     n = sum(row["n_inferred"] for row in rows)
     return {"inferred cells": str(n)} if n else {}
 

@@ -1,4 +1,4 @@
-"""The Wada test: do all basins share one boundary?"""
+"""Test whether all basins share one boundary (Wada property)."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def wada_merge_test(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Wada test by merging: do all basins share one boundary?
+    """Test by merging whether all basins share one boundary.
 
-    All basins but one are merged, for each basin in turn. If the basins have the Wada property the
-    boundary stays the same whichever is left out; on a grid, each boundary then lies within every other
-    one fattened by a radius of some cells (Daza, Wagemakers and Sanjuán, Sci. Rep. 8, 9954, 2018). The
-    smallest such radius is the largest Hausdorff distance between two boundaries.
+    For each basin in turn, all others are merged. If the basins have the Wada property, the boundary is the
+    same for every basin. On a grid, each boundary then lies within every other boundary fattened by a radius
+    of some cells (Daza, Wagemakers and Sanjuán, Sci. Rep. 8, 9954, 2018). The smallest radius that passes is
+    the largest Hausdorff distance between two boundaries.
 
     Parameters
     ----------
@@ -55,8 +55,8 @@ def wada_merge_test(
         Distance between cells: ``"taxicab"`` counts steps along the axes, ``"chessboard"`` also
         diagonal ones.
     unfinished
-        Codes of cells whose outcome is not known: no boundary passes between such a cell and another.
-        Where they lie on the boundary they may hide that it is common.
+        Codes of cells whose outcome is not known. No boundary passes between an unfinished cell and another
+        cell, so unfinished cells on the boundary may hide that it is common.
     resamples, confidence, seed
         Bootstrap samples of tiles of the grid, level of the percentile interval, seed.
 
@@ -64,19 +64,19 @@ def wada_merge_test(
     -------
     Dataset
         On `label` and `other`: `distance`, the largest distance of a boundary cell of `label` from the
-        boundary of `other` [cells], infinite if one of them has none. On `radius`: `beyond`, the largest
-        number over all pairs of boundary cells farther than `radius` from the other boundary, as a
-        part of all cells, with `beyond_stderr`, `beyond_low`, `beyond_high`; `beyond_of_boundary`, the
-        largest as a part of the cells of that boundary; `wada`: none is farther. Scalar:
-        `hausdorff_distance`, the largest of `distance`, the smallest radius that passes;
-        `fraction_unfinished`. On `label`: `n_boundary`.
+        boundary of `other` [cells], infinite if one of them has none. On `radius`: `beyond`, the number of
+        boundary cells farther than `radius` from the other boundary, as a fraction of all cells, largest
+        over all pairs, with `beyond_stderr`, `beyond_low`, `beyond_high`; `beyond_of_boundary`, the same as
+        a fraction of the boundary's cells; `wada`, whether no cell is farther. Scalar:
+        `hausdorff_distance`, the largest `distance` and smallest radius that passes;
+        `fraction_unfinished`. On `label`: `n_boundary`, the number of boundary cells.
 
     Notes
     -----
-    A test at finite resolution: any basins pass with a radius as large as the grid, and basins that are
-    Wada fail with a small one where the grid does not show the thinnest strips. The radius should be
-    small against the basins; that is not validated. Where no cell is beyond, the errors are 0: no part
-    of this grid shows any, which does not say that a larger one would not.
+    The resolution is finite: any basins pass with a radius as large as the grid, and Wada basins fail with
+    a small radius if the grid does not resolve the thinnest strips. The radius should be small against the
+    basins; this is not validated. If no cell is beyond the radius the errors are 0, although a larger grid
+    might show one.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def wada_merge_test(
 
 
 def _boundary_cells(codes: Codes, code: int) -> Ints:
-    """Flat indices of the cells on the boundary between one basin and all others merged."""
+    """Return the flat indices of the cells on the boundary between one basin and all others merged."""
     inside, known = codes == code, codes >= 0
     edge: Bools = np.zeros(codes.shape, dtype=np.bool_)
     for axis in range(codes.ndim):
@@ -149,9 +149,9 @@ def _boundary_cells(codes: Codes, code: int) -> Ints:
 def _distances(
     shape: tuple[int, ...], boundaries: list[Ints], radii: Ints, metric: Metric
 ) -> tuple[Floats, Floats]:
-    """Largest distance of each boundary from each other one, and cells beyond each radius per tile.
+    """Compute each boundary's largest distance from every other, and count cells beyond each radius per tile.
 
-    One distance transform per label, and a look at the boundary cells for each pair.
+    There is one distance transform per label, which is read at the boundary cells of each pair.
     """
     n_tiles = tiles_per_side(shape) ** len(shape)
     tile = tile_numbers(shape, shape).ravel()
@@ -170,7 +170,7 @@ def _distances(
 
 
 def _distance_field(shape: tuple[int, ...], target: Ints, metric: Metric) -> npt.NDArray[np.int32]:
-    """Distance of every cell from the nearest of the target cells, flat."""
+    """Compute the distance of every cell from the nearest target cell, flattened."""
     outside: Bools = np.ones(int(np.prod(shape)), dtype=np.bool_)
     outside[target] = False
     field = ndimage.distance_transform_cdt(outside.reshape(shape), metric=metric)

@@ -1,4 +1,4 @@
-"""Periodic orbits as branches along a parameter, and their bifurcations.
+"""Follow branches of periodic orbits along a parameter, and locate their bifurcations.
 
     starts, left_out = attracting(attractors, parameters, "frequency", (2.0, 3.0))
     branches = explore(starts, Scope(2.0, 3.0))
@@ -12,8 +12,8 @@ evaluates many of them in one call of the engine, `arclength` traces, `bifurcati
 parameters. `connecting` says which orbits found along an axis lie on one branch. Any
 `magpend_core.engine.system.System` will do; names, units and the class of a motion are the model's.
 
-What is located
----------------
+Located bifurcations
+--------------------
 ==================== ======================================== =============================================
 kind                 test function                            at the point
 ==================== ======================================== =============================================
@@ -23,11 +23,11 @@ kind                 test function                            at the point
 ``branch_point``     det of the derivative and the tangent    another branch of the same period crosses
 ==================== ======================================== =============================================
 
-M is the monodromy matrix. A step that changes the number of unstable multipliers in a way that the sign
-changes do not explain is halved. A real pair of product 1 (a neutral saddle) is no bifurcation and dropped.
-Each point is bracketed to 1e-8 of arclength. Criticality of a doubling is read off the branch of twice the
-period: *supercritical* if it lies where the single orbit has more unstable multipliers. That of a torus is
-not determined. Two changes of the same test function within one step are not seen.
+M is the monodromy matrix. A step is halved if the sign changes do not explain its change of the number of
+unstable multipliers. A real pair with product 1 (a neutral saddle) is no bifurcation and is dropped. Each
+point is bracketed to 1e-8 of arclength. A doubling is *supercritical* if the branch of twice the period lies
+where the single orbit has more unstable multipliers. The criticality of a torus bifurcation is not
+determined. Two sign changes of the same test function within one step are missed.
 
 Friction's corner
 -----------------

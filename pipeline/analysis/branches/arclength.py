@@ -1,7 +1,7 @@
-"""Pseudo-arclength continuation of the solutions of a problem (Keller 1977).
+"""Trace the solutions of a problem by pseudo-arclength continuation (Keller 1977).
 
-The predictor is the cubic through the last two points, a step along the tangent; the corrector is Newton's
-method in the plane normal to the tangent, so that folds in the parameter are nothing special.
+The predictor extends the cubic through the last two points by a step along the tangent. The corrector is
+Newton's method in the plane normal to the tangent, so that it also passes folds in the parameter.
 Unknowns are scaled; lengths are Euclidean in them.
 """
 
@@ -18,12 +18,12 @@ from pipeline.analysis.branches.problems import Problem, Value
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """How to trace.
+    """The settings of a trace.
 
     Attributes
     ----------
     first_step, longest_step, shortest_step : float
-        Arclengths; below the shortest a trace ends.
+        Arclengths; a trace ends if it needs a step below the shortest.
     max_points : int
         Points of one trace.
     tolerance : float
@@ -45,7 +45,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A solution: unknowns, unit tangent, the problem's value there, Newton steps taken."""
+    """A solution: unknowns, unit tangent, the problem's value, number of Newton steps."""
 
     u: np.ndarray
     tangent: np.ndarray
@@ -60,7 +60,7 @@ class Point:
 
 @dataclass(eq=False)
 class Trace:
-    """Points in their order, and why there are no more."""
+    """The points of a trace in order, and the reason for its end."""
 
     points: list[Point] = field(default_factory=list)
     end: str = ""
@@ -103,7 +103,7 @@ def correct(
 
 
 def tangent_of(value: Value, along: np.ndarray) -> np.ndarray | None:
-    """Unit vector of the kernel of the derivative with a positive product with `along`."""
+    """Return the unit tangent of the solutions that points along `along`; None if it is not unique."""
     matrix = np.vstack([value.derivative, along])
     right = np.zeros(len(matrix))
     right[-1] = 1.0
@@ -116,15 +116,15 @@ def tangent_of(value: Value, along: np.ndarray) -> np.ndarray | None:
 
 
 def kernel_of(value: Value) -> np.ndarray:
-    """Unit vector of the kernel of the derivative, of either sign."""
+    """Return a unit vector of the derivative's kernel, with either sign."""
     return np.asarray(np.linalg.svd(value.derivative)[2][-1])
 
 
 Between = Callable[[Point, Point], "Steps[bool]"]
-"""What is done between two neighbouring points; False asks for a shorter step."""
+"""A check between two neighbouring points; it returns False to ask for a shorter step."""
 
 Stop = Callable[[list[Point]], str]
-"""Looks at the points so far; a word ends the trace."""
+"""A check of the points so far; it returns the reason to end the trace, or an empty text."""
 
 
 def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, between: Between) -> Steps[Trace]:
@@ -162,7 +162,7 @@ def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, betwee
 
 
 def cubic(a: Point, b: Point, share: float) -> np.ndarray:
-    """The cubic through two points with their tangents, at a share of the chord; beyond 1 it goes on."""
+    """Evaluate the cubic through two points and their tangents at a share of the chord (above 1: beyond)."""
     length = float(np.linalg.norm(b.u - a.u))
     s, rest = share, 1.0 - share
     middle = rest**2 * (1.0 + 2.0 * s) * a.u + s**2 * (3.0 - 2.0 * s) * b.u
@@ -183,7 +183,7 @@ def _ahead(points: list[Point], step: float) -> np.ndarray:
 
 
 def _is_near(here: Point, there: Point, step: float, settings: Settings) -> bool:
-    """Whether the step stayed on the curve: little turned, and little corrected."""
+    """Return whether a step stayed on the curve: the tangent turned little, and the correction was small."""
     cosine = float(here.tangent @ there.tangent)
     moved = np.linalg.norm(there.u - here.u - step * here.tangent)
     return cosine >= np.cos(settings.largest_turn) and bool(moved <= 0.5 * step)

@@ -1,4 +1,4 @@
-"""Bifurcations on a branch of orbits: noticed by test functions, located by inverse interpolation."""
+"""Detect bifurcations on a branch by test functions, and locate them by inverse interpolation."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", 
 KINDS = (FOLD, DOUBLING, TORUS, BRANCHING)
 
 WIDTH = 1e-8
-"""Arclength to which a bifurcation is bracketed; the parameter changes by less, in its scale."""
+"""Width to which a bifurcation is bracketed [arclength]; in its scale, the parameter changes by less."""
 
 Test = Callable[[Point], float]
 
 
 def multipliers_of(point: Point) -> np.ndarray:
-    """Floquet multipliers by falling modulus."""
+    """Return the Floquet multipliers by falling modulus, shape (state,)."""
     found = np.linalg.eigvals(point.value.monodromy)
     return found[np.argsort(-np.abs(found), kind="stable")]
 
 
 def n_unstable(point: Point) -> int:
-    """Number of multipliers outside the unit circle."""
+    """Count the multipliers outside the unit circle."""
     return int((np.abs(np.linalg.eigvals(point.value.monodromy)) > 1.0).sum())
 
 
@@ -100,7 +100,7 @@ _CHANGES = {FOLD: 1, DOUBLING: 1, TORUS: 2, BRANCHING: 1}
 
 @dataclass(eq=False)
 class Watch:
-    """Looks for bifurcations between neighbouring points of a trace and keeps those that it locates."""
+    """A detector of bifurcations between neighbouring points of a trace, with those located so far."""
 
     problem: OrbitProblem
     settings: Settings
@@ -109,7 +109,7 @@ class Watch:
     n_steps: int = 0
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Locate what lies between two points; False if the change of stability is not explained by it."""
+        """Locate the bifurcations between two points; return False if they do not explain the stability."""
         if self.skip_first and self.n_steps == 0:
             self.n_steps += 1
             return True
@@ -131,11 +131,11 @@ class Watch:
 
 
 def _explains(kinds: list[str], change: int) -> bool:
-    """Whether some of these bifurcations can change the number of unstable multipliers so."""
+    """Return whether these bifurcations can change the number of unstable multipliers by `change`."""
     reachable = {0}
     for kind in kinds:
         step = _CHANGES[kind]
-        # a fold or a torus test may also be a neutral saddle or a fold without a change of this count
+        # a sign change may leave the count: at a neutral saddle, or at a fold
         reachable = {r + s for r in reachable for s in (-step, 0, step)}
     return change in reachable
 
@@ -156,7 +156,7 @@ def locate(
         root = _root(known[-3:]) if trial % 6 < 5 else 0.5 * (low[0] + high[0])
         if not low[0] < root < high[0]:
             root = 0.5 * (low[0] + high[0])
-        # once it stands still, an end of the bracket is put on each side of it
+        # once the root stands still, put an end of the bracket on each side of it
         away = 0.4 * least if abs(root - last) < 0.3 * least else 0.0
         last, at = root, root - away if root - low[0] > least else root + away
         at = min(max(at, low[0] + 0.4 * least), high[0] - 0.4 * least)
@@ -177,7 +177,7 @@ def locate(
 
 
 def _root(known: list[tuple[float, float]]) -> float:
-    """Where a function vanishes, by inverse interpolation of (argument, value); NaN for equal values."""
+    """Estimate a root by inverse interpolation of (argument, value) pairs; NaN for equal values."""
     total = 0.0
     for i, (at, value) in enumerate(known):
         others = [v for j, (_, v) in enumerate(known) if j != i]
@@ -188,14 +188,14 @@ def _root(known: list[tuple[float, float]]) -> float:
 
 
 def _between(a: Point, b: Point, share: float) -> np.ndarray:
-    """Guess of the orbit at a share of the chord, in the plane normal to it."""
+    """Guess the orbit at a share of the chord, in the plane normal to the chord."""
     chord = b.u - a.u
     bent = cubic(a, b, share)
     return np.asarray(bent + (share - (bent - a.u) @ chord / (chord @ chord)) * chord)
 
 
 def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
-    """Drop neutral saddles and the folds that are branch points; order along the branch."""
+    """Drop neutral saddles and folds that are branch points, and sort along the branch."""
     branching = [one.point.u for one in located if one.kind == BRANCHING]
     kept = []
     for one in located:
@@ -208,7 +208,7 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
 
 
 def _is_torus(one: Bifurcation) -> bool:
-    """Whether the pair with product 1 is complex; a real pair is a neutral saddle, no bifurcation."""
+    """Return whether the pair with product 1 is complex; a real pair is only a neutral saddle."""
     multipliers = multipliers_of(one.point)
     complex_pairs = multipliers[multipliers.imag > 0.0]
     return bool(len(complex_pairs)) and bool(np.abs(np.abs(complex_pairs) - 1.0).min() < 1e-4)

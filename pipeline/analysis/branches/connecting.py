@@ -1,17 +1,18 @@
-"""Which of the orbits found along a parameter lie on one branch.
+"""Link the orbits found along a parameter that lie on one branch.
 
 Orbits are given at several values of one parameter. Each is followed from value to value, stable or not,
 until it meets another one, at which moment the two are linked:
 
-* Neighbours are held against each other first. If the step along the tangent from either leads to the other,
-  within a tenth of its length, no more is asked: a step of the continuation would be accepted there.
-* From an orbit without such a neighbour pseudo-arclength continuation goes on, through unstable parts, as
-  far as there are orbits that it could meet. It ends at a fold, where the branch turns back in the parameter:
-  so over each value of the parameter there is at most one orbit of what is linked.
-* An orbit of even period that arrives on that of half its period, at a period doubling, goes on as that one.
+* Neighbours are compared first. They are linked if a step along the tangent from each leads to the other,
+  within a tenth of the step's length: the continuation would accept this step.
+* An orbit without a linked neighbour is followed by pseudo-arclength continuation, also through unstable
+  parts, as long as it can meet other orbits. It ends at a fold, where the branch turns back in the parameter.
+  So a group of linked orbits has at most one orbit at each parameter value.
+* An orbit of even period that reaches the orbit of half its period, at a period doubling, continues as that
+  orbit.
 
-What ended without an answer (Newton's method failed, too many points) is told apart from what ended at a fold
-or passed all the orbits that it could have met: those are on different branches.
+The outcome is open if Newton's method failed or there were too many points. Orbits are apart if following
+ended at a fold, or passed all the orbits that it could have met.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import Family, OrbitProblem
 
 CONNECT = Settings(first_step=2e-3, longest_step=0.05, shortest_step=1e-6, max_points=300)
-"""Longer steps than those of a branch, since nothing is looked for between."""
+"""Settings with longer steps than for a branch, since no bifurcations are located."""
 
 NEAR = 0.1
 """Largest distance of a neighbour from the step along the tangent, as a share of the step's length."""
 
 LONGEST = 0.1
-"""Longest step along a tangent that is held against a neighbour."""
+"""Longest step along a tangent that is compared with a neighbour."""
 
 SAME = 1e-6
 """Scaled distance within which two orbits at one parameter value are the same."""
@@ -79,7 +80,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Link:
-    """Two orbits of one branch, by their numbers, and how many period doublings lie between them."""
+    """Two orbits of one branch, by number, and the number of period doublings between them."""
 
     first: int
     second: int
@@ -88,14 +89,14 @@ class Link:
 
 @dataclass(eq=False)
 class Links:
-    """What was found along some lines.
+    """The links along one line of orbits, and the outcome of following each orbit.
 
     Attributes
     ----------
     links : list of Link
     up, down : dict
-        By number: ``linked``, ``apart`` (followed to a fold, or past all that could be met) or ``open``
-        (followed in vain); no entry if there was nothing to be met.
+        Outcome by number: ``linked``, ``apart`` (followed to a fold, or past all orbits that it could meet)
+        or ``open`` (no answer); no entry if there was no orbit to meet.
     """
 
     links: list[Link] = field(default_factory=list)
@@ -151,7 +152,7 @@ def _tangent(one: Found, settings: Settings) -> Steps[Point | None]:
 
 
 def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
-    """Links between orbits at neighbouring values that a step along the tangent shows."""
+    """Link orbits at neighbouring values that a step along the tangent connects."""
     result = Links()
     by_place: dict[tuple[int, int], list[Found]] = {}
     for one in line:
@@ -166,13 +167,13 @@ def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
 
 
 def _is_one_step(a: Found, b: Found, start: dict[int, Point | None]) -> bool:
-    """Whether the tangent at either orbit leads to the other, to the same phase."""
+    """Return whether the tangent at each orbit leads to the other orbit, at a consistent phase."""
     phases = [_leads_to(start[a.number], b), _leads_to(start[b.number], a)]
     return all(p is not None for p in phases) and sum(p for p in phases if p is not None) % a.period == 0
 
 
 def _leads_to(point: Point | None, other: Found) -> int | None:
-    """Index of the other orbit's section point that the tangent leads to, None if it leads elsewhere."""
+    """Return the index of the section point that the tangent leads to on another orbit; None if elsewhere."""
     if point is None or point.tangent[-1] == 0.0:
         return None
     change = other.value / other.family.scales[0] - point.u[-1]
@@ -186,7 +187,7 @@ def _leads_to(point: Point | None, other: Found) -> int | None:
 
 
 def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[Found]:
-    """Orbits that one without a neighbour could meet: upwards of its period, both ways of halves of it."""
+    """Return the orbits that one can meet: upwards of its own period, both ways of half, quarter, ..."""
     if one.number in (known.up if way > 0 else known.down):
         return []
     halves = {one.period // 2**k for k in range(1, one.period.bit_length()) if one.period % 2**k == 0}
@@ -201,7 +202,7 @@ def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[
 
 @dataclass(eq=False)
 class _Meeting:
-    """Looks along a trace for the orbits that it can meet."""
+    """A detector of the orbits that a trace meets."""
 
     family: Family
     targets: Sequence[Found]
@@ -210,7 +211,7 @@ class _Meeting:
     met: Found | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Correct the orbit at each value that was passed and hold it against the orbits there."""
+        """Correct the orbit at each parameter value that was passed, and compare it with the orbits there."""
         chord = b.u - a.u
         for target in self.targets:
             value = target.value / self.family.scales[0]
@@ -229,7 +230,7 @@ class _Meeting:
         return True
 
     def stop(self, points: list[Point]) -> str:
-        """Say why the trace is over, if it is."""
+        """Return the reason to end the trace; empty if it continues."""
         here = points[-1]
         if self.met is not None:
             return LINKED
@@ -244,7 +245,7 @@ class _Meeting:
 def _follow(
     one: Found, point: Point, targets: Sequence[Found], way: int, settings: Settings
 ) -> Steps[tuple[str, Link | None]]:
-    """Follow an orbit one way until it meets one of the targets; halves its period where it must."""
+    """Follow an orbit one way until it meets a target; halve its period at period doublings."""
     family, here = one.family, point
     for n_doublings in range(one.period.bit_length()):
         meeting = _Meeting(family, targets, way, settings)
@@ -268,21 +269,21 @@ def _follow(
 
 
 def grouped(places: Sequence[Hashable], links: Iterable[Link]) -> tuple[np.ndarray, list[Link]]:
-    """Put what is linked into groups, links without doublings first; no two orbits of one place together.
+    """Group linked orbits, links without doublings first; a group never has two orbits of one place.
 
     Parameters
     ----------
     places
-        Where each orbit was found.
+        Place of each orbit.
     links
-        Between orbits by number, which is their index in `places`.
+        Links between orbits, numbered by their index in `places`.
 
     Returns
     -------
     group : ndarray
         Least number of each orbit's group.
     used : list of Link
-        Those between orbits of one group.
+        Links between orbits of one group.
     """
     members = {i: [i] for i in range(len(places))}
     taken = {i: {place} for i, place in enumerate(places)}

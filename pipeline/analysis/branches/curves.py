@@ -1,4 +1,4 @@
-"""Curves of bifurcations in the plane of two parameters, continued from points located on branches."""
+"""Continue bifurcations that were located on branches, as curves in the plane of two parameters."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from pipeline.analysis.branches.units import parameter_units, state_units
 from pipeline.layout.vocabulary import frequency_of
 
 CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-8, max_iterations=8)
-"""Steps are longer than on a branch, since nothing is looked for between; the residual, with that of the
-test function in it, is what differences of monodromy matrices allow for."""
+"""Settings with longer steps than on a branch, since nothing is located in between. The residual includes the
+test function, and is limited by finite differences of monodromy matrices."""
 
 CURVE_ENDS = ("bound", "closed", "resonance", "max_points", "stuck")
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One curve of bifurcations: its points, why it ends on both sides, the located point it began with."""
+    """A curve of bifurcations: its points, the reasons for both ends, the located point it started from."""
 
     family: Family
     kind: str
@@ -55,9 +55,9 @@ def curves_from(
     Parameters
     ----------
     branches
-        From `dataset_of`.
+        Result of `dataset_of`.
     parameters
-        What was integrated; the value of `second` is where the branches lie.
+        Parameters of the run; the value of `second` is that of the branches.
     second
         Name of the second parameter.
     bounds
@@ -65,12 +65,12 @@ def curves_from(
     max_period
         Longest period of the orbits taken.
     settings
-        How to trace; arclengths are in units of the intervals.
+        Settings of the traces; arclengths are in units of the intervals.
 
     Returns
     -------
     list of Curve
-        By the located point they began with; none twice.
+        Curves in the order of the located points they start from, none twice.
     """
     return continue_curves(_starts(branches, parameters, second, bounds, max_period), bounds, settings)
 
@@ -84,7 +84,7 @@ def continue_curves(
     bounds: tuple[tuple[float, float], tuple[float, float]],
     settings: Settings = CURVE,
 ) -> list[Curve]:
-    """Follow each start both ways until a bound, itself, or a resonance; see `curves_from`."""
+    """Follow each start both ways until a bound, its own start, or a resonance; see `curves_from`."""
     problems = [BifurcationProblem(family, kind) for _, family, kind, _ in starts]
     firsts = run_together(
         [_first(problem, u, settings) for problem, (_, _, _, u) in zip(problems, starts, strict=True)]
@@ -110,7 +110,7 @@ def _starts(
     bounds: tuple[tuple[float, float], tuple[float, float]],
     max_period: int,
 ) -> list[CurveStart]:
-    """Located points with their two-parameter families and unknowns."""
+    """Return the located points with their two-parameter families and unknowns."""
     first = str(ds.attrs["parameter"])
     scales = tuple(high - low for low, high in bounds)
     found = []
@@ -151,7 +151,7 @@ def _follow(
     bounds: tuple[tuple[float, float], tuple[float, float]],
     settings: Settings,
 ) -> Steps[Trace]:
-    """One way along a curve; the point beyond a bound is dropped."""
+    """Follow a curve one way, and drop the point beyond a bound."""
 
     def stop(points: list[Point]) -> str:
         here = points[-1]
@@ -183,7 +183,7 @@ def _has_torus(point: Point) -> bool:
 
 
 def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
-    """Whether a curve goes through a start, to within what a chord allows for."""
+    """Return whether a curve passes through a start, within the accuracy of its chords."""
     if curve.kind != kind or curve.family.period != family.period:
         return False
     u = np.array([p.u for p in curve.points])

@@ -1,4 +1,4 @@
-"""Branches as a labelled dataset."""
+"""Convert branches into a labelled dataset."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def dataset_of(
     Parameters
     ----------
     branches
-        From `exploring.explore`; if there are none, so are the dataset's.
+        Result of `exploring.explore`; may be empty.
     parameter
-        Name of the free parameter, ``frequency`` for the drive's.
+        Name of the free parameter, ``frequency`` for the drive frequency.
     parameters
-        What was integrated: its model tells names, units, and the class of each orbit's motion.
+        Parameters of the run; their model gives names, units, and the class of each orbit's motion.
     left_out
-        Lines on what was not followed, and why.
+        Lines on attractors that were not followed, with reasons.
     """
     model = None if parameters is None else parameters.model
     system = branches[0].family.system if branches else (None if model is None else model.system)
@@ -77,7 +77,7 @@ def dataset_of(
 
 
 def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | None) -> dict[str, Any]:
-    """Parameters in which branches differ from the run's own values, beside the one that is followed."""
+    """Return the variables of other parameters in which branches differ from the run's own values."""
     if parameters is None or not branches:
         return {}
     values = np.array([b.family.parameters for b in branches])
@@ -103,14 +103,14 @@ def _side_variables(
 
 
 def _settle_origin(counts: np.ndarray, branch: Branch) -> None:
-    """Count at the point where a branch sprang off, with a multiplier on the circle, as at the next one."""
+    """Copy the count of unstable multipliers to a branch's bifurcation from the next point, in place."""
     for j, point in enumerate(branch.points):
         if branch.origin is not None and point.u is branch.origin.point.u:
             counts[j] = counts[j + 1] if j + 1 < len(branch.points) else counts[j - 1]
 
 
 class _Arrays:
-    """Variables per point of a branch."""
+    """The arrays of the variables per point of a branch."""
 
     def __init__(self, shape: tuple[int, int], longest: int, n_states: int) -> None:
         self.parameter = np.full(shape, np.nan)
@@ -131,7 +131,7 @@ class _Arrays:
         self.period_s[i, j] = point.value.seconds
 
     def variables(self, units: str, state_units: str) -> dict[str, Any]:
-        """As xarray takes them; `units` are those of the parameter."""
+        """Return the arrays as (dims, values, attributes) for xarray; `units` are those of the parameter."""
         dims = ("branch", "point")
         return {
             "parameter": (dims, self.parameter, {"units": units, "long_name": "value of the parameter"}),
@@ -165,7 +165,7 @@ class _Arrays:
 
 
 def _orbit(branch: Branch, point: Any) -> np.ndarray:
-    """Section points of an orbit, the point itself first."""
+    """Return the section points of an orbit (period, state), the point itself first."""
     images = np.asarray(point.value.images)
     return np.concatenate([branch.family.state(point.u)[None], images[: branch.family.period - 1]])
 

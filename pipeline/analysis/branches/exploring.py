@@ -1,4 +1,4 @@
-"""All branches that hang together with some orbits: followed, switched at period doublings, none twice."""
+"""Follow all branches that are connected with some orbits, each once."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ SAME = 1e-6
 """Scaled distance within which two orbits at one parameter value are the same."""
 
 FOLLOWING = "following branches"
-"""Begins the names of the work in reports."""
+"""First words of the work's name in progress reports."""
 
 GUESS = 0.05
-"""Scaled distance from the chord of a branch within which an orbit may lie on it."""
+"""Largest scaled distance from a branch's chord at which an orbit is tested for lying on the branch."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """An orbit to begin with: its family, a section point, the parameter's value."""
+    """A starting orbit: its family, a section point, the parameter's value."""
 
     family: Family
     state: np.ndarray
@@ -43,7 +43,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """What is looked at.
+    """The limits of an exploration.
 
     Attributes
     ----------
@@ -52,8 +52,9 @@ class Scope:
     max_period : int
         Longest period of a branch [drive periods].
     max_generations : int
-        How often branches spring from branches.
+        Most generations of branches that bifurcate from branches.
     settings : Settings
+        Settings of the traces.
     """
 
     low: float
@@ -64,12 +65,12 @@ class Scope:
 
 
 def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
-    """Follow the branches of all starts, and those that spring from them.
+    """Follow the branches of all starts, and the branches that bifurcate from them.
 
     Returns
     -------
     list of Branch
-        Those of the starts in their order, then one generation after the other.
+        Branches of the starts in their order, then those of each generation.
     """
     branches: list[Branch] = []
     _follow_starts(starts, branches, scope)
@@ -85,7 +86,7 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
 
 
 def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope) -> None:
-    """Append the branches of those starts that lie on none yet; starts of one parameter value together."""
+    """Append the branches of starts that lie on no branch yet, one parameter value at a time."""
     for value in dict.fromkeys(start.value for start in starts):
         group = [s for s in starts if s.value == value and s.family.period <= scope.max_period]
         known = _lie_on(group, branches)
@@ -117,7 +118,7 @@ def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch 
 
 
 def _lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
-    """Whether each start is an orbit of one of the branches."""
+    """Return whether each start is an orbit of one of the branches."""
     asked = [(i, guess) for i, s in enumerate(starts) for b in branches for guess in _near(s, b)]
     settings = Settings()
     found = run_together([_at_value(starts[i].family, guess, settings) for i, guess in asked])
@@ -136,7 +137,7 @@ def _at_value(family: Family, guess: np.ndarray, settings: Settings) -> Steps[Po
 
 
 def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
-    """Points between those of a branch at the start's parameter value that are near its orbit."""
+    """Yield the interpolated points of a branch at the start's parameter value that are near its orbit."""
     family = branch.family
     if family.period != start.family.period or not _same_others(family, start.family):
         return
@@ -160,7 +161,7 @@ def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
 
 
 def _same_others(a: Family, b: Family) -> bool:
-    """Whether two families differ in the free parameter at most."""
+    """Return whether two families have equal parameters apart from the free one."""
     return a.free == b.free and np.array_equal(_fixed(a), _fixed(b))
 
 
@@ -171,7 +172,7 @@ def _fixed(family: Family) -> np.ndarray:
 
 
 def _distance(start: Start, point: Point) -> float:
-    """Scaled distance of a start from the nearest section point of an orbit."""
+    """Return the scaled distance of a start from the nearest section point of an orbit."""
     here = start.family.unknowns(start.state, [0.0])
     return min(float(np.abs(start.family.mismatch(here, x)).max()) for x in point.value.images)
 
@@ -180,9 +181,9 @@ def _distance(start: Start, point: Point) -> float:
 
 
 def _adopt(branches: Sequence[Branch]) -> list[Start]:
-    """Tie branches that end on orbits of half their period to the period doubling there.
+    """Connect branches that end on orbits of half their period to the period doubling there.
 
-    Returns orbits of half the period, as starts, for ends at which no doubling is known.
+    Return the orbits of half the period as starts, for ends without a known doubling.
     """
     orphans = []
     for branch in branches:
@@ -200,7 +201,7 @@ def _adopt(branches: Sequence[Branch]) -> list[Start]:
 
 
 def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifurcation | None:
-    """The nearest period doubling of half the period, within a few steps of the branch's end."""
+    """Find the nearest period doubling of half the period, within a few steps of the branch's end."""
     end, inner = (branch.points[0], branch.points[1]) if which == 0 else branch.points[:-3:-1]
     reach = 3.0 * max(float(np.linalg.norm(end.u - inner.u)), 1e-3)
     best, nearest = None, reach
@@ -216,18 +217,18 @@ def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifu
 
 
 def _gap(family: Family, end: Point, one: Bifurcation) -> float:
-    """Scaled distance of an orbit from the nearest section point of the one at a bifurcation."""
+    """Return the scaled distance of an orbit from the nearest section point of a bifurcation's orbit."""
     return min(float(np.linalg.norm(family.mismatch(end.u, x))) for x in one.point.value.images)
 
 
 def _half_orbit(branch: Branch, which: int) -> Start:
-    """The middle between the two halves of the orbit at the end of a branch."""
+    """Make a start of half the period from the orbit at the end of a branch."""
     state, value = half_orbit(branch.family, branch.points[-which])
     return Start(replace(branch.family, period=branch.family.period // 2), state, value)
 
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
-    """Compare the side of the parameter on which the child lies with that where the parent is less stable."""
+    """Decide criticality: supercritical if the child lies on the side where the parent is less stable."""
     rising = at.point.tangent[-1] > 0.0
     worse_above = (at.n_unstable_after > at.n_unstable_before) == rising
     inner = child.points[end + 3 if end == 0 else end - 3]
@@ -235,7 +236,7 @@ def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
 
 
 def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
-    """Follow the branches of twice the period, and those through branch points, that are not known yet."""
+    """Follow the unknown branches at period doublings and branch points."""
     open_ends = [
         (branch, one)
         for branch in branches
@@ -295,14 +296,14 @@ def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch],
 
 
 def _direction(branch: Branch, at: Bifurcation) -> np.ndarray:
-    """Where a branch goes as it passes a bifurcation: from the point before it to the one after it."""
+    """Return the direction of a branch at a bifurcation, from the point before it to the point after it."""
     u = np.array([p.u for p in branch.points])
     i = int(np.argmin(np.linalg.norm(u - at.point.u, axis=1)))
     return np.asarray(u[min(i + 1, len(u) - 1)] - u[max(i - 1, 0)])
 
 
 def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> bool:
-    """Whether the other branch is known: a branch with a branch point at the same orbit."""
+    """Return whether the other branch is known: it has a branch point at the same orbit."""
     for branch in branches:
         for other in branch.bifurcations if branch.family.period == parent.family.period else ():
             same = (

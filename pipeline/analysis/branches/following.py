@@ -1,4 +1,4 @@
-"""One branch of periodic orbits: both ways from an orbit, until something ends it."""
+"""Follow one branch of periodic orbits from an orbit, both ways to its ends."""
 
 from __future__ import annotations
 
@@ -17,24 +17,26 @@ from pipeline.analysis.branches.problems import Family, OrbitProblem
 ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium")
 
 REST = 0.01
-"""A cycle has shrunk to an equilibrium where its period, at the speed with which it crosses the section,
-would carry it no farther than this [scales of the state that crosses]."""
+"""A cycle counts as an equilibrium if its crossing speed times its period is below this distance [scales of
+the state that crosses]."""
 
 
 @dataclass(eq=False)
 class Branch:
-    """Orbits of one period along one parameter.
+    """A branch: the orbits of one period along one parameter.
 
     Attributes
     ----------
     family : Family
+        Period, system and parameters of the orbits.
     points : list of Point
+        Orbits in order.
     bifurcations : list of Bifurcation
-        In the order of the points.
+        Located bifurcations in the order of the points.
     ends : tuple of str
-        Why it ends at its first and last point, of `ENDS`; ``start``: at the bifurcation it sprang from.
+        Reasons for the first and the last end, of `ENDS`; ``start`` stands for the bifurcation at its origin.
     origin : Bifurcation or None
-        Where it sprang from.
+        Bifurcation from which it branches.
     """
 
     family: Family
@@ -51,7 +53,7 @@ class Branch:
 
 @dataclass(eq=False)
 class Half:
-    """One way from a start."""
+    """One direction of a branch from its start: the trace and its bifurcations."""
 
     trace: Trace
     bifurcations: list[Bifurcation] = field(default_factory=list)
@@ -59,7 +61,7 @@ class Half:
 
 @dataclass(frozen=True, eq=False)
 class _Stop:
-    """Says when a trace is over."""
+    """The rule that ends a trace."""
 
     family: Family
     low: float
@@ -97,7 +99,7 @@ class _Stop:
 
 
 def reach(family: Family, point: Point) -> float:
-    """Scaled distance that the crossing state would go in a period at its speed; infinite with a drive."""
+    """Compute the scaled crossing speed times the period; infinite for a driven system."""
     crossed = crossed_state(family.system)
     if crossed is None:
         return np.inf
@@ -107,7 +109,7 @@ def reach(family: Family, point: Point) -> float:
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:
-    """Whether the two halves of the orbit changed places: it passed the orbit of half the period."""
+    """Return whether the trace passed an orbit of half the period: the orbit's halves changed places."""
     if family.period % 2 or len(points) < 2:
         return False
     before, here = (_half_way(family, p) for p in points[-2:])
@@ -119,7 +121,7 @@ def _half_way(family: Family, point: Point) -> np.ndarray:
 
 
 def half_orbit(family: Family, point: Point) -> tuple[np.ndarray, float]:
-    """The middle between the two halves of an orbit: a state near the orbit of half the period; the value."""
+    """Return the mean of an orbit's halves, near the orbit of half the period, and the parameter value."""
     u = point.u.copy()
     u[:-1] += 0.5 * _half_way(family, point)
     return family.state(u), float(family.values(u)[0])
@@ -152,17 +154,17 @@ def half_branch(
         # the map is not smooth where the orbit shrinks to a point of the section
         watch.found = [b for b in watch.found if b.after < n_last]
     elif found.end == "period_halving":
-        # the half-period orbit is a singular point of these equations: what was located there is it
+        # the half-period orbit is a singular point of these equations: drop what was located there
         found.points.pop()
         watch.found = [b for b in watch.found if b.after < n_last]
     elif found.end == "closed":
-        # the last step goes over the first one again
+        # the last step repeats the first one
         watch.found = [b for b in watch.found if b.after < n_last or not _is_known(b, watch.found)]
     return Half(found, watch.found)
 
 
 def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
-    """Whether the same bifurcation was located on an earlier step."""
+    """Return whether the same bifurcation was located on an earlier step."""
     return any(
         b.kind == one.kind and b.after < one.after and abs(b.point.u[-1] - one.point.u[-1]) < 1e-6
         for b in found
@@ -187,7 +189,7 @@ def _cut(problem: OrbitProblem, found: Trace, low: float, high: float, settings:
 
 
 def joined(family: Family, backward: Half, forward: Half) -> Branch:
-    """One branch of two halves from the same start: first the backward one, reversed."""
+    """Join two halves from the same start to a branch, the backward half first and reversed."""
     if forward.trace.end == "closed":
         return Branch(family, forward.trace.points, forward.bifurcations, ("closed", "closed"))
     back = [Point(p.u, -p.tangent, p.value, p.n_iterations) for p in reversed(backward.trace.points)]
@@ -210,12 +212,12 @@ def joined(family: Family, backward: Half, forward: Half) -> Branch:
 
 
 def opposite(point: Point) -> Point:
-    """The same point, looked at the other way."""
+    """Return the same point with the opposite tangent."""
     return Point(point.u, -point.tangent, point.value, point.n_iterations)
 
 
 def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
-    """The orbit at a period doubling, taken twice, with the tangent of the branch of twice the period."""
+    """Return a period doubling's orbit, taken twice, with the tangent of the doubled branch."""
     double = Family(
         family.system, 2 * family.period, family.frequency_hz, family.parameters, family.free, family.scales
     )
@@ -234,10 +236,10 @@ def crossing_half(
 ) -> Steps[Half]:
     """Follow the other branch through a branch point, one way.
 
-    Its tangent lies in the kernel of the derivative, of two dimensions there; the known branch does not
-    meet the plane at a small distance from it, so that Newton's method in that plane finds the other.
-    `own` is the direction of the known branch, by its neighbouring points: at the branch point itself the
-    tangent is any vector of the kernel, by rounding errors alone.
+    At a branch point the derivative's kernel has two dimensions, and the other branch's tangent lies in it.
+    The known branch does not meet a plane at a small distance along the kernel's normal to it, so Newton's
+    method in this plane finds the other branch. `own` is the direction of the known branch from its
+    neighbouring points, since rounding errors determine the tangent at the branch point itself.
     """
     kernel = np.linalg.svd(at.point.value.derivative)[2][-2:]
     own = kernel @ own

@@ -1,8 +1,8 @@
-"""Many computations in step, whose trajectories share the engine's lanes.
+"""Run many computations in step, so that their trajectories share the engine's lanes.
 
-A computation is a generator: it yields a `Query`, gets the `Value` of its problem there, and returns its
-result. A single orbit would fill one lane of sixteen; all computations that wait are served in one call,
-for little more than the price of one. The numbers of each are those that it would get alone.
+A computation is a generator: it yields a `Query`, receives the `Value` of its problem, and returns its
+result. A single orbit would fill one lane of sixteen. One call serves all waiting computations, at little
+more than the cost of one. Each gets the same numbers as if it ran alone.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Query:
-    """A problem to be evaluated at `u`."""
+    """A request to evaluate a problem at the unknowns `u`."""
 
     problem: Problem
     u: np.ndarray
@@ -37,8 +37,8 @@ Steps = Generator[Query, Value, T]
 def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
     """Run computations to their ends and return their results, in their order.
 
-    With a name for the work it is reported how far it is. A trace's length is not known before its end: it
-    counts by the part of the parameter's interval that it has seen, up to nine tenths.
+    If the work has a name, progress is reported. The length of a trace is unknown before its end, so it
+    counts by the part of the parameter's interval that it has covered, up to nine tenths.
     """
     results: list[T | None] = [None] * len(computations)
     waiting: dict[int, Query] = {}
@@ -68,7 +68,7 @@ def _report(
     seen: dict[int, tuple[float, float]],
     n: int,
 ) -> None:
-    """Say how far computations are; `seen` has the range of the last unknown of those that go on."""
+    """Report progress; `seen` has the range of the last unknown of each computation, updated in place."""
     for i, query in queries.items():
         last = float(query.u[-1])
         low, high = seen.get(i, (last, last))
@@ -78,7 +78,7 @@ def _report(
 
 
 def run_alone(computation: Steps[T]) -> T:
-    """Run one computation."""
+    """Run one computation and return its result."""
     return run_together([computation])[0]
 
 
@@ -93,7 +93,7 @@ def _evaluate(queries: Sequence[Query]) -> list[Value]:
 
 
 def _calls(rows: Sequence[Rows], systems: Sequence[System]) -> list[list[int]]:
-    """Which queries share a call: those of one system and period, all periods if they fit into a group."""
+    """Group queries into calls: by system, and by period if they are too many for one set of lanes."""
     by_system: dict[str, list[int]] = {}
     for i, system in enumerate(systems):
         by_system.setdefault(system.label, []).append(i)

@@ -1,4 +1,4 @@
-"""What the whole of an orbit shows: the class of its motion, and how it turns."""
+"""Classify the motion of whole orbits, and compute their rotation."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ SAMPLES = 64
 
 
 def sides_of(branches: Sequence[Branch], base: Parameters) -> list[np.ndarray]:
-    """Codes of the model's classifier for the orbits of each branch, from the whole orbit.
+    """Classify the orbits of each branch by the model's classifier, from the whole orbit.
 
     Parameters
     ----------
     branches
-        Of a model with a classifier.
+        Branches of a model with a classifier.
     base
-        What was integrated; parameters in which a branch differs are its own.
+        Parameters of the run; each branch replaces those in which it differs.
     """
     classifier = base.model.classifier
     assert classifier is not None
@@ -58,7 +58,7 @@ def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarr
 
 
 _SEEN_WHOLE = np.array(np.inf)
-"""Frequency at which a motion is judged: between samples of the whole orbit nothing stays unseen."""
+"""Frequency given to the classifier: infinite, since samples of the whole orbit leave no gap."""
 
 
 def _values(parameters: Parameters) -> Mapping[str, Any]:
@@ -66,13 +66,13 @@ def _values(parameters: Parameters) -> Mapping[str, Any]:
 
 
 def rotation_of(branch: Branch) -> np.ndarray:
-    """Mean turns per drive period or return of each angle, from the branch's first orbit."""
+    """Compute the mean turns of each angle per drive period or return, from the branch's first orbit."""
     family = branch.family
     if not any(family.system.is_angle):
         return np.zeros(0)
     n = family.system.n_states
     rows = family.rows(branch.points[0].u[None])
-    # the extended system, since that code is compiled already
+    # use the system with tangents, whose code is compiled already
     extended = dataclasses.replace(with_tangents(family.system, n), n_controlled=None)
     result = run_branches(
         rows.parameters[:, None], rows.frequency_hz[:, None],

@@ -1,4 +1,4 @@
-"""What is continued: equations for orbits and for their bifurcations, on scaled unknowns.
+"""Define the equations for orbits and for their bifurcations, in scaled unknowns.
 
 Every problem is ``F(u) = 0`` with one unknown more than equations, so that its solutions are curves. A
 problem says which trajectories it needs at some `u`, and turns their ends into `F` and its derivative;
@@ -37,7 +37,7 @@ STATE_STEP = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Ends of the trajectories that a problem asked for.
+    """The ends of the trajectories that a problem requested.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Ends:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Trajectories wanted: starts (m, n_states), frequencies (m,), packed parameters (m, k)."""
+    """Requested trajectories: starts (m, n_states), frequencies (m,) [Hz], packed parameters (m, k)."""
 
     states: np.ndarray
     frequency_hz: np.ndarray
@@ -66,9 +66,9 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """A problem at some `u`: F (m,), its derivative (m, m + 1), and what the orbit looks like there.
+    """The value of a problem at `u`: F (m,), its derivative (m, m + 1), and the orbit's data.
 
-    `seconds` is the orbit's period.
+    `images` are the orbit's sections, `monodromy` its monodromy matrix, `seconds` its period [s].
     """
 
     residual: np.ndarray
@@ -95,10 +95,10 @@ class Problem(Protocol):
         """What is integrated."""
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Trajectories that are needed at `u`."""
+        """Return the trajectories that the value at `u` needs."""
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """F and its derivative from the trajectories' ends."""
+        """Compute F and its derivative from the trajectories' ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,24 +129,24 @@ class Family:
 
     @property
     def unit(self) -> np.ndarray:
-        """What one unit of each unknown is: the states', then the free parameters'."""
+        """Unit of each unknown: of the states, then of the free parameters."""
         return np.array([*self.system.scales, *self.scales])
 
     def unknowns(self, state: np.ndarray, values: Sequence[float]) -> np.ndarray:
-        """Scaled unknowns of a section point and values of the free parameters."""
+        """Return the scaled unknowns of a section point and of values of the free parameters."""
         return np.asarray(np.concatenate([state, values]) / self.unit)
 
     def state(self, u: np.ndarray) -> np.ndarray:
-        """Section point [rad, rad/s], angles wrapped."""
+        """Return the section point [the states' units], angles wrapped."""
         n = self.system.n_states
         return wrap_angles(np.asarray(u[:n] * np.asarray(self.system.scales)), self.system)
 
     def values(self, u: np.ndarray) -> np.ndarray:
-        """Values of the free parameters."""
+        """Return the values of the free parameters."""
         return np.asarray(u[self.system.n_states :] * np.asarray(self.scales))
 
     def rows(self, many: np.ndarray) -> Rows:
-        """Trajectories of one period from each of many unknowns, shape (m, size)."""
+        """Return the trajectories of one period from many unknowns (m, size)."""
         n = self.system.n_states
         frequency = np.full(len(many), self.frequency_hz)
         packed = np.tile(self.parameters, (len(many), 1))
@@ -159,13 +159,13 @@ class Family:
         return Rows(many[:, :n] * np.asarray(self.system.scales), frequency, packed, self.period)
 
     def mismatch(self, u: np.ndarray, image: np.ndarray) -> np.ndarray:
-        """Scaled difference between the image and the point, angles on their circle."""
+        """Compute the scaled difference between the image and the point, angles on their circle."""
         scales = np.asarray(self.system.scales)
         start = u[: self.system.n_states] * scales
         return np.asarray(wrap_angles(image - start, self.system) / scales)
 
     def scaled(self, monodromy: np.ndarray) -> np.ndarray:
-        """Monodromy matrix in scaled states."""
+        """Return the monodromy matrix in scaled states."""
         scales = np.asarray(self.system.scales)
         return np.asarray(monodromy * scales / scales[:, None])
 
@@ -187,13 +187,13 @@ class OrbitProblem:
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """The orbit, and its two neighbours in the parameter."""
+        """Return the trajectories of the orbit and of its two neighbours in the parameter."""
         step = np.zeros(self.size)
         step[-1] = PARAMETER_STEP
         return self.family.rows(np.stack([u, u + step, u - step]))
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Mismatch after the period and its derivative."""
+        """Compute the mismatch after the period, and its derivative."""
         n = self.size - 1
         last = [self.family.mismatch(u, image) for image in ends.images[:, -1]]
         slope = _wrapped(last[1] - last[2], self.family) / (2.0 * PARAMETER_STEP)
@@ -208,17 +208,17 @@ def _wrapped(difference: np.ndarray, family: Family) -> np.ndarray:
 
 
 def fold_test(monodromy: np.ndarray) -> float:
-    """det(M - 1): zero where a multiplier is +1."""
+    """Compute det(M - 1), which vanishes where a multiplier is +1."""
     return float(np.linalg.det(monodromy - np.eye(len(monodromy))))
 
 
 def doubling_test(monodromy: np.ndarray) -> float:
-    """det(M + 1): changes its sign where a real multiplier passes -1."""
+    """Compute det(M + 1), which changes sign where a real multiplier passes -1."""
     return float(np.linalg.det(monodromy + np.eye(len(monodromy))))
 
 
 def torus_test(monodromy: np.ndarray) -> float:
-    """Product of mu_i mu_j - 1 over all pairs: zero where a pair of multipliers has the product 1.
+    """Compute the product of mu_i mu_j - 1 over pairs, zero where two multipliers have the product 1.
 
     The determinant of the bialternate product of M with itself, minus 1 (Kuznetsov, Elements of Applied
     Bifurcation Theory, 3rd ed., 2004, Sect. 10.2.2).
@@ -259,12 +259,12 @@ class BifurcationProblem:
         return np.array([STATE_STEP] * n + [PARAMETER_STEP] * 2)
 
     def rows(self, u: np.ndarray) -> Rows:
-        """The orbit, and two neighbours in every unknown."""
+        """Return the trajectories of the orbit and of two neighbours in every unknown."""
         shifts = np.diag(self._steps)
         return self.family.rows(np.concatenate([u[None], u + shifts, u - shifts]))
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Mismatch and test function with their derivative."""
+        """Compute the mismatch and the test function, with their derivative."""
         n, size = self.family.system.n_states, self.size
         test = TESTS[self.kind]
         tests = np.array([test(m) if np.isfinite(m).all() else np.nan for m in ends.monodromy])

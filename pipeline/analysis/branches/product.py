@@ -1,4 +1,4 @@
-"""Branches and curves as analyses of a run (`pipeline.products.branches`)."""
+"""Compute branches and curves as analyses of a run (`pipeline.products.branches`)."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from pipeline.store.run import Run
 
 LEAST_PERIOD = 4
-"""Branches of twice the period are followed up to this one, however short the orbits of the run are."""
+"""Least limit for the periods of followed branches, however short the orbits of the run are."""
 
 
 def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
-    """Complete the interval from the run's axis; refuse an empty one."""
+    """Complete the interval from the run's axis; raise SpecError if it is empty."""
     parameter = options.parameter
     _refuse_frequency_of_flow(run, parameter)
     low, high = _interval(run, parameter, options.low, options.high)
@@ -25,7 +25,7 @@ def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
 
 
 def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
-    """Raise if the frequency is to be followed of a model that has no drive."""
+    """Raise SpecError if the parameter is the frequency and the model has no drive."""
     from pipeline.spec.problems import SpecError
 
     if axis_name(parameter) == FREQUENCY_DIM and run.model.crossing is not None:
@@ -35,7 +35,7 @@ def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
 
 
 def branches(run: Any, options: BranchOptions) -> xr.Dataset:
-    """Branches of periodic orbits along a parameter, from the orbits that attract a run's cells."""
+    """Follow branches of periodic orbits along a parameter, from the orbits that attract a run's cells."""
     from pipeline.analysis.branches import Scope, attracting, dataset_of, explore, recurrent
 
     cube, parameter = run.cube(), axis_name(options.parameter)
@@ -61,7 +61,7 @@ def _ends(options: BranchOptions) -> tuple[float, float]:
 
 
 def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
-    """Complete the branches' interval; refuse a plane that is none."""
+    """Complete the branches' interval; raise SpecError unless two different parameters span a plane."""
     from pipeline.spec.problems import SpecError
 
     settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
@@ -77,7 +77,7 @@ def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
 
 
 def curves(run: Any, options: CurveOptions) -> xr.Dataset:
-    """Curves of the bifurcations located by `branches`, in the plane of its parameter and a second one."""
+    """Continue the bifurcations located by `branches` in the plane of its parameter and a second one."""
     from pipeline.analysis.branches import curves_dataset, curves_from
 
     located = run.derive("branches", **options.part(BranchOptions))
@@ -89,7 +89,7 @@ def curves(run: Any, options: CurveOptions) -> xr.Dataset:
 
 
 def _axis(run: Run, parameter: str) -> xr.DataArray | None:
-    """The axis of a parameter that the run sweeps."""
+    """Return the axis of a parameter; None if the run does not sweep it."""
     axis = run.cube().coords.get(axis_name(parameter))
     return axis if axis is not None and axis.ndim > 0 and axis.size > 1 else None
 

@@ -1,4 +1,4 @@
-"""Orbits to begin with: those that attract cells of a cube, and those near recurrences in its chaos."""
+"""Find starting orbits: those that attract cells of a cube, and those near recurrences in its chaos."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, is_start_dim
 
 CLOSE = 0.1
-"""Largest scaled distance of a recurrence that is worth a try."""
+"""Largest scaled distance of a recurrence that is tried."""
 
 TRIES = 16
-"""Recurrences tried per period."""
+"""Most recurrences tried per period."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Listed:
 
 
 def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float) -> Iterator[Listed]:
-    """All attractors of a run, those with a polished closed orbit as starts.
+    """Yield all attractors of a run, those with a polished closed orbit as starts.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def attracting(
     interval: tuple[float, float],
     max_period: int = 0,
 ) -> tuple[list[Start], list[str]]:
-    """Polished closed orbits among the attractors of a run, and what is left out.
+    """Return the polished closed orbits among the attractors of a run, and the attractors left out.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def attracting(
 
 
 def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str:
-    """Why an attractor is no start, empty if it is one."""
+    """Return the reason why an attractor is no start; empty if it is one."""
     if one.is_rest:
         return "an equilibrium, not a periodic orbit"
     if one.is_cycle:
@@ -124,7 +124,7 @@ def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str
 
 
 def _places(where: Sequence[Mapping[str, float]]) -> str:
-    """Where an attractor is, in words: the range of each axis."""
+    """Describe the places of an attractor by the range of each axis."""
     if not where[0]:
         return ""
     ranges = []
@@ -138,12 +138,12 @@ def _places(where: Sequence[Mapping[str, float]]) -> str:
 def family_of(
     system: System, period: int, frequency_hz: float, packed: np.ndarray, parameter: str, scale: float
 ) -> Family:
-    """Orbits of a period with one free parameter."""
+    """Make the family of orbits of a period with one free parameter."""
     return Family(system, period, frequency_hz, packed, (parameter,), (scale,))
 
 
 def value_of(family: Family, frequency_hz: float, packed: np.ndarray) -> float:
-    """Value of the free parameter among given ones."""
+    """Return the value of the family's free parameter, from a frequency [Hz] and packed parameters."""
     name = family.free[0]
     if name == FREQUENCY:
         return frequency_hz
@@ -151,19 +151,19 @@ def value_of(family: Family, frequency_hz: float, packed: np.ndarray) -> float:
 
 
 def _dims(ds: xr.Dataset) -> list[str]:
-    """Parameter dims of a dataset."""
+    """Return the parameter dims of a dataset."""
     return [str(d) for d in ds["status"].dims if not is_start_dim(str(d))]
 
 
 def _points(ds: xr.Dataset) -> list[xr.Dataset]:
-    """Parameter points of a dataset."""
+    """Return the parameter points of a dataset."""
     dims = _dims(ds)
     indices = np.ndindex(*(ds.sizes[d] for d in dims))
     return [ds.isel(dict(zip(dims, map(int, index), strict=True))) for index in indices]
 
 
 def _parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarray]:
-    """Frequency and packed parameters of a point of the cube."""
+    """Return the frequency [Hz] and the packed parameters of a point of the cube."""
     axes = {n: float(point.coords[n]) for n in base.names if n in point.coords and not point.coords[n].dims}
     return frequency_of(base.model, {str(k): v for k, v in point.coords.items()}), base.replace(**axes).pack()
 
@@ -171,7 +171,7 @@ def _parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarr
 def recurrent(
     cube: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int
 ) -> list[Start]:
-    """Orbits, most of them unstable, that bounded trajectories of a cube come near.
+    """Find the orbits, mostly unstable, that bounded trajectories of a cube come near.
 
     Where two sections of a trajectory are close, p periods apart, Newton's method from the first often
     leads to an orbit of period p (Auerbach et al., Phys. Rev. Lett. 58, 1987, 2387).
@@ -179,9 +179,9 @@ def recurrent(
     Parameters
     ----------
     cube
-        With `section` and `status`; only cells of status bounded are used.
+        Cube with `section` and `status`; only cells of status bounded are used.
     parameters, parameter, scale, max_period
-        As for `attracting`.
+        Parameters of the run, free parameter, its scale (see `listed`), and longest period.
 
     Returns
     -------
@@ -206,7 +206,7 @@ def recurrent(
 def orbits_near(
     section: np.ndarray, frequency_hz: float, packed: np.ndarray, max_period: int, system: System
 ) -> list[tuple[np.ndarray, int]]:
-    """Periodic orbits near close recurrences of trajectories.
+    """Find periodic orbits near close recurrences of trajectories.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ def orbits_near(
 def _spread(
     section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
 ) -> list[np.ndarray]:
-    """Points of the closest recurrences, each farther than `CLOSE` from those before."""
+    """Choose the points of the closest recurrences, each farther than `CLOSE` from the others."""
     chosen: list[np.ndarray] = []
     for place in places:
         if len(chosen) == TRIES or not distance[place] <= CLOSE:

@@ -1,4 +1,4 @@
-"""Tables of branches and of curves: what ``magpend analyse branches`` and ``curves`` say."""
+"""Tabulate branches and curves, for ``magpend analyse branches`` and ``curves``."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Row = dict[str, Any]
 
 
 def words(variable: xr.DataArray) -> list[str]:
-    """Meanings of a flag variable's values."""
+    """Return the label of each value of a flag variable."""
     meanings = str(variable.attrs["flag_meanings"]).split()
     return [meanings[int(v)] for v in variable.values]
 
 
 def branches_table(ds: xr.Dataset) -> Table:
-    """Table of the located bifurcations; lines of the stable segments and of what was left out.
+    """Return the table of bifurcations, with lines on stable segments and attractors left out.
 
     ``unstable_below`` and ``unstable_above`` say how many multipliers are unstable on the two sides of the
     parameter; at a fold both orbits lie on one side, and the other says ``none``.
@@ -48,7 +48,7 @@ def _why_none(ds: xr.Dataset) -> str:
 
 
 def table_of(ds: xr.Dataset) -> list[Row]:
-    """Located bifurcations by rising parameter value, one dict for each; see `branches_table`.
+    """Return a row per located bifurcation, by rising parameter value; see `branches_table`.
 
     The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``. Parameters
     that have other values than the run's own follow, and ``side`` where the model has words for motions.
@@ -82,7 +82,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
 
 
 def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
-    """Where a branch lies in the parameters that it does not follow: the frequency, and what differs."""
+    """Return a branch's fixed parameters: the frequency, and those that differ from the run's values."""
     parameter = str(ds.attrs["parameter"])
     names = [FREQUENCY] if parameter != FREQUENCY and FREQUENCY in ds else []
     names += [str(n) for n in ds.data_vars if str(ds[n].attrs.get("long_name", "")) == f"value of {n}"]
@@ -90,7 +90,7 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
 
 
 def _unstable(one: xr.Dataset, kind: str) -> tuple[str, str]:
-    """How many multipliers are unstable below and above in the parameter."""
+    """Return the numbers of unstable multipliers below and above in the parameter, as texts."""
     before, after = int(one["n_unstable_before"]), int(one["n_unstable_after"])
     rises = bool(one["rises_before"])
     if kind == FOLD:
@@ -112,7 +112,7 @@ def _lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
             "unstable below, above": f"{row['unstable_below']}, {row['unstable_above']}",
             "branch": f"{row['branch']}{to}{_at(ds, row['branch'])}",
         }  # fmt: skip
-        if model_of(ds).crossing is None:  # as many periods of the drive
+        if model_of(ds).crossing is None:  # the period in drive periods says the same
             known.pop("seconds")
         table.append(known if "side" in row else {n: v for n, v in known.items() if n != "side"})
     return _aligned(table)
@@ -135,7 +135,7 @@ def _aligned(rows: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def _at(ds: xr.Dataset, branch: int) -> str:
-    """Values of what is not varied, in words."""
+    """Format a branch's fixed parameters."""
     found = [
         f"{value:g} Hz" if name == parameter_name(FREQUENCY) else f"{name} {value:g}"
         for name, value in fixed_of(ds, branch).items()
@@ -162,7 +162,7 @@ def _left_out(ds: xr.Dataset) -> list[str]:
 
 
 def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
-    """Stable segments of the branches, and what bounds each of them, by period, side and parameter."""
+    """Return the stable segments of the branches with their bounds, sorted by period, side and parameter."""
     found = []
     for i in range(ds.sizes["branch"]):
         n = int(ds["n_points"][i])
@@ -185,7 +185,7 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
-    """First and last points of runs of stable points; on a closed branch the ends hang together."""
+    """Return the first and last points of runs of stable points; on a closed branch a run may wrap."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], stable.astype(np.int8), [0]])))
     runs = [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
     if closed and len(runs) > 1 and stable[0] and stable[-1]:
@@ -199,7 +199,7 @@ def _ends_of(ds: xr.Dataset, branch: int) -> tuple[str, str]:
 
 
 def _bound(ds: xr.Dataset, branch: int, point: int, after: int, end: int) -> tuple[float, str]:
-    """Parameter value and name of what bounds a stable segment: a bifurcation after `after`, or the end."""
+    """Return the value and name of a stable segment's bound: a bifurcation after `after`, or the end."""
     here = np.flatnonzero((ds["of_branch"].values == branch) & (ds["after"].values == after))
     value = float(ds["parameter"][branch, point])
     if len(here):
@@ -226,7 +226,7 @@ def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
 
 
 def curves_table(ds: xr.Dataset) -> Table:
-    """Table of the curves: kind, period, points, and the ranges of both parameters."""
+    """Return the table of curves: kind, period, points, and the ranges of both parameters."""
     names = [parameter_name(str(ds.attrs[f"{role}_parameter"])) for role in ("first", "second")]
     kinds = words(ds["kind"])
     rows: list[Row] = []

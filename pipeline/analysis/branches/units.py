@@ -1,4 +1,4 @@
-"""Units of what is followed and of what is varied, as the run's model names them."""
+"""Return the units of parameters and states from the run's model."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pipeline.analysis.branches.problems import FREQUENCY
 
 
 def parameter_units(parameter: str, model: Model | None) -> str:
-    """Unit of a parameter or of the drive frequency; empty if there is no model to tell."""
+    """Return the unit of a parameter or of the drive frequency; empty without a model."""
     if parameter == FREQUENCY:
         return "Hz"
     return model.parameter(parameter).unit if model is not None else ""
 
 
 def state_units(model: Model | None) -> str:
-    """Units of the states, with commas between; 1 if there is no model to tell."""
+    """Return the units of the states, separated by commas; 1 without a model."""
     return ", ".join(model.state_units) if model is not None else "1"

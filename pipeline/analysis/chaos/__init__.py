@@ -1,1 +1,1 @@
-"""Regular or chaotic: exponents, dimensions, the 0-1 test."""
+"""Distinguish regular and chaotic motion: Lyapunov exponents, dimensions, the 0-1 test."""

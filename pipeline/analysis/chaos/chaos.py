@@ -1,11 +1,10 @@
-"""Chaos of a cube's cells: Lyapunov exponents, Kaplan-Yorke dimension, 0-1 test.
+"""Compute indicators of chaos: Lyapunov exponents, Kaplan-Yorke dimension, 0-1 test.
 
     ds = pipeline.open_run(directory)
     cells = chaotic_cells(ds)               # cell by cell; integrates nothing
     found = chaos(ds, attractors)           # and per attractor, see `per_attractor`
 
-What a cell says of its motion is one thing, what an attractor is another: a mean over cells speaks of one
-attractor only where they share it. So the means are taken per attractor.
+A mean over cells describes an attractor only if all these cells are on it. So means are taken per attractor.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from pipeline.products.chaos import ChaosOptions
 def chaos(
     ds: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions | None = None, **changes: Any
 ) -> xr.Dataset:
-    """Chaos of each cell and of each attractor.
+    """Compute the indicators of chaos of each cell and of each attractor.
 
     Parameters
     ----------
     ds
-        Cube with `section` and `status`; with `lyapunov` and the variables beside it if it has them.
+        Cube with `section` and `status`, and optionally the variables of the product `lyapunov`.
     attractors
-        What `identify` or `match` made of it.
+        Result of `identify` or `match` for the cube.
     options
-        By default those of `ChaosOptions`.
+        By default the defaults of `ChaosOptions`.
     changes
-        Fields of the options, instead of `options`.
+        Fields of `ChaosOptions`, used if `options` is None.
 
     Returns
     -------
@@ -47,8 +46,8 @@ def chaos(
     Raises
     ------
     ValueError
-        If an option is out of bounds, the cube has neither exponents nor sections enough and orbits are not
-        polished, or `attractors` are those of another cube.
+        If an option is out of bounds, the cube has neither exponents nor enough sections and orbits are not
+        polished, or `attractors` belong to another cube.
     """
     options = options or ChaosOptions(**changes)
     if attractors["attractor_id"].sizes != ds["status"].sizes:
@@ -60,12 +59,12 @@ def chaos(
 
 
 def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes: Any) -> xr.Dataset:
-    """Chaos of each cell.
+    """Compute the indicators of chaos of each cell.
 
     Parameters
     ----------
     ds, options, changes
-        As for `chaos`.
+        Cube and options, see `chaos`.
 
     Returns
     -------
@@ -78,7 +77,7 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
         ``audit`` [1/s]
             As in the cube and in `summarise`.
         ``kaplan_yorke_dimension``, ``kaplan_yorke_dimension_stderr``
-            Of the section, see `kaplan_yorke_dimension`.
+            Dimension of the section and its standard error, see `kaplan_yorke_dimension`.
         ``zero_one``, ``zero_one_stderr``, ``zero_one_half``, ``zero_one_low``, ``zero_one_high``,
         ``oversampling``
             See `zero_one_test`.
@@ -88,7 +87,7 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
     Raises
     ------
     ValueError
-        If an option is out of bounds, or the cube has neither exponents nor sections enough, and orbits are
+        If an option is out of bounds, or the cube has neither exponents nor enough sections and orbits are
         not polished.
     """
     options = options or ChaosOptions(**changes)
@@ -108,19 +107,19 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
 
 
 def check_chaos(ds: xr.Dataset, options: ChaosOptions) -> None:
-    """Refuse a cube that has nothing to say: polished orbits have multipliers without it.
+    """Check that the cube allows an indicator, or that orbits are polished and so have multipliers.
 
     Raises
     ------
     ValueError
-        With all reasons.
+        If neither holds; the message has all reasons.
     """
     if len(missing := reasons(ds, options.stride)) == 2 and not options.polish:
         raise ValueError("nothing to compute. " + ". ".join(missing))
 
 
 def reasons(ds: xr.Dataset, stride: int = 1) -> list[str]:
-    """Why the exponents or the 0-1 test are not to be had from a cube; a sentence each."""
+    """Return the reasons why a cube does not allow the exponents or the 0-1 test, a sentence each."""
     found = []
     if "lyapunov" not in ds:
         found.append(
@@ -142,7 +141,7 @@ def _of_exponents(ds: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
 
 
 def _without_exponents(ds: xr.Dataset) -> xr.Dataset:
-    """Closed orbits are regular; nothing is known of the others."""
+    """Return the motion of cells without exponents: regular if closed, otherwise unknown."""
     closed = is_closed(ds)
     motion = xr.full_like(closed, Motion.UNKNOWN, dtype=np.int8)
     motion = motion.where(~closed, np.int8(Motion.REGULAR)).assign_attrs(motion_attrs())

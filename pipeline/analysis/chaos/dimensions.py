@@ -1,7 +1,7 @@
-"""Kaplan-Yorke and correlation dimension of the stroboscopic section.
+"""Compute the Kaplan-Yorke and the correlation dimension of the section.
 
-A closed orbit is a few points there, of dimension 0, a quasi-periodic motion a curve, of dimension 1. The
-flow's attractor has one dimension more.
+On the section a closed orbit is a few points, of dimension 0, and a quasi-periodic motion is a curve, of
+dimension 1. The attractor of the flow has one dimension more.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pipeline.products.reporting import track
 def kaplan_yorke_dimension(
     ds: xr.Dataset, *, name: str = "lyapunov", dim: str = "exponent", zero: float = 0.0, flow: bool = False
 ) -> xr.Dataset:
-    """Kaplan-Yorke dimension from Lyapunov spectra.
+    """Compute the Kaplan-Yorke dimension from Lyapunov spectra.
 
     With the exponents in falling order and j the largest number whose sum S_j is not negative,
     ``D = j + S_j/|l_(j+1)|``: conjectured to be the information dimension of the attractor (Kaplan and
@@ -33,17 +33,17 @@ def kaplan_yorke_dimension(
     Parameters
     ----------
     ds
-        Has `name` on `dim`, in any order and unit: exponents of the section, without the zero along
-        the flow. If there are fewer than the dim `state` has entries, the spectrum is known in part. If
-        it has their errors ``<name>_stderr`` and the flags ``<name>_flag`` of a cube, they are used.
+        Dataset with `name` on `dim`, in any order and unit: exponents of the section, without the zero along
+        the flow. With fewer exponents than entries of the dim `state`, the spectrum is known in part. Errors
+        ``<name>_stderr`` and flags ``<name>_flag`` are used if present.
     name, dim
-        Of the exponents.
+        Variable and dim of the exponents.
     zero
-        Exponents of at most this modulus count as 0. The dimension jumps from 0 to 1 where the largest
-        exponent changes its sign: on a quasi-periodic motion it is 0 but for an error.
+        Largest modulus of an exponent that counts as 0. The dimension jumps from 0 to 1 where the largest
+        exponent changes sign; on a quasi-periodic motion this exponent is 0 within its error.
     flow
-        Whether they are those of a flow: the one nearest to 0 is left out, and the dimension is that of a
-        section across the flow, one less than that of the attractor.
+        Whether the exponents are those of a flow. Then the one nearest to 0 is left out, and the dimension is
+        that of a section across the flow, one less than that of the attractor.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def kaplan_yorke_dimension(
         rates, errors = (_without_zero(values, rates) for values in (rates, errors))
     n = rates.shape[-1]
     sums = np.cumsum(rates, axis=-1)
-    # sums rise and then fall, and start at 0: those before the first negative one are not
+    # sums start at 0, rise and then fall: all sums before the first negative one are at least 0
     j = np.where((sums < 0.0).any(axis=-1), (sums < 0.0).argmax(axis=-1), n)
     below = np.minimum(j, n - 1)[..., None]
     rate = -np.take_along_axis(rates, below, axis=-1)[..., 0]
@@ -100,24 +100,24 @@ def kaplan_yorke_dimension(
 
 
 def _without_zero(values: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Values on the last axis but for that of the rate nearest to 0."""
+    """Drop the value of the rate nearest to 0 from the last axis."""
     nearest = np.argmin(np.abs(np.nan_to_num(rates, nan=np.inf)), axis=-1)
     kept = np.arange(rates.shape[-1]) != nearest[..., None]
     return np.asarray(values[kept].reshape(*rates.shape[:-1], rates.shape[-1] - 1))
 
 
 PER_OCTAVE = 4
-"""Radii per factor of two."""
+"""Number of radii per factor of two."""
 N_OCTAVES = 20
-"""Radii reach from the largest distance down by this many factors of two."""
+"""Number of factors of two from the largest radius to the smallest."""
 MOST_PAIRS = 0.05
-"""Share of the pairs closer than the radius at which the fit ends."""
+"""Share of pairs closer than the radius, at the upper end of the fit."""
 LEAST_OCTAVES = 2
-"""Shortest range that is fitted."""
+"""Shortest range of a fit [octaves]."""
 LEAST_NEIGHBOURS = 10
-"""Points around a point, on average, where the fit begins."""
+"""Mean number of neighbours within the radius, at the lower end of the fit."""
 N_PARTS = 10
-"""Parts of the points that the standard error comes from."""
+"""Number of parts of the points for the jackknife."""
 
 
 def correlation_dimension(
@@ -129,27 +129,26 @@ def correlation_dimension(
     floor: float = FLOOR,
     geometry: Geometry | None = None,
 ) -> xr.Dataset:
-    """Correlation dimension of the sections of each cell, with the curve and the range of the fit.
+    """Compute the correlation dimension of each cell's sections, with the curve and the range of the fit.
 
-    The correlation sum C(r) is the share of the pairs of points closer than r; the dimension is the
+    The correlation sum C(r) is the share of pairs of points closer than r; the dimension is the
     slope of log C against log r (Grassberger and Procaccia, Phys. Rev. Lett. 50, 346 and Physica D 9,
     189, 1983). Pairs at most `theiler` sections apart in time are left out (Theiler, Phys. Rev. A 34,
     2427, 1986). Distances are the largest scaled difference of a component, angles on their circle.
 
-    The range of the fit is a rule, not a choice: from the least radius within which a point has ten
-    others on average, at least `floor`, to that within which lies a twentieth of all pairs. Above it the
-    edge of the set bends the curve; below it so do the few returns of a quasi-periodic motion. If this
-    is less than two octaves there is no fit: N points do for a dimension of ``log2(N/200)/2`` or less.
-    The slope is that of the straight line of least squares through the radii in the range, four per
-    octave.
+    A fixed rule sets the range of the fit. It begins at the least radius, at least `floor`, within which a
+    point has ten neighbours on average, and ends where a twentieth of all pairs is closer. Above the range
+    the edge of the set bends the curve; below it the few returns of a quasi-periodic motion do. Without two
+    octaves there is no fit: N points suffice for a dimension of at most ``log2(N/200)/2``. The slope is a
+    least-squares fit through the radii in the range, four per octave.
 
     Parameters
     ----------
     ds
         Cube with `section` (and `status`).
     pool
-        Dims whose cells are taken together, as points of one set: cells on the same attractor. That
-        they are is not validated. Cells that were not computed are left out.
+        Dims whose cells are pooled as points of one set. They should be on one attractor; this is not
+        validated. Cells that were not computed are left out.
     theiler
         Theiler window [sections]; 0 leaves out a point's pair with itself alone. Larger where
         sections follow each other closely.
@@ -158,19 +157,19 @@ def correlation_dimension(
         there are more cells than points. Time grows with its square at the largest radii, memory in
         proportion.
     floor
-        Scaled distance that is not resolved. A set no larger is a point.
+        Scaled distance that is not resolved. A smaller set counts as a point.
     geometry
-        Of the states; by default that of the cube's model.
+        Geometry of the states, by default from the cube's model.
 
     Returns
     -------
     Dataset
-        On the dims of the cells that are not pooled: `correlation_dimension`;
+        On the cell dims that are not pooled: `correlation_dimension`;
         `correlation_dimension_stderr`, its sampling error, by the jackknife: slopes without each tenth of
-        the points (of successive sections, or of cells, where some are pooled);
+        the points (of successive sections, or of pooled cells);
         `correlation_dimension_spread`, the slope of the lower half of the range minus that of the upper
-        half: where it is not small against the range of answers that matter, the curve is not straight
-        and its slope no dimension; `fit_low`, `fit_high`, the radii of the range; `n_points`;
+        half: if it is not small against the precision that you need, the curve is not straight and its
+        slope is no dimension; `fit_low`, `fit_high`, the radii of the range; `n_points`;
         `largest_resolved`, ``2 log N/log(extent/fit_low)``, the bound of Eckmann and Ruelle (Physica D
         56, 185, 1992): a result near it says only that the points are too few. And, with `radius`:
         `log_radius` and `log_correlation_sum`, natural logarithms, NaN where no pair is closer. The
@@ -180,13 +179,13 @@ def correlation_dimension(
     Raises
     ------
     ValueError
-        If a dim to pool is none of the cells', or an option is out of bounds.
+        If `pool` has a dim that the cells lack, or an option is out of bounds.
 
     Notes
     -----
-    Sets of points wave about their straight line (that of the Henon map by 0.07 in the local slope), so
-    that two digits are what a fit over some octaves gives. A rotation close to a resonance fills its
-    curve slowly, and has a dimension between 0 and 1 until it has.
+    Correlation sums oscillate about their straight line (for the Henon map by 0.07 in the local slope), so
+    a fit over some octaves gives two digits. A rotation close to a resonance fills its curve slowly; until
+    then its dimension lies between 0 and 1.
     """
     geometry = geometry_of(ds, geometry)
     section = computed(ds, geometry)
@@ -214,7 +213,7 @@ def correlation_dimension(
 
 @dataclass(frozen=True)
 class _Curve:
-    """Correlation sum of one set, and what was read from it."""
+    """The correlation sum of one set, with the dimension and the range of its fit."""
 
     log_radius: Floats
     log_sum: Floats
@@ -228,7 +227,7 @@ class _Curve:
 
 
 def _sample(section: Floats, n_max: int) -> Floats:
-    """At most `n_max` points: the last sections of each cell, of evenly chosen cells."""
+    """Choose at most `n_max` points: the last sections of evenly chosen cells."""
     m = len(section)
     if m > n_max:
         section = section[np.linspace(0, m - 1, n_max).round().astype(int)]
@@ -236,7 +235,7 @@ def _sample(section: Floats, n_max: int) -> Floats:
 
 
 def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometry) -> _Curve:
-    """Correlation dimension of the points of some cells, shape (cell, n, state)."""
+    """Compute the correlation dimension of the points of some cells, shape (cell, n, state)."""
     n_radii = N_OCTAVES * PER_OCTAVE + 1
     nothing = _Curve(np.full(n_radii, np.nan), np.full(n_radii, np.nan))
     n_points = section.shape[0] * section.shape[1]
@@ -266,12 +265,12 @@ def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometr
 
 
 def _extent(points: Floats, geometry: Geometry) -> float:
-    """Largest distance of a component, at most half of its circle."""
+    """Return the largest extent of a component, at most half its circle."""
     extent = 0.0
     for i, length in enumerate(geometry.circumference):
         x = geometry.scaled(points)[:, i]
         if length > 0.0:
-            # the arc that holds all points ends where the widest gap begins
+            # the arc that holds all points is the circle without the widest gap
             x = np.sort(x)
             gap = np.diff(x, append=x[0] + length).max()
             extent = max(extent, min(length - gap, 0.5 * length))
@@ -282,14 +281,14 @@ def _extent(points: Floats, geometry: Geometry) -> float:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Ordered pairs of points closer than each radius, those close in time left out.
+    """Numbers of ordered pairs of points closer than each radius, without pairs close in time.
 
     Attributes
     ----------
     by_part : ndarray of int64, (part, radius)
-        With their first point in the part.
+        Pairs whose first point is in the part.
     within : ndarray of int64, (part, radius)
-        With both.
+        Pairs whose points are both in the part.
     total : int
         Pairs at any distance.
     """
@@ -300,7 +299,7 @@ class _Pairs:
 
     @classmethod
     def of(cls, section: Floats, radii: Floats, theiler: int, geometry: Geometry) -> _Pairs:
-        """Pairs among the points of some cells, shape (cell, n, state)."""
+        """Count the pairs among the points of some cells, shape (cell, n, state)."""
         m, n, _ = section.shape
         points = section.reshape(m * n, -1)
         everything = geometry.tree(points)
@@ -324,11 +323,11 @@ class _Pairs:
 
     @property
     def all(self) -> npt.NDArray[np.int64]:
-        """Of all points."""
+        """Pairs of all points, shape (radius,)."""
         return np.asarray(self.by_part.sum(axis=0))
 
     def without(self, part: int) -> npt.NDArray[np.int64]:
-        """Of the points that are not in a part."""
+        """Return the pairs of points outside of a part, shape (radius,)."""
         return np.asarray(self.all - 2 * self.by_part[part] + self.within[part])
 
 
@@ -337,7 +336,7 @@ def _logarithm(values: npt.NDArray[Any]) -> Floats:
 
 
 def _slope(x: Floats, y: Floats, rows: npt.NDArray[np.int64]) -> float:
-    """Slope of the straight line of least squares through some rows, those without a pair left out."""
+    """Fit a slope through some rows by least squares, without radii that have no pair."""
     rows = rows[np.isfinite(y[rows])]
     x, y = x[rows] - x[rows].mean(), y[rows] - y[rows[0]]  # a flat curve has the slope 0 exactly
     return float((x * y).sum() / (x * x).sum())

@@ -1,7 +1,7 @@
-"""What stored Lyapunov exponents say: per period, how sure, chaos or not, and whether it lasts.
+"""Interpret stored Lyapunov exponents: class of motion, errors, transients, means over cells.
 
-Works on the variables of ``[products] lyapunov``; integrates nothing. `spectrum_of_jacobians` gives the
-exponents of any map whose Jacobians are known.
+The functions read the variables of ``[products] lyapunov`` and integrate nothing. `spectrum_of_jacobians`
+computes the exponents of any map from its Jacobians.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ Floats = npt.NDArray[np.float64]
 GOOD, UNRESOLVED, FAILED = LyapunovFlag.GOOD, LyapunovFlag.UNRESOLVED, LyapunovFlag.FAILED
 
 FEWEST_BLOCKS = 12
-"""Blocks from which a transient can be told: three in each quarter, so that they have errors."""
+"""Fewest blocks for detecting a transient: three in each quarter, so that quarters have errors."""
 
 
 class Motion(IntEnum):
-    """What the exponents of a cell say of its motion."""
+    """Classes of motion by a cell's exponents."""
 
     UNKNOWN = 0
     REGULAR = 1
@@ -36,7 +36,7 @@ class Motion(IntEnum):
 
 
 def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> xr.Dataset:
-    """Return what the exponents of a cube say, cell by cell.
+    """Classify the motion of each cell by its exponents, with errors, drift and consistency checks.
 
     Parameters
     ----------
@@ -51,26 +51,26 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
     Returns
     -------
     Dataset
-        With the cell dims of the cube:
+        Variables on the cell dims of the cube:
 
         ``lyapunov_per_period`` (exponent), ``lyapunov_per_period_stderr`` (exponent)
             Exponents per drive period, or per return in the mean [1].
         ``lyapunov_running`` (block, exponent)
-            Mean over the blocks up to this one [1/s]: the convergence history.
+            Mean over the blocks so far [1/s]: the convergence history.
         ``motion``
             Codes of `Motion`: chaotic if the largest exponent is positive, hyperchaotic if the second
             is too, regular if the largest is negative (or the orbit closed), undecided in between. A
             continuous quasi-periodic motion, whose largest exponent of the section map is 0, is undecided,
             and so is a cell that closed and yet has a positive exponent.
         ``contradicts``
-            1 for such a cell: its sections closed within the run's tolerance, on an unstable orbit or by
-            chance, and its neighbours leave it. Else 0.
+            1 for a closed cell with a positive exponent: its sections closed within the run's tolerance, on
+            an unstable orbit or by chance, and nearby trajectories leave it. Otherwise 0.
         ``is_transient``
             See `transients`.
         ``drift``
-            Largest exponent of the later half of the blocks minus that of the earlier [1/s], and
-            ``drift_sigma``, the same in standard errors: a transient that ends within the blocks shows as a
-            large negative value, chaos that lasts stays within a few.
+            Largest exponent of the later half of the blocks minus that of the earlier half [1/s], and
+            ``drift_sigma``, the same in standard errors: large and negative for a transient that ends within
+            the blocks, a few standard errors for lasting chaos.
         ``audit``
             Sum of a whole spectrum minus the divergence [1/s]; NaN for a part.
 
@@ -100,7 +100,7 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
 
 
 def period_seconds(ds: xr.Dataset) -> xr.DataArray:
-    """Time between two sections [s]: a drive period, or the mean return of each cell."""
+    """Return the time between two sections [s]: a drive period, or the mean return of each cell."""
     if "return_time" in ds:
         return ds["return_time"].mean("period_index")
     frequency = ds["frequency"] if "frequency" in ds.coords else xr.DataArray(float(ds.attrs["frequency_hz"]))
@@ -114,7 +114,7 @@ def _running(blocks: xr.DataArray) -> xr.DataArray:
 
 
 def is_closed(ds: xr.Dataset) -> xr.DataArray:
-    """Cells whose sections closed."""
+    """Return which cells' sections closed."""
     return (ds["status"] == PERIODIC) | (ds["orbit_period"] > 0)
 
 
@@ -144,7 +144,7 @@ def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> dict[str, xr.DataAr
 
 
 def motion_attrs() -> dict[str, Any]:
-    """Attributes of an array of codes of `Motion`."""
+    """Return the attributes of an array of codes of `Motion`."""
     return {
         "units": "1", "long_name": "kind of motion by its exponents",
         "flag_values": np.array(list(Motion), np.int8),
@@ -153,7 +153,7 @@ def motion_attrs() -> dict[str, Any]:
 
 
 def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
-    """Say which cells' chaos ended within the blocks of their exponents.
+    """Detect cells whose chaos ended within the blocks of their exponents.
 
     Returns
     -------
@@ -174,17 +174,17 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
     early, late = first.isel(block=slice(quarter)), first.isel(block=slice(-quarter, None))
     before, after = early.mean("block"), late.mean("block")
     error = np.sqrt((early.var("block", ddof=1) + late.var("block", ddof=1)) / quarter)
-    # the largest exponent of a flow's orbit is 0, along the flow
+    # the largest exponent of an orbit of a flow is 0, along the flow
     floor = least if "return_time" in ds else -least
-    # not each by its own error: the blocks of an orbit with complex multipliers swing widely
+    # use the common error: blocks of an orbit with complex multipliers oscillate widely
     ended = (before > least) & (after < floor) & (before - after > n_sigma * error)
     return ended.astype(np.int8).where(known, np.int8(-1)).assign_attrs(attrs)
 
 
 def on_attractor(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
-    """Cells of which the largest exponent says something of what they ended on.
+    """Return which cells' largest exponent describes the set that they ended on.
 
-    Those without objection, those of which the first exponent alone is resolved, and no transients.
+    Their flag is good, or only the first exponent is resolved, and they are no transients.
     """
     resolved = ds["lyapunov_flag"].isin((GOOD, UNRESOLVED))
     return resolved & (transients(ds, n_sigma=n_sigma, least=least) != 1)
@@ -204,7 +204,7 @@ def _drift(blocks: xr.DataArray) -> dict[str, xr.DataArray]:
 
 
 def _audit(ds: xr.Dataset) -> xr.DataArray:
-    # returns, and so blocks, are not of one length
+    # returns differ in length, and so do blocks
     means = ds["lyapunov"] if "return_time" in ds else ds["lyapunov_blocks"].mean("block")
     total = means.sum("exponent", skipna=False) - ds["divergence"]
     if ds.sizes["exponent"] < ds.sizes["state"]:
@@ -216,24 +216,24 @@ def _audit(ds: xr.Dataset) -> xr.DataArray:
 
 
 def pooled_mean(value: Floats, stderr: Floats, which: npt.NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
-    """Mean over cells, its standard error, and the standard deviation between cells beyond their errors.
+    """Compute the mean over cells, its standard error, and the scatter of cells beyond their errors.
 
-    The variance S**2 between m cells contains that within a cell, s_i**2. With T**2 = S**2 - mean(s_i**2)
-    for the part beyond it, 0 if that is negative, the variance of the mean is ``(T**2 + mean(s_i**2))/m``
-    (Hedges and Olkin, Statistical Methods for Meta-Analysis, 1985, ch. 9): the errors within cells
-    while the cells agree, the scatter of the cells where it is larger. One cell has its own error.
+    The variance S**2 of m cells includes the squared errors s_i**2 of the cells. Let T**2 be S**2 -
+    mean(s_i**2), or 0 if that is negative. The variance of the mean is ``(T**2 + mean(s_i**2))/m`` (Hedges
+    and Olkin, Statistical Methods for Meta-Analysis, 1985, ch. 9). It follows the errors of the cells while
+    they agree, and their scatter if that is larger. A single cell has its own error.
 
     Parameters
     ----------
     value, stderr
-        Values with their standard errors, cells on the last axis; not finite: left out.
+        Values and standard errors, cells on the last axis; values that are not finite are left out.
     which
-        Cells that count, of the same shape or one that broadcasts.
+        Mask of the cells that count, of the same shape or one that broadcasts.
 
     Returns
     -------
     tuple of ndarray
-        Without the last axis; NaN where no cell counts.
+        Mean, standard error and standard deviation, without the last axis; NaN where no cell counts.
     """
     there = which & np.isfinite(value)
     m = there.sum(-1)
@@ -255,12 +255,12 @@ def _over(values: Any, counts: Any) -> Floats:
 
 @dataclass(frozen=True)
 class JacobianSpectrum:
-    """Lyapunov exponents of a map along its trajectories, per iterate.
+    """The Lyapunov exponents of a map along its trajectories, per iterate.
 
     Attributes
     ----------
     exponents : ndarray, (..., state)
-        In falling order.
+        Exponents in falling order.
     stderr : ndarray, (..., state)
         Standard errors by block means.
     blocks : ndarray, (..., block, state)
@@ -275,7 +275,7 @@ class JacobianSpectrum:
 def spectrum_of_jacobians(
     jacobians: npt.ArrayLike, *, n_blocks: int = 16, n_transient: int = 0
 ) -> JacobianSpectrum:
-    """Lyapunov spectrum of a map from its Jacobians along trajectories.
+    """Compute the Lyapunov spectrum of a map from its Jacobians along trajectories.
 
     A basis is carried along by the Jacobians and made orthonormal at each by QR; an exponent is the mean
     logarithm of the diagonal of R (Benettin, Galgani, Giorgilli and Strelcyn, Meccanica 15, 9 and 21,
@@ -291,18 +291,18 @@ def spectrum_of_jacobians(
         Blocks of equal length for the errors, 2 or more. They are right if a block is longer than the
         motion remembers.
     n_transient
-        First Jacobians, in which the basis turns into its directions, that are not counted.
+        Number of first Jacobians that only align the basis and are not counted.
 
     Returns
     -------
     JacobianSpectrum
-        -inf where a Jacobian is singular.
+        Exponents, errors and blocks; -inf where a Jacobian is singular.
 
     Raises
     ------
     ValueError
-        If the shape is another, there is a Jacobian that is not finite, or what is counted is no whole
-        number of blocks.
+        If the shape is wrong, a Jacobian is not finite, or the counted Jacobians do not fill a whole number
+        of blocks.
     """
     given = np.asarray(jacobians, np.float64)
     if given.ndim < 3 or given.shape[-1] != given.shape[-2]:

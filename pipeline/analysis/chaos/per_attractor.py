@@ -1,4 +1,4 @@
-"""Chaos per attractor: exponents, multipliers, dimensions, 0-1 test and share, for each at each point.
+"""Compute the indicators of chaos per attractor and parameter point.
 
 Schema
 ------
@@ -10,10 +10,10 @@ many as there are states; ``multiplier``. Variables, beside the copies of ``kind
 variable                        own dims   meaning
 =============================== ========== ===================================================================
 ``nature``                                 codes of `Nature`
-``n_transient``                            its cells of which the chaos ended while exponents were taken
-``n_drifting``                             not closed, with a largest exponent that drifts
-``n_contradicting``                        closed, and yet with a positive exponent
-``n_audit_failed``,                        with these flags
+``n_transient``                            its cells whose chaos ended while exponents were taken
+``n_drifting``                             cells not closed, with a largest exponent that drifts
+``n_contradicting``                        closed cells with a positive exponent
+``n_audit_failed``,                        cells with these flags
 ``n_unresolved``, ``n_failed``
 ``exponents_from``                         0 none, 1 the orbit's multipliers, 2 its cells, 3 the equilibrium's
                                            eigenvalues
@@ -24,16 +24,16 @@ variable                        own dims   meaning
 ``attractor_kaplan_yorke_stderr``          its standard error
 ``attractor_correlation``,                 correlation dimension of the pooled sections, its sampling error,
 ``attractor_correlation_stderr``,          and the slope of the lower half of its range minus the upper;
-``attractor_correlation_spread``           of bounded sets with points enough
+``attractor_correlation_spread``           for bounded sets with enough points
 ``median_zero_one``,                       K over its cells
 ``least_zero_one``,
 ``largest_zero_one``
 =============================== ========== ===================================================================
 
-A polished orbit's exponents are the logarithms of its Floquet multipliers over its period: all of them, free
-of sampling errors, whether the cube has exponents or not. Those of a bounded set are means over its cells
-(`pooled_mean`), transients left out; after the first, of cells flagged good. `lyapunov_max` of the attractors
-is the first of them.
+A polished orbit's exponents are the logarithms of its Floquet multipliers over its period. They are complete
+and free of sampling errors, whether the cube has exponents or not. A bounded set's exponents are means over
+its cells (`pooled_mean`), without transients; all but the first use only cells flagged good. `lyapunov_max`
+of the attractors is the first exponent.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ from pipeline.products.chaos import ChaosOptions
 from pipeline.products.lyapunov import LyapunovFlag
 
 CHAOTIC_K, REGULAR_K = 0.9, 0.1
-"""Median of K from which, and up to which, the 0-1 test alone tells chaos from order."""
+"""Least median of K that shows chaos, and largest that shows order, by the 0-1 test alone."""
 
 FEWEST_POINTS = 1000
-"""Fewest section points for a correlation dimension: they do for a dimension of 1.2."""
+"""Fewest section points for a correlation dimension: enough for a dimension of 1.2."""
 
 
 class Nature(IntEnum):
-    """What an attractor is, by its exponents; where there are none, by the 0-1 test."""
+    """Classes of attractors by their exponents or, without exponents, by the 0-1 test."""
 
     UNKNOWN = 0
     REGULAR = 1
@@ -88,14 +88,14 @@ class Nature(IntEnum):
 
     @property
     def words(self) -> str:
-        """As tables say it."""
+        """Label for tables."""
         by_test = self.name.endswith("_BY_TEST")
         name = self.name.removesuffix("_BY_TEST").lower().replace("quasi_", "quasi-")
         return name + (" (by the 0-1 test)" if by_test else "")
 
     @property
     def has_dimension(self) -> bool:
-        """Whether sections of it fill something that stays."""
+        """Whether a correlation dimension of its sections is computed."""
         return self in (Nature.CHAOTIC, Nature.HYPERCHAOTIC, Nature.CHAOTIC_BY_TEST, Nature.UNDECIDED)
 
 
@@ -104,12 +104,12 @@ _FROM = ("none", "multipliers", "cells", "eigenvalues")
 
 @dataclass
 class _Cells:
-    """Cells of one parameter point as rows.
+    """The cells of one parameter point as rows.
 
     Attributes
     ----------
     values : dict of ndarray
-        By variable, cells on the first axis.
+        Arrays by variable, cells on the first axis.
     is_flow : bool
         Whether sections are crossings of a flow.
     """
@@ -140,11 +140,11 @@ def chaos_per_attractor(
     ds
         The cube.
     cells
-        Of `chaotic_cells`, with `attractor_id`.
+        Result of `chaotic_cells`, with `attractor_id`.
     attractors
-        Of `identify` or `match`.
+        Result of `identify` or `match`.
     options
-        Those of the exponents' signs, and `n_max` points of a correlation dimension; 0 for none.
+        Criteria for the signs of exponents, and `n_max`, the most points of a correlation dimension.
     """
     dims, starts = split_dims(cells["motion"])
     copied = [
@@ -192,7 +192,7 @@ def _flags(words: Sequence[str]) -> dict[str, Any]:
 def _of_attractor(
     one: xr.Dataset, cells: _Cells, number: int, n_states: int, options: ChaosOptions
 ) -> dict[str, Any]:
-    """Counts, exponents, 0-1 test and nature of one attractor."""
+    """Compute the counts, exponents, 0-1 test and nature of one attractor."""
     is_own = cells.values["attractor_id"] == number
     found: dict[str, Any] = {"kind_is_bounded": int(one["kind"]) in APERIODIC}
     found |= _counts(cells, is_own, options)
@@ -217,7 +217,7 @@ def _counts(cells: _Cells, is_own: npt.NDArray[np.bool_], options: ChaosOptions)
     flag, drift = cells.get("lyapunov_flag"), cells.get("drift_sigma")
     if flag is None or drift is None:
         return found
-    # the blocks of a closed orbit scatter by its waves, not by chance
+    # the blocks of a closed orbit scatter because the orbit oscillates, not by chance
     open_cells = is_own & (cells.values["status"] != PERIODIC)
     found["n_drifting"] = int((np.abs(drift[open_cells]) > options.n_sigma).sum())
     for code in (LyapunovFlag.AUDIT_FAILED, LyapunovFlag.UNRESOLVED, LyapunovFlag.FAILED):
@@ -259,7 +259,7 @@ def _exponents(
 
 
 def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Nature:
-    """Nature by what the set was shown to be; where nothing was, by its exponents or the 0-1 test."""
+    """Return the nature of a set by its kind and stability, else by its exponents or the 0-1 test."""
     kind, stability = int(one["kind"]), int(one["stability"])
     if kind in (PERIODIC_ORBIT, EQUILIBRIUM):
         return Nature.UNDECIDED if stability == UNSTABLE else Nature.REGULAR
@@ -285,13 +285,13 @@ def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Na
 
 
 class _Curves:
-    """Correlation dimensions of attractors' pooled sections."""
+    """The correlation dimensions of attractors, from their cells' pooled sections."""
 
     def __init__(self, options: ChaosOptions) -> None:
         self._n_max = options.n_max
 
     def of(self, point: xr.Dataset, starts: Sequence[str], cells: _Cells, number: int) -> dict[str, float]:
-        """Of one attractor, from the cells of its parameter point; empty if its points are too few."""
+        """Compute the dimension of one attractor from its cells; empty if there are too few points."""
         lasting = (cells.values["attractor_id"] == number) & (cells.values["is_transient"] != 1)
         n_keep = point.sizes["period_index"]
         if min(int(lasting.sum()) * n_keep, self._n_max) < FEWEST_POINTS:
@@ -306,20 +306,20 @@ class _Curves:
 
 
 def pooled(point: xr.Dataset, starts: Sequence[str], which: npt.NDArray[np.bool_]) -> xr.Dataset:
-    """Sections and status of some cells of a parameter point, on the dim ``cell``."""
+    """Return the sections and status of some cells of a parameter point, on the dim ``cell``."""
     own = point[["section", "status"]].reset_coords(drop=True)
     rows = own.stack(cell=list(starts), create_index=False) if starts else own.expand_dims("cell")
     return rows.isel(cell=np.flatnonzero(which)).assign_attrs(point.attrs)
 
 
 def _with_kaplan_yorke(result: xr.Dataset) -> xr.Dataset:
-    """Kaplan-Yorke dimension of each attractor, from its own exponents."""
+    """Add the Kaplan-Yorke dimension of each attractor, from its own exponents."""
     exponents = {
         "attractor_lyapunov": result["attractor_lyapunov"],
         "attractor_lyapunov_stderr": result["attractor_lyapunov_stderr"],
     }
     spectra = xr.Dataset(exponents).reset_coords(drop=True)
-    # exponents that were not taken are not those of a whole spectrum
+    # spectra without some exponents keep NaN there, and have no dimension
     flow = model_of(result).crossing is not None
     found = kaplan_yorke_dimension(spectra, name="attractor_lyapunov", dim="rank", flow=flow)
     about = {"units": "1", "long_name": "Kaplan-Yorke dimension of the section"}

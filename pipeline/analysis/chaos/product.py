@@ -1,4 +1,4 @@
-"""Chaos and correlation dimension as analyses of a run (`pipeline.products.chaos`)."""
+"""Compute chaos and correlation dimension as analyses of a run (`pipeline.products.chaos`)."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ if TYPE_CHECKING:
 
 
 def needs_chaos(run: Run, options: ChaosOptions) -> None:
-    """Refuse a cube that has neither exponents nor sections enough, unless orbits are polished."""
+    """Raise ValueError if the cube has neither exponents nor enough sections and orbits are not polished."""
     from pipeline.analysis.chaos.chaos import check_chaos
 
     check_chaos(run.cube(), options)
 
 
 def chaos(run: Any, options: ChaosOptions) -> xr.Dataset:
-    """Exponents, dimensions and 0-1 test of the cells and of each attractor."""
+    """Compute exponents, dimensions and 0-1 test of the cells and of each attractor."""
     from pipeline.analysis.chaos.chaos import chaos as compute
 
     return compute(run.cube(), run.derive("attractors", **options.part(AttractorOptions)), options)
 
 
 def needs_dimension(run: Run, options: DimensionOptions) -> None:
-    """Refuse axes and values that the cube does not have."""
+    """Raise ValueError for an axis or a value that the cube does not have."""
     from pipeline.analysis.selection import select_points
 
     select_points(run.cube(), options.at)
 
 
 def settle_dimension(run: Run, options: DimensionOptions) -> DimensionOptions:
-    """Take the values that the axes have: another spelling of a point is the same result."""
+    """Replace values by the exact axis values, so that every spelling of a point has the same kept result."""
     from pipeline.analysis.selection import select_points
 
     part = select_points(run.cube(), options.at)
@@ -43,7 +43,7 @@ def settle_dimension(run: Run, options: DimensionOptions) -> DimensionOptions:
 
 
 def dimension(run: Any, options: DimensionOptions) -> xr.Dataset:
-    """Correlation dimension of each bounded set that stays."""
+    """Compute the correlation dimension of each attractor that does not close."""
     from pipeline.analysis.chaos.staying import section_dimension
 
     return section_dimension(run.cube(), run.derive("attractors", **options.part(AttractorOptions)), options)

@@ -1,4 +1,4 @@
-"""What indicators of chaos read from a cube: the sections of the cells that were computed."""
+"""Read the sections of computed cells from a cube, for the indicators of chaos."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from pipeline.layout.vocabulary import model_of
 Floats = npt.NDArray[np.float64]
 
 FLOOR = 1e-6
-"""Scaled distance below which sections are one point: the closure tolerance of a run."""
+"""Scaled distance below which sections count as one point."""
 
 
 def geometry_of(ds: xr.Dataset, geometry: Geometry | None = None) -> Geometry:
-    """Geometry of a cube's states: the one given, else that of its model."""
+    """Return the given geometry, or else the geometry of the cube's model."""
     return Geometry.of(model_of(ds)) if geometry is None else geometry
 
 
 def computed(ds: xr.Dataset, geometry: Geometry) -> xr.DataArray:
-    """Sections, NaN in the cells that were not computed to the end.
+    """Return the sections, NaN in cells that were not computed to the end.
 
     Raises
     ------
     ValueError
-        If there are no sections, or their states are not those of the geometry.
+        If there are no sections, or the geometry has another number of states.
     """
     if "section" not in ds:
         raise ValueError("The dataset has no section; give the dataset of pipeline.open_run.")
@@ -46,13 +46,13 @@ def computed(ds: xr.Dataset, geometry: Geometry) -> xr.DataArray:
 
 
 def at_least(name: str, value: int, least: int) -> int:
-    """Return a number that is large enough; raises ValueError if it is not."""
+    """Return a number if it is at least `least`; otherwise raise ValueError."""
     if value < least:
         raise ValueError(f"{name} is {value}, below {least}: give {least} or more")
     return int(value)
 
 
 def with_coords(ds: xr.Dataset, dims: Sequence[object], variables: Mapping[str, Any]) -> xr.Dataset:
-    """Dataset with those coordinates of another that lie on the given dims."""
+    """Make a dataset of variables, with the coordinates of `ds` that lie on the given dims."""
     coords = {name: c for name, c in ds.coords.items() if set(c.dims) <= set(dims)}
     return xr.Dataset(variables, coords=coords)

@@ -1,4 +1,4 @@
-"""Correlation dimension of attractors that do not close, and why other sets have none."""
+"""Compute the correlation dimension of attractors that do not close; give the reason for other sets."""
 
 from __future__ import annotations
 
@@ -22,34 +22,35 @@ HAS_DIMENSION, ABSENT, CLOSED, NO_ATTRACTOR, TOO_FEW = range(len(REASONS))
 def section_dimension(
     ds: xr.Dataset, attractors: xr.Dataset, options: DimensionOptions | None = None, **changes: Any
 ) -> xr.Dataset:
-    """Correlation dimension of each attractor that does not close, from the sections of its cells.
+    """Compute the correlation dimension of each attractor that does not close, from its cells' sections.
 
-    A cell that is still closing, or a chaotic transient, fills nothing: a slope of its correlation sum is no
-    dimension. So only sets that were shown to attract have one.
+    A cell that is still closing and a chaotic transient fill no set, so the slope of their correlation sum is
+    no dimension. Only sets that were shown to attract have a dimension.
 
     Parameters
     ----------
     ds
         Cube with `section`, `status` and `orbit_period`.
     attractors
-        What `identify` or `match` made of it.
+        Result of `identify` or `match` for the cube.
     options
-        By default those of `DimensionOptions`; `at` selects values of swept parameters.
+        By default the defaults of `DimensionOptions`; `at` selects values of swept parameters.
     changes
-        Fields of the options, instead of `options`.
+        Fields of `DimensionOptions`, used if `options` is None.
 
     Returns
     -------
     Dataset
-        On the parameter dims and `attractor` (those that a point of the selection has): the variables of
-        `pipeline.analysis.chaos.dimensions.correlation_dimension`; `n_cells`, `share`, `kind`; `reason`, why
-        there is no dimension (`REASONS`); `stability`, `n_sampled`, `n_left`, `lifetime_low` of `identify`.
+        On the parameter dims and `attractor` (the attractors present in the selection): the variables of
+        `pipeline.analysis.chaos.dimensions.correlation_dimension`; `n_cells`, `share`, `kind`; `reason`, the
+        reason why there is no dimension (`REASONS`); `stability`, `n_sampled`, `n_left`, `lifetime_low` of
+        `identify`.
 
     Raises
     ------
     ValueError
-        If an axis or a value is not the cube's, an option is out of bounds, or `attractors` are those of
-        another cube.
+        If the cube lacks an axis or a value, an option is out of bounds, or `attractors` belong to another
+        cube.
     """
     options = options or DimensionOptions(**changes)
     part = select_points(ds, options.at)

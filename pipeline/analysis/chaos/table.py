@@ -1,4 +1,4 @@
-"""Tables of chaos and of correlation dimensions, an attractor each line."""
+"""Tabulate chaos and correlation dimensions, with a row per attractor and parameter point."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _TEST = ("median_zero_one", "least_zero_one", "largest_zero_one")
 
 
 def chaos_table(ds: xr.Dataset) -> Table:
-    """Table with a row per attractor and parameter point: exponents, multipliers, dimensions, 0-1 test."""
+    """Return the table of exponents, multipliers, dimensions and 0-1 test per attractor and point."""
     rows = _rows(ds)
     dims, _ = split_dims(ds["motion"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
@@ -78,7 +78,7 @@ def _rows(ds: xr.Dataset) -> list[Row]:
 
 
 def _spectrum(one: xr.Dataset) -> Row:
-    """Exponents per unit time and per drive period, and multipliers."""
+    """Return the columns of exponents, per unit time and per drive period, and of multipliers."""
     frequency = float(one.coords["frequency"]) if "frequency" in one.coords else np.nan
     row: Row = {}
     for k in range(one.sizes["rank"]):
@@ -131,7 +131,7 @@ def _multipliers(row: Row) -> str:
 
 
 def _summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[str]:
-    """Where each motion occurs, extremes of the largest exponent, counts of flags."""
+    """Return lines on where each motion occurs, on the largest exponent, and on the flags."""
     table = []
     for nature in Nature:
         own = [row for row in rows if row["nature"] == nature.name.lower()]
@@ -153,7 +153,7 @@ def _summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[s
 
 
 def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[str]:
-    """Largest exponent of all attractors, with its place and in both units."""
+    """Return a line with the largest exponent of all attractors, in both units, and its place."""
     known = [row for row in rows if np.isfinite(row["lyapunov_1"])]
     if not known:
         return []
@@ -182,7 +182,7 @@ _OPEN = tuple(KINDS[code] for code in APERIODIC)
 
 
 def dimension_table(ds: xr.Dataset) -> Table:
-    """Table with a row per attractor and parameter point: its dimension, or why it has none."""
+    """Return the table of dimensions per attractor and point, with the reason if there is none."""
     rows = _dimension_rows(ds)
     dims = [str(d) for d in ds["reason"].dims if d != "attractor"]
     lines = ["correlation dimension of the sections of attractors that do not close"]

@@ -1,4 +1,4 @@
-"""The 0-1 test for chaos, on the sections of each cell."""
+"""Apply the 0-1 test for chaos to the sections of each cell."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pipeline.analysis.sets import Geometry
 from pipeline.products.reporting import report
 
 BUDGET = 64 * 2**20
-"""Bytes that a step of the 0-1 test holds at once."""
+"""Most memory of a step of the 0-1 test [bytes]."""
 
 SHORTEST = 200
-"""Fewest sections for the 0-1 test: lags reach a tenth of them, and ten lags call a period of 3 chaotic."""
+"""Fewest sections for the 0-1 test: lags reach a tenth of them, and with ten lags period 3 looks chaotic."""
 
 
 def zero_one_test(
@@ -27,31 +27,31 @@ def zero_one_test(
     seed: int = 0,
     geometry: Geometry | None = None,
 ) -> xr.Dataset:
-    """0-1 test for chaos on the sections of each cell: near 0 regular, near 1 chaotic.
+    """Apply the 0-1 test for chaos to the sections of each cell: near 0 regular, near 1 chaotic.
 
-    The sections' observable phi(1), ..., phi(N), its mean taken off, drives a walk in the plane,
-    ``z_c(n) = sum over j <= n of phi(j) exp(i c j)``. It stays bounded if the motion is regular and
+    An observable of the sections, phi(1), ..., phi(N) without its mean, drives a walk in the plane,
+    ``z_c(n) = sum over j <= n of phi(j) exp(i c j)``. The walk stays bounded if the motion is regular, and
     diffuses if it is chaotic. K_c is the correlation of the mean square displacement
     ``D_c(n) = mean over j of |z_c(j + n) - z_c(j)|**2`` with n for n up to N/10, and K its median over
     random c in (pi/5, 4 pi/5) (Gottwald and Melbourne, SIAM J. Appl. Dyn. Syst. 8, 129, 2009, the
-    correlation method). They subtract from the displacement the oscillating term
-    ``mean(phi)**2 (1 - cos n c)/(1 - cos c)``; of an observable without mean it is 0.
+    correlation method). They subtract the oscillating term ``mean(phi)**2 (1 - cos n c)/(1 - cos c)`` from
+    the displacement; it is 0 for an observable without mean.
 
     Parameters
     ----------
     ds
         Cube with `section` (and `status`), all sections loaded at once.
     state
-        Observable: a state, an angle by its sine and cosine along which it varies most. None: the
-        combination of all scaled states that varies most (their first principal component).
+        State to observe. For an angle, the observable is the combination of its sine and cosine that varies
+        most. By default, the first principal component of all scaled states.
     n_frequencies
-        Number of c, 10 or more.
+        Number of frequencies c, 10 or more.
     stride
-        Use every so many-th section; against oversampling, see below.
+        Use every `stride`-th section, against oversampling; see the notes.
     seed
-        Of the c, which are the same for all cells.
+        Seed of the frequencies c, which are the same for all cells.
     geometry
-        Of the states; by default that of the cube's model.
+        Geometry of the states, by default from the cube's model.
 
     Returns
     -------
@@ -72,12 +72,12 @@ def zero_one_test(
     -----
     * A few hundred sections tell closed orbits from strong chaos. Weak or intermittent chaos and orbits
       of long period need thousands; there K lies between 0 and 1, and `zero_one_half` is lower or higher.
-    * A signal sampled too often looks regular: K of a flow sampled at short times tends to 0 for chaos,
-      too. Sections are taken once per drive period, which is coarse unless the drive is fast against the
-      motion. `oversampling` above 10 says so; `stride` is the remedy.
-    * Some c resonate with a regular motion and have K_c = 1. The median does not see them unless they
-      are half of all.
-    * Sections that lie within 1e-6 of each other are one point, K = 0: the test would find the noise
+    * A signal sampled too often looks regular: K of a flow sampled at short times tends to 0 even for chaos.
+      Sections are taken once per drive period, which is coarse unless the drive is fast against the motion.
+      `oversampling` above 10 indicates the problem; `stride` is the remedy.
+    * Some frequencies c resonate with a regular motion and have K_c = 1. The median ignores them unless
+      they are half of all.
+    * Sections within 1e-6 of each other count as one point with K = 0: the test would measure the noise
       of the integration. A transient that has not died out counts as part of the motion.
     """
     geometry = geometry_of(ds, geometry)
@@ -130,12 +130,12 @@ def _number(ds: xr.Dataset, state: str) -> int:
 
 
 def _observable(section: Floats, state: int | None, geometry: Geometry) -> Floats:
-    """One number per section, shape (cell, n), without mean; 0 where the sections are one point."""
+    """Return the observable without its mean, shape (cell, n); 0 where the sections are one point."""
     columns = range(section.shape[-1]) if state is None else [state]
     lines = []
     for i in columns:
         x, scale = section[..., i], geometry.scales[i]
-        # an angle on its circle in the plane: no jump where it passes pi
+        # sine and cosine do not jump where an angle passes pi
         lines += [np.cos(x) / scale, np.sin(x) / scale] if geometry.is_angle[i] else [x / scale]
     points = np.stack(lines, axis=-1)
     points = points - points.mean(axis=1, keepdims=True)
@@ -148,7 +148,7 @@ def _observable(section: Floats, state: int | None, geometry: Geometry) -> Float
 
 
 def _zero_one(phi: Floats, c: Floats) -> Floats:
-    """Rows of the measures of `zero_one_test`, for each observable (cell, n)."""
+    """Compute the six measures of `zero_one_test` for observables (cell, n), shape (6, cell)."""
     n = phi.shape[1]
     k = np.sort(_growth(phi, c), axis=1)
     half = np.full(len(phi), np.nan)
@@ -166,7 +166,7 @@ def _zero_one(phi: Floats, c: Floats) -> Floats:
 
 
 def _growth(phi: Floats, c: Floats) -> Floats:
-    """K_c of each observable and frequency, shape (cell, c); 0 where the observable is 0."""
+    """Compute K_c of each observable and frequency, shape (cell, c); 0 where the observable is 0."""
     n = phi.shape[1]
     n_cut = n // 10
     walk = np.cumsum(phi[:, None, :] * np.exp(1j * c[:, None] * np.arange(1, n + 1)), axis=-1)
@@ -179,9 +179,10 @@ def _growth(phi: Floats, c: Floats) -> Floats:
 
 
 def _displacement(walk: npt.NDArray[np.complex128], n_cut: int) -> Floats:
-    """Mean of ``|z(j + lag) - z(j)|**2`` over the first n - n_cut j, for lags 1 to `n_cut` (last axis).
+    """Compute the mean of ``|z(j + lag) - z(j)|**2`` over the first n - n_cut j, for lags 1 to `n_cut`.
 
-    The square is multiplied out: sums of squares, and a correlation by Fourier transform.
+    The lags are on the last axis. The expanded square gives sums of squares and a correlation, which is
+    computed by Fourier transform.
     """
     n = walk.shape[-1]
     length = fft.next_fast_len(n)  # j + lag never goes beyond n
