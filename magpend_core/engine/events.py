@@ -148,7 +148,7 @@ def may_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
 
 
 def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
-    """Zero in [0, right] of the cubic with values `a` >= 0, `b` and slopes `da`, `db` at 0 and 1."""
+    """Return the zero in [0, right] of the cubic with values `a` >= 0, `b` and end slopes `da`, `db`."""
     c3 = 2.0 * (a - b) + (da + db)
     c2 = multiply_add(3.0, b - a, -(da + da) - db)
     left = 0.0 * right
@@ -180,7 +180,7 @@ def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
 
 
 def pair(w: Any, row: int, k: int) -> Any:
-    """Value and rate of event `k` in rows that begin at `row`."""
+    """Return value and rate of event `k` in rows that begin at `row`."""
     return load(w, row + 2 * k * WIDTH), load(w, row + (2 * k + 1) * WIDTH)
 
 

@@ -283,7 +283,7 @@ def unrolled_stages(system: System) -> Callable[..., None]:
 
 
 def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
-    """Mean square of the scaled error estimate of the attempt."""
+    """Return the mean square of the scaled error estimate of the attempt."""
     total = 0.0 * load(w, base + ROWS.step)
     for i in range(N_CONTROLLED):
         row = base + i * WIDTH
@@ -472,7 +472,7 @@ def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> i
 
 
 def in_bounds(w: Any, base: int, lane: int) -> bool:
-    """Whether no state of a lane has escaped or is NaN."""
+    """Tell whether all states of a lane are finite and within bounds."""
     for i in range(N):
         if not abs(w[base + ROWS.state + i * WIDTH + lane]) <= ESCAPE[i]:
             return False
@@ -593,7 +593,7 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, 
 
 
 def has_failed(status: int) -> bool:
-    """Whether a cell's sections are not to be used."""
+    """Tell whether a cell's sections must not be used."""
     return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW or status == ENDS_IN_CHATTER
 
 

@@ -103,7 +103,7 @@ def mode_bindings(system: System) -> dict[str, Any]:
 
 
 def lane_pairs(w: Any, base: int, lane: int, dy: Any) -> Any:
-    """Values and rates of a lane's events, for any rates `dy` of its states."""
+    """Return values and rates of a lane's events, for any rates `dy` of its states."""
     y = lane_states(w, base + ROWS.state + lane)
     c = lane_constants(w, base + ROWS.constants + lane)
     level = w[base + ROWS.level + lane] if HAS_SECTION else 0.0
@@ -111,7 +111,7 @@ def lane_pairs(w: Any, base: int, lane: int, dy: Any) -> Any:
 
 
 def lane_rates(w: Any, base: int, lane: int) -> Any:
-    """Rates of a lane's states."""
+    """Return the rates of a lane's states."""
     c = lane_constants(w, base + ROWS.constants + lane)
     u = forcing(w[base + ROWS.time + lane], c)
     return rhs(lane_states(w, base + ROWS.state + lane), u, c)
@@ -138,13 +138,13 @@ def gradient_along(w: Any, base: int, lane: int, k: int, vector: Any) -> float:
 
 
 def switch_rate(w: Any, base: int, lane: int, k: int, side: float) -> float:
-    """Rate of switch `k` with the right-hand side of one side."""
+    """Return the rate of switch `k` with the right-hand side of one side."""
     w[base + ROWS.constants + (N_OWN + k) * WIDTH + lane] = side
     return lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * k + 1]
 
 
 def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
-    """Mode of switch `k` after its event."""
+    """Return the mode of switch `k` after its event."""
     if not SLIDES[k]:
         return -mode
     above, below = switch_rate(w, base, lane, k, 1.0), switch_rate(w, base, lane, k, -1.0)

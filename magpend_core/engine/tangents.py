@@ -1,4 +1,4 @@
-"""Tangent vectors of large systems: carried through the stages of a step by loops.
+"""Carry the tangent vectors of large systems through the stages of a step by loops.
 
 Templates for the engine, see `lanes`. For a small system the products of the Jacobian J and tangent vectors
 are written out in the right-hand side (see `variational.with_tangents`). For a large one the right-hand side

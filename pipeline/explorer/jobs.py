@@ -102,7 +102,7 @@ class Desk:
         self._closed = False
 
     def put(self, job: Job) -> None:
-        """Accept a job; cancel the waiting or running one."""
+        """Accept a job; it replaces the waiting and the running one."""
         job.answers_to(self._emit)
         with self._lock:
             if self._closed:

@@ -85,7 +85,7 @@ def _version() -> str:
 
 
 def _cells(run: ExploredRun) -> dict[str, int]:
-    """Count the cells: all, not yet computed, and failed."""
+    """Count the cells: all, not yet computed, and failed or diverged."""
     committed = sum(run.plan.cells_in(task) for task in run.commits)
     counts = np.zeros(1 + max(DIVERGED, *FAILED, PENDING), np.int64)
     if committed:
