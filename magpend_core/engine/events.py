@@ -1,4 +1,4 @@
-"""Events: zeros of functions along a trajectory on which a step must end.
+"""Detect events: zeros of functions along a trajectory, at which a step must end.
 
 Templates for the engine, see `lanes`. An attempted step that ends beyond a zero is taken back; the next
 attempt ends where the cubic through values and rates at both ends has its zero, and so on until an attempt
@@ -103,7 +103,7 @@ def _middle_of(n: int) -> Callable[..., Any]:
 
 
 def event_bindings(system: System) -> dict[str, Any]:
-    """Names that the templates of events use, for a system."""
+    """Return the names that the templates of events use, for a system."""
     of, direction = system.section or (0, 0)
     directions = [0.0] * system.n_switches + [float(d) for d in system.impact_directions]
     starts = [1.0] * system.n_switches + [-float(d) for d in system.impact_directions]

@@ -1,4 +1,4 @@
-"""The engine: many trajectories in step, each with its own time, step size and parameters.
+"""Integrate many trajectories in step, each with its own time, step size and parameters.
 
 Dormand and Prince's methods of order 5 or 8, with error control. Every trajectory owns a lane; `simd.WIDTH`
 lanes form a group, whose numbers lie row by row in one flat array (see `Rows`). One attempted step advances
@@ -241,7 +241,7 @@ def run_stage(w: Any, base: int, s: int) -> None:
 
 
 def run_stages(w: Any, base: int) -> None:
-    """Compute the states and slopes of all stages but the first, which is the last step's last."""
+    """Compute the states and slopes of all stages but the first, which the last step has computed."""
     for s in range(1, N_STAGES):
         run_stage(w, base, s)
 
@@ -409,7 +409,7 @@ def attempt(
 def load_cell(
     w: Any, base: int, lane: int, frequency: float, p: Any, slack: float, scratch: Any, edge_table: Any
 ) -> None:
-    """Give a lane the constants and edges of a cell; the state stays."""
+    """Give a lane the constants and edges of a cell; the lane's state stays."""
     constants(frequency, p, scratch)
     for i in range(N_OWN):
         w[base + ROWS.constants + i * WIDTH + lane] = scratch[i]

@@ -1,4 +1,4 @@
-"""What happens at events: switches turn, states jump, tangent vectors with them.
+"""Act on events: change switch modes, apply impacts to states and tangent vectors.
 
 Templates for the engine's scalar pass, see `lanes`; they run once per event, on plain numbers of one lane.
 
@@ -132,13 +132,13 @@ def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
 
 
 def gradient_along(w: Any, base: int, lane: int, k: int, vector: Any) -> float:
-    """Derivative of event `k`'s function along a change of the states."""
+    """Return the derivative of event `k`'s function along a change of the states."""
     at_rest = lane_pairs(w, base, lane, ZEROS)
     return lane_pairs(w, base, lane, vector)[2 * k + 1] - at_rest[2 * k + 1]
 
 
 def switch_rate(w: Any, base: int, lane: int, k: int, side: float) -> float:
-    """Return the rate of switch `k` with the right-hand side of one side."""
+    """Return the rate of switch `k` under the right-hand side of a given side."""
     w[base + ROWS.constants + (N_OWN + k) * WIDTH + lane] = side
     return lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * k + 1]
 
@@ -196,12 +196,12 @@ def begin_events(w: Any, base: int, lane: int) -> None:
 
 
 def contact_row(base: int, lane: int, k: int) -> int:
-    """Where the mode of the contact with the surface of impact `k` stands."""
+    """Return the row of the contact mode of impact `k`."""
     return base + ROWS.constants + (N_OWN + N_SWITCHES + k) * WIDTH + lane
 
 
 def bend(w: Any, base: int, lane: int, event: int) -> float:
-    """Second time derivative of an event's value along the motion, by a difference."""
+    """Return the second time derivative of an event's value along the motion, by a difference."""
     step = LOOK * w[base + ROWS.period + lane]
     y, t = lane_states(w, base + ROWS.state + lane), w[base + ROWS.time + lane]
     dy = lane_rates(w, base, lane)
@@ -350,7 +350,7 @@ def set_units(w: Any, base: int, lane: int) -> None:
 
 
 def log_volume(w: Any, at: int) -> float:
-    """Logarithm of the absolute determinant of the N_BASE vectors in rows from `at`, which are used up."""
+    """Return log |det| of the N_BASE vectors in rows from `at`; overwrites the vectors."""
     total, n = 0.0, N_BASE
     for j in range(n):
         best = j

@@ -50,7 +50,7 @@ class Settings(NamedTuple):
 
 
 def window_of(max_orbit_period: int) -> int:
-    """Sections that are looked at to say whether an orbit closes."""
+    """Return the number of sections examined to tell whether an orbit closes."""
     return max(64, 4 * max_orbit_period)
 
 
@@ -183,7 +183,7 @@ def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -
 
 
 def _smallest_divisor(ring: Any, last: int, half: int, p: int, settings: Settings) -> int:
-    """Smallest divisor of `p` that is a period too.
+    """Return the smallest divisor of `p` that is a period too.
 
     Near a slow spiral, sections p apart can settle before successive ones do. All of the younger
     half lie within a few tolerances of the orbit, so ten of them tell the periods apart.

@@ -124,7 +124,7 @@ class DescribedModel(Model):
 
     @cached_property
     def system(self) -> System:
-        """Refused: what a person has not named is not imported."""
+        """Raise: a described model has no object that could be integrated."""
         assert self.text is not None
         path = self.text[KEY]
         known = _imported.get(path)

@@ -54,7 +54,7 @@ class TextModel(Model):
 
     @property
     def reference(self) -> str | Mapping[str, Any]:
-        """Its name if it ships, else its text."""
+        """Return the model's name if it ships, else its text."""
         return self.name if self.shipped else self.definition.table
 
     @cached_property
