@@ -68,7 +68,7 @@ class PeriodicOrbits:
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """Where section points come back to, one per row.
+    """The images of section points, one per row.
 
     Attributes
     ----------

@@ -154,7 +154,7 @@ def _points(system: System, drive: Drive, packed: np.ndarray, part: slice) -> tu
 
 
 class _Walk:
-    """Where the branches are, and what was seen on the way."""
+    """The current states of the branches, and the results so far."""
 
     def __init__(
         self, system: System, packed: np.ndarray, initial: np.ndarray, marks: np.ndarray, settings: Settings,

@@ -226,7 +226,7 @@ class _Functions:
         return tuple(out)
 
     def has_values(self, frequency: np.float64, p: np.ndarray) -> bool:
-        """Whether a cell lies at no pole of the constants."""
+        """Tell whether a cell lies at no pole of the constants."""
         return not self.system.has_poles or bool(np.isfinite(self.constants(frequency, p)).all())
 
     def edges(self, frequency: np.float64, p: np.ndarray) -> np.ndarray:

@@ -318,7 +318,7 @@ def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
 
 
 def section_counts(w: Any, base: int, lane: int) -> bool:
-    """Whether a zero is a crossing of the section: an angle's sine has another half a turn away."""
+    """Tell whether a zero is a section crossing: an angle's sine has another zero half a turn away."""
     if w[base + ROWS.fired + (N_EVENTS - 1) * WIDTH + lane] < 0.5:
         return False
     if not IS_ANGLE[SECTION_OF]:

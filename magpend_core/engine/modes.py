@@ -217,7 +217,7 @@ def bend(w: Any, base: int, lane: int, event: int) -> float:
 
 
 def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
-    """Whether an impact, at the speed `arriving`, is one of infinitely many that end within a moment."""
+    """Tell whether an impact, at speed `arriving`, begins an infinite sequence that ends within a moment."""
     event = N_SWITCHES + k
     leaving = -DIRECTIONS[event] * lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * event + 1]
     if not (abs(leaving) < arriving and leaving > -ELASTIC * arriving):

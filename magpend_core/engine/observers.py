@@ -39,7 +39,7 @@ FIRST_TURN = 1
 
 
 class Settings(NamedTuple):
-    """What the recording observers need to know."""
+    """The settings of the recording observers."""
 
     n_transient: int
     n_keep: int

@@ -47,7 +47,7 @@ def n_entries(system: System) -> int:
 
 
 def _has_trace(system: System) -> bool:
-    """Whether a last state integrates the trace of the Jacobian."""
+    """Tell whether a last state integrates the trace of the Jacobian."""
     return system.state_names[-1] == DIVERGENCE
 
 

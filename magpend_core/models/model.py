@@ -1,4 +1,4 @@
-"""What a model is, for everyone above the engine. Imports no compiler: a model describes itself without it.
+"""Define a model for all code above the engine. Imports no compiler.
 
 A model names its states and parameters, its presets with their provenance, and the system that the engine
 integrates. It may bring more: quantities of state and time, a classifier of motions with its words, a
@@ -122,7 +122,7 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Drawing:
-    """What a model looks like, for portraits and animations.
+    """A model's appearance, for portraits and animations.
 
     Attributes
     ----------

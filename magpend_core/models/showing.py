@@ -1,4 +1,4 @@
-"""What a model is in the end: what was found in its equations, and whether they hold what they promise."""
+"""Describe a model: the features found in its equations, and the results of the checks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def checks_of(model: Model) -> list[str]:
 
 @dataclass(frozen=True)
 class Description:
-    """What `describe` finds.
+    """The result of `describe`.
 
     Attributes
     ----------

@@ -13,7 +13,7 @@ from magpend_core.validation import check_states
 
 
 class Torques(NamedTuple):
-    """What acts on the pendulum at a state.
+    """The loads on the pendulum at a state.
 
     Attributes
     ----------
