@@ -1,4 +1,4 @@
-"""Physics and kernels of magpend: forced systems of ordinary differential equations, many at a time.
+"""Integrate forced systems of ordinary differential equations, many trajectories at a time.
 
 Names are found where they are defined when they are first used, so that codes, parameters and models can be
 read without the compiler.

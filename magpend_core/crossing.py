@@ -1,4 +1,4 @@
-"""A section by crossing: where the trajectories of a flow without a drive are looked at."""
+"""Define a section by crossing, where trajectories of a flow without a drive are sampled."""
 
 from __future__ import annotations
 
@@ -60,17 +60,17 @@ class Crossing:
 
     @property
     def sign(self) -> int:
-        """+1 where the level is crossed upwards, -1 downwards."""
+        """Return +1 if the level is crossed upwards, -1 if downwards."""
         return DIRECTIONS[self.direction]
 
     @property
     def frequency_hz(self) -> float:
-        """What the engine takes for the drive's frequency: one over the longest wait [Hz]."""
+        """Return the value passed as the drive frequency: one over the longest wait [Hz]."""
         return 1.0 / float(self.longest)
 
     @property
     def sentence(self) -> str:
-        """Where it lies, in words."""
+        """Describe the section in words."""
         return f"{self.of} = {self.value:g} going {self.direction}"
 
     def applied(self, parameters: np.ndarray, system: System) -> tuple[System, np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Equilibria of flows: Newton's method on the rates, with the eigenvalues of their Jacobian."""
+"""Find equilibria of flows by Newton's method, with the eigenvalues of the Jacobian."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class Equilibria:
 
     @property
     def is_stable(self) -> np.ndarray:
-        """Whether all eigenvalues have negative real parts."""
+        """Tell whether all eigenvalues have negative real parts."""
         return np.asarray(self.eigenvalues.real.max(axis=1) < 0.0)
 
 
 def newton_steps(system: System, states: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Newton steps to an equilibrium, and the Jacobians, at states with common parameters.
+    """Return Newton steps to an equilibrium, and the Jacobians, at states with common parameters.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""More sections of cells that have some: integrated on from the last one, with the bits of a longer run."""
+"""Extend the sections of cells from the last one, bit for bit like a longer run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def more_sections(
     system: System,
     quantities: Sequence[str] | None = None,
 ) -> Sections:
-    """Sections of the drive periods that follow the last one that is known.
+    """Return the sections of the drive periods that follow the last known one.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def more_sections(
 def orbit_periods(
     sections: np.ndarray, *, closure_tolerance: float, max_orbit_period: int, system: System
 ) -> np.ndarray:
-    """Period of the orbit on which each cell closes, 0 if on none: what `run_branches` says at its end.
+    """Return the period of the orbit on which each cell closes, 0 if none, as `run_branches` does.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def orbit_periods(
 
 
 def judge(rings: Any, last: int, settings: Settings, found: Any) -> None:
-    """Look at each ring of sections for the orbit on which it closes."""
+    """Find the orbit on which each ring of sections closes."""
     for i in range(len(rings)):
         found[i] = closed_period(rings[i], last, settings)
 

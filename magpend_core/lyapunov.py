@@ -1,4 +1,4 @@
-"""Lyapunov exponents of many trajectories, by the variational equations inside the engine.
+"""Estimate Lyapunov exponents of many trajectories by the variational equations inside the engine.
 
 Method of Benettin, Galgani, Giorgilli and Strelcyn, Meccanica 15 (1980) 9-30: tangent vectors are carried
 along by the analytic Jacobian and made orthonormal again (QR by modified Gram-Schmidt) at set times; the
@@ -131,7 +131,7 @@ def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
 def _average(
     section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: Any
 ) -> int:
-    """Add each period to its block, a row of the record, and with its weight to the measures."""
+    """Add each period to its block (a row of the record), and its weighted value to the measures."""
     n_vectors = N_TANGENTS // N_BASE
     i = i_period - settings.n_transient
     n_periods = settings.n_blocks * settings.periods_per_block
@@ -282,7 +282,7 @@ def lyapunov_exponents(
 
 
 def _parts(n_cells: int, per_cell: int, n_lanes: int) -> list[slice]:
-    """Split cells into parts that are integrated one after the other, each with few enough numbers."""
+    """Split cells into parts that are integrated in turn, each of limited size."""
     most = max(n_lanes, MOST_NUMBERS // per_cell // n_lanes * n_lanes)
     return [slice(i, i + most) for i in range(0, max(n_cells, 1), most)]
 

@@ -1,4 +1,4 @@
-"""What sources mean, as a digest: results carry it, so that they can be compared with what would be computed.
+"""Compute digests of source code, so that stored results can be compared with the current code.
 
 Two sources mean the same if they differ in comments, docstrings, layout, or the wording of errors alone. A
 run that was begun with one is completed with the other.
@@ -18,7 +18,7 @@ _WITHOUT_MEANING = ("type_comment", "kind", "ctx")
 
 
 def meaning_digest(paths: Iterable[Path]) -> str:
-    """Digest of what Python sources do, whatever is said about it and where they lie.
+    """Return a digest of what Python sources do, independent of comments, docstrings and location.
 
     Left out are comments, docstrings and other bare strings, layout and line numbers, and what errors say
     (their types count). Names count, and so does the order of statements.
@@ -54,7 +54,7 @@ def meaning_digest(paths: Iterable[Path]) -> str:
 
 @cache
 def kernel_version() -> str:
-    """Digest of the numerical core without its models: what stored results carry as ``kernel_version``.
+    """Return the digest of the numerical core without its models, stored as ``kernel_version``.
 
     It follows the meaning of the sources (see `meaning_digest`): an edited sentence bars nobody from
     completing a run.
@@ -98,7 +98,7 @@ def _write(node: object, out: list[str]) -> None:
 
 
 def _is_remark(node: object) -> bool:
-    """Whether a statement does nothing: a docstring, another bare string, ``pass`` or ``...``."""
+    """Tell whether a statement does nothing: a docstring, another bare string, ``pass`` or ``...``."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return isinstance(node.value.value, str) or node.value.value is ...
     return isinstance(node, ast.Pass)

@@ -1,4 +1,4 @@
-"""What Floquet multipliers say of an orbit's Lyapunov exponents."""
+"""Convert Floquet multipliers of an orbit to Lyapunov exponents."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def orbit_exponents(multipliers: np.ndarray, seconds: float, is_flow: bool = False) -> np.ndarray:
-    """Lyapunov exponents of a periodic orbit from its Floquet multipliers [1/s], in falling order.
+    """Return a periodic orbit's Lyapunov exponents [1/s], in falling order, from its multipliers.
 
     Parameters
     ----------

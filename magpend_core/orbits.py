@@ -1,4 +1,4 @@
-"""Periodic orbits: Newton's method on the stroboscopic map or the return map, with Floquet multipliers.
+"""Find periodic orbits by Newton's method on the stroboscopic or return map, with multipliers.
 
 The return map of a flow takes a point of a section by crossing to its next crossing. With the flow's
 monodromy matrix Phi over that time, its rates f at the image, and the normal n of the section, its derivative
@@ -62,13 +62,13 @@ class PeriodicOrbits:
 
     @property
     def is_stable(self) -> np.ndarray:
-        """Whether all multipliers lie inside the unit circle."""
+        """Tell whether all multipliers lie inside the unit circle."""
         return np.asarray(np.abs(self.multipliers).max(axis=1) < 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """Where section points come back to, one per row.
+    """The images of section points, one per row.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ def section_map(
     rtol: float = RTOL,
     system: System = PENDULUM_FITTED,
 ) -> Returns:
-    """Follow section points for some periods, with the derivatives of where they arrive.
+    """Follow section points for some periods, with the derivatives of their images.
 
     Parameters
     ----------
@@ -158,12 +158,12 @@ def stroboscopic_map(
 
 
 def crossed_state(system: System) -> int | None:
-    """Number of the state whose crossings are the section; None if that is at a drive's period."""
+    """Return the number of the state whose crossings define the section; None for a driven system."""
     return None if system.section is None else system.section[0]
 
 
 def on_section(points: np.ndarray, parameters: np.ndarray, system: System) -> np.ndarray:
-    """Return points with the state that crosses at its level; as they are at a drive's period.
+    """Return points with the crossing state set to its level; unchanged for a driven system.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def on_section(points: np.ndarray, parameters: np.ndarray, system: System) -> np
 
 
 def on_section_derivative(monodromy: np.ndarray, slopes: np.ndarray, crossed: int) -> np.ndarray:
-    """Derivative of the return map from that of the flow over the same time.
+    """Return the derivative of the return map, from the flow's derivative over the same time.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def on_section_derivative(monodromy: np.ndarray, slopes: np.ndarray, crossed: in
 
 
 def wrap_angles(states: np.ndarray, system: System = PENDULUM_FITTED) -> np.ndarray:
-    """Bring the angles among states (or differences of states) to (-pi, pi]."""
+    """Wrap the angles among states (or differences of states) to (-pi, pi]."""
     wrapped = np.array(states, dtype=np.float64)
     angles = np.asarray(system.is_angle)
     values = wrapped[..., angles]
@@ -212,7 +212,7 @@ def wrap_angles(states: np.ndarray, system: System = PENDULUM_FITTED) -> np.ndar
 
 
 def scaled_distance(a: np.ndarray, b: np.ndarray, system: System = PENDULUM_FITTED) -> np.ndarray:
-    """Largest difference between states in units of the system's scales, angles on their circle."""
+    """Return the largest scaled difference between states, with angles on their circle."""
     difference = np.abs(wrap_angles(np.asarray(a) - np.asarray(b), system)) / np.asarray(system.scales)
     return np.asarray(difference.max(axis=-1))
 
@@ -345,7 +345,7 @@ def _newton_steps(derivatives: np.ndarray, mismatch: np.ndarray, system: System)
 
 
 def _least_period(orbit: np.ndarray, tolerance: float, system: System) -> int:
-    """Smallest divisor of the period after which the orbit is back.
+    """Return the smallest divisor of the period after which the orbit closes.
 
     Images of a point that is off by the tolerance differ by a multiple of it along the orbit.
     """

@@ -1,4 +1,4 @@
-"""What a model says at given states and times: rates, their Jacobian, named quantities."""
+"""Evaluate a model at given states and times: rates, their Jacobian, named quantities."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _named(t: Any, y: Any, c: Any) -> Any:
 
 
 def _set_modes(t: float, y: Any, rows: Any, lane: int, edge_times: Any) -> None:
-    """Put one lane's modes where its state and the time are: switches by their signs, no sliding."""
+    """Set one lane's switch modes from its state and time, without sliding."""
     for k in range(N_OWN, NC):
         rows[k * WIDTH + lane] = 1.0
     if HAS_SWITCHES:
@@ -150,7 +150,7 @@ def evaluate_packed(
     frequency_hz: float,
     out: np.ndarray,
 ) -> None:
-    """Fill `out` with all quantities of a system, for callers that have checked what they give.
+    """Fill `out` with all quantities of a system; the caller has checked the arguments.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def evaluate_packed(
 
 
 def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
-    """Rates of a flow at many finite states with common parameters, for callers that have checked them.
+    """Return a flow's rates at many finite states with common, already checked parameters.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarr
 
 
 def jacobian_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
-    """Jacobians of `rates_at`, shape (n, n_states, n_states)."""
+    """Return the Jacobians of `rates_at`, shape (n, n_states, n_states)."""
     return whole_jacobian(system, _flow_at("jacobian", len(places_of(system)), system, states, packed))
 
 
@@ -206,7 +206,7 @@ def _flow_at(kind: str, n_out: int, system: System, states: np.ndarray, packed: 
 def rates_packed(
     system: System, states: np.ndarray, packed: np.ndarray, frequency_hz: np.ndarray
 ) -> np.ndarray:
-    """Rates of a flow at many states, each with parameters of its own, for callers that have checked them.
+    """Return a flow's rates at many states, each with its own, already checked parameters.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def rates_packed(
 
 
 def rates(t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
-    """Time derivatives of the states.
+    """Return the time derivatives of the states.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ def rates(t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np
 
 
 def drive_level(t: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
-    """Forcing at given times, in the unit of the model's own.
+    """Return the forcing at given times, in the model's unit.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def drive_level(t: Any, parameters: Parameters, frequency_hz: float) -> np.ndarr
 
 
 def jacobian(t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
-    """Analytic Jacobian of `rates`: entry [i, j] is the derivative of the rate of state i by state j.
+    """Return the Jacobian of `rates`: entry [i, j] is the derivative of rate i by state j.
 
     Parameters
     ----------
@@ -310,7 +310,7 @@ def jacobian(t: Any, state: Any, parameters: Parameters, frequency_hz: float) ->
 def evaluate(
     names: Sequence[str], t: Any, state: Any, parameters: Parameters, frequency_hz: float
 ) -> np.ndarray:
-    """Named quantities of the model, such as an energy or a torque.
+    """Return named quantities of the model, for example an energy or a torque.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Sections and quantities under a recorded drive: its intervals are points that a branch walks through.
+"""Compute sections and quantities under a recorded drive, whose intervals are points of a branch.
 
 A branch of `engine.entry.integrate` goes from point to point with its state and its step, and each point has
 a drive frequency and parameters of its own. That is a recorded drive: an interval is a period of its own
@@ -30,12 +30,12 @@ CHUNK_NUMBERS = 4_000_000
 
 
 def driven_system(system: System, drive: Drive) -> System:
-    """Return the system that follows a drive: its own, or that with a recorded forcing."""
+    """Return the system for a drive: its own, or one with a recorded forcing."""
     return with_recorded_drive(system) if LEVEL in drive.names else system
 
 
 def _padded(packed: np.ndarray, system: System) -> np.ndarray:
-    """Parameters with a place for those that the recorded drive brings."""
+    """Return parameters with room for those that the recorded drive sets."""
     more = len(system.parameter_names) - packed.shape[-1]
     return np.pad(packed, [(0, 0)] * (packed.ndim - 1) + [(0, more)])
 
@@ -58,7 +58,7 @@ def recorded_sections(
     quantities: Sequence[str] | None = None,
     n_points: int | None = None,
 ) -> Sections:
-    """Sections of many trajectories under one recorded drive, from its start.
+    """Return the sections of many trajectories under one recorded drive, from its start.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def _chunks(first_kept: int, last: int, most: int) -> Iterator[tuple[int, int]]:
 
 
 def _points(system: System, drive: Drive, packed: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters and frequency of each interval for each branch."""
+    """Return parameters and frequency of each interval for each branch."""
     durations = drive.durations_s[part]
     shape = (len(packed), len(durations))
     points = np.repeat(packed[:, None], len(durations), axis=1)
@@ -154,7 +154,7 @@ def _points(system: System, drive: Drive, packed: np.ndarray, part: slice) -> tu
 
 
 class _Walk:
-    """Where the branches are, and what was seen on the way."""
+    """The current states of the branches, and the results so far."""
 
     def __init__(
         self, system: System, packed: np.ndarray, initial: np.ndarray, marks: np.ndarray, settings: Settings,
@@ -174,7 +174,7 @@ class _Walk:
             raise ValueError(f"parameters has {len(packed)} rows; initial_states has {n}.")
 
     def take(self, cells: Cells, first: int) -> None:
-        """Take over what the engine says of the intervals from number `first` on."""
+        """Store the engine's results of the intervals from number `first` on."""
         alive, n = self.alive, cells.status.shape[1]
         good = np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED))
         number = np.searchsorted(self.marks, np.arange(first, first + n))
@@ -198,7 +198,7 @@ class _Walk:
         self.alive = alive[~failed]
 
     def outcome(self, with_extremes: bool) -> Sections:
-        """What became of the branches."""
+        """Return the result of the branches."""
         failed = self.status != Status.BOUNDED
         self.seen[failed], self.watched[failed], self.turns[failed] = np.nan, np.nan, 0
         period = np.zeros(len(failed), np.int64)
@@ -223,7 +223,7 @@ class _Walk:
 
 
 def closed_periods(sections: np.ndarray, settings: Settings, system: System) -> np.ndarray:
-    """Period at which each row of sections closes, 0 where it does not; see `observers.closed_period`.
+    """Return the period at which each row of sections closes, 0 if none; see `observers.closed_period`.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def recorded_trajectory(
     atol: float = 1e-8,
     max_steps_per_interval: int = 1_000_000,
 ) -> np.ndarray:
-    """States of one trajectory on a time grid, under a recorded drive.
+    """Return the states of one trajectory on a time grid, under a recorded drive.
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ def recorded_trajectory(
 def evaluate_recorded(
     names: Sequence[str], t: np.ndarray, state: np.ndarray, parameters: Parameters, drive: Drive
 ) -> np.ndarray:
-    """Named quantities of the model under a recorded drive, each instant in its own interval.
+    """Return named quantities under a recorded drive, each instant in its own interval.
 
     Parameters
     ----------

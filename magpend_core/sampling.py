@@ -1,4 +1,4 @@
-"""Many trajectories at the instants of recordings, under recorded drives: what fits are made of."""
+"""Sample many trajectories at the instants of recordings, under recorded drives, for fits."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Drive:
     def from_edges(
         cls, rising_s: np.ndarray, falling_s: np.ndarray, *, name: str = "duty_cycle", start_s: float = 0.0
     ) -> Drive:
-        """Drive whose periods lie between measured rising edges.
+        """Make a drive whose periods lie between measured rising edges.
 
         Parameters
         ----------
@@ -77,7 +77,7 @@ class Drive:
 
     @classmethod
     def from_torque(cls, times_s: np.ndarray, values: np.ndarray) -> Drive:
-        """Drive whose measured values are joined by lines, for `with_recorded_drive`.
+        """Make a drive that interpolates measured values linearly, for `with_recorded_drive`.
 
         Parameters
         ----------
@@ -154,7 +154,7 @@ def sample(
     max_steps_per_interval: int = 1_000_000,
     n_lanes: int = N_LANES,
 ) -> Samples:
-    """States of many trajectories at the instants of recordings.
+    """Return the states of many trajectories at the instants of recordings.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def _offsets(parts: Sequence[np.ndarray]) -> np.ndarray:
 def _drive_table(
     system: System, grids: list[np.ndarray], drives: Sequence[Drive | None] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Durations, values, first intervals, changed parameters and starts, as the engine takes them."""
+    """Return durations, values, first intervals, changed parameters and starts for the engine."""
     given = [None] * len(grids) if drives is None else list(drives)
     if len(given) != len(grids):
         raise ValueError(f"{len(given)} drives for {len(grids)} pieces; give one for each.")

@@ -1,4 +1,4 @@
-"""Sections of many trajectories, stroboscopic or by crossing: the door to the engine."""
+"""Compute sections of many trajectories, stroboscopic or by crossing, with the engine."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def run_branches(
     method: str | None = None,
     section: Crossing | None = None,
 ) -> Sections:
-    """Walk many branches through their points; each point starts where the one before ended.
+    """Integrate many branches through their points; each point starts where the previous one ended.
 
     A sweep is the case of one point per branch. All start at the drive's rising edge. The numbers of
     a branch depend on that branch alone, to the last bit: not on its neighbours, `n_lanes` or the
@@ -205,7 +205,7 @@ def sections(
     atol: float = 1e-8,
     **options: Any,
 ) -> Sections:
-    """Stroboscopic sections of many independent trajectories of one model.
+    """Return stroboscopic sections of many independent trajectories of one model.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Sizes that the engine, the models and the pipeline agree on."""
+"""Define the sizes shared by the engine, the models and the pipeline."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ vectors.
 
 
 def too_many_states(name: str, n_states: int) -> str | None:
-    """Return why a system can have no tangent vectors: it has too many states; None if it can."""
+    """Return why a system has too many states for tangent vectors; None if it has not."""
     if n_states <= MAX_STATES:
         return None
     return (

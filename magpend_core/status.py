@@ -1,4 +1,4 @@
-"""What became of a cell: one code, one sentence each."""
+"""Define the status of a cell: one code, one sentence each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Status(IntEnum):
 
     @property
     def sentence(self) -> str:
-        """What the code means and, where something went wrong, what to do."""
+        """Return the code's meaning and, for a failure, the remedy."""
         return _SENTENCES[self]
 
 

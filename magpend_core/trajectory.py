@@ -1,4 +1,4 @@
-"""Dense output of one trajectory: time series and portraits on a given time grid."""
+"""Compute dense output of one trajectory on a given time grid."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def desk_for(system: System) -> Desk:
 def prepare(
     w: Any, frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any
 ) -> None:
-    """Fill the rows of one group: the trajectory in lane 0, copies that stand still beside it."""
+    """Fill the rows of one group: the trajectory in lane 0, idle copies in the other lanes."""
     for lane in range(WIDTH):
         load_cell(w, 0, lane, frequency, p, slack, scratch, edge_table)
         for i in range(N):
@@ -164,7 +164,7 @@ def trajectory(
     atol: float = 1e-8,
     max_steps_per_period: int = 20_000,
 ) -> np.ndarray:
-    """States of one trajectory on a time grid, started at the drive's rising edge.
+    """Return the states of one trajectory on a time grid, started at the drive's rising edge.
 
     Parameters
     ----------

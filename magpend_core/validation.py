@@ -1,4 +1,4 @@
-"""Checks of numerical arguments: one clear error that names the argument, the value and the bound."""
+"""Check numerical arguments: each error names the argument, the value and the bound."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def check_array(name: str, values: Any, ndim: int | tuple[int, ...]) -> np.ndarr
 
 
 def _refuse_masks(name: str, values: Any) -> None:
-    """Refuse masked entries: what they hide is no number of theirs, and an array of float64 cannot say so."""
+    """Raise for masked entries: a float64 array cannot mark them as missing."""
     parts = values if isinstance(values, (list, tuple)) else [values]
     n_masked = sum(int(np.ma.getmaskarray(p).sum()) for p in parts if isinstance(p, np.ma.MaskedArray))
     if n_masked:
@@ -40,7 +40,7 @@ def _refuse_masks(name: str, values: Any) -> None:
 
 
 def check_times(values: Any, shape: tuple[int, ...], name: str = "t") -> np.ndarray:
-    """Return finite times as an array of a shape, to which a single one is spread.
+    """Return finite times as an array of a given shape; a single time is broadcast.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def check_count(name: str, value: Any, least: int) -> int:
 
 
 def check_flag(name: str, value: Any) -> bool:
-    """Return a truth value; texts such as ``"no"`` would count as true.
+    """Return a truth value; raise for texts, because ``"no"`` would count as true.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Whether a system is what it says: found out once, on plain numbers, before anything is compiled.
+"""Check a system against its declaration, once, on plain numbers, before compilation.
 
 The engine trusts its functions. One that returns a number too few reads what lies beside it; a wrong Jacobian
 gives wrong exponents, whose audit it passes; an edge outside of the period never comes. So the functions are
@@ -148,7 +148,7 @@ def _problems(
 
 
 def _declaration(system: System, linearised: bool) -> Iterator[str]:
-    """Problems of the fields that are no functions."""
+    """Return the problems of the fields that are not functions."""
     n, names = system.n_states, ", ".join(system.state_names)
     if not n:
         yield "state_names is empty; a system has one state at least."
@@ -220,13 +220,13 @@ class _Functions:
         return None
 
     def constants(self, frequency: np.float64, p: np.ndarray) -> tuple[np.float64, ...]:
-        """Constants of a cell."""
+        """Return the constants of a cell."""
         out = np.full(self.system.n_constants, np.nan)
         self.call("constants", frequency, p, out)
         return tuple(out)
 
     def has_values(self, frequency: np.float64, p: np.ndarray) -> bool:
-        """Whether a cell lies at no pole of the constants."""
+        """Tell whether a cell lies at no pole of the constants."""
         return not self.system.has_poles or bool(np.isfinite(self.constants(frequency, p)).all())
 
     def edges(self, frequency: np.float64, p: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Events: zeros of functions along a trajectory on which a step must end.
+"""Detect events: zeros of functions along a trajectory, at which a step must end.
 
 Templates for the engine, see `lanes`. An attempted step that ends beyond a zero is taken back; the next
 attempt ends where the cubic through values and rates at both ends has its zero, and so on until an attempt
@@ -103,7 +103,7 @@ def _middle_of(n: int) -> Callable[..., Any]:
 
 
 def event_bindings(system: System) -> dict[str, Any]:
-    """Names that the templates of events use, for a system."""
+    """Return the names that the templates of events use, for a system."""
     of, direction = system.section or (0, 0)
     directions = [0.0] * system.n_switches + [float(d) for d in system.impact_directions]
     starts = [1.0] * system.n_switches + [-float(d) for d in system.impact_directions]
@@ -148,7 +148,7 @@ def may_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
 
 
 def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
-    """Zero in [0, right] of the cubic with values `a` >= 0, `b` and slopes `da`, `db` at 0 and 1."""
+    """Return the zero in [0, right] of the cubic with values `a` >= 0, `b` and end slopes `da`, `db`."""
     c3 = 2.0 * (a - b) + (da + db)
     c2 = multiply_add(3.0, b - a, -(da + da) - db)
     left = 0.0 * right
@@ -180,7 +180,7 @@ def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
 
 
 def pair(w: Any, row: int, k: int) -> Any:
-    """Value and rate of event `k` in rows that begin at `row`."""
+    """Return value and rate of event `k` in rows that begin at `row`."""
     return load(w, row + 2 * k * WIDTH), load(w, row + (2 * k + 1) * WIDTH)
 
 
@@ -318,7 +318,7 @@ def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
 
 
 def section_counts(w: Any, base: int, lane: int) -> bool:
-    """Whether a zero is a crossing of the section: an angle's sine has another half a turn away."""
+    """Tell whether a zero is a section crossing: an angle's sine has another zero half a turn away."""
     if w[base + ROWS.fired + (N_EVENTS - 1) * WIDTH + lane] < 0.5:
         return False
     if not IS_ANGLE[SECTION_OF]:

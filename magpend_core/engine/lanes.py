@@ -1,4 +1,4 @@
-"""The engine: many trajectories in step, each with its own time, step size and parameters.
+"""Integrate many trajectories in step, each with its own time, step size and parameters.
 
 Dormand and Prince's methods of order 5 or 8, with error control. Every trajectory owns a lane; `simd.WIDTH`
 lanes form a group, whose numbers lie row by row in one flat array (see `Rows`). One attempted step advances
@@ -241,7 +241,7 @@ def run_stage(w: Any, base: int, s: int) -> None:
 
 
 def run_stages(w: Any, base: int) -> None:
-    """Compute the states and slopes of all stages but the first, which is the last step's last."""
+    """Compute the states and slopes of all stages but the first, which the last step has computed."""
     for s in range(1, N_STAGES):
         run_stage(w, base, s)
 
@@ -283,7 +283,7 @@ def unrolled_stages(system: System) -> Callable[..., None]:
 
 
 def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
-    """Mean square of the scaled error estimate of the attempt."""
+    """Return the mean square of the scaled error estimate of the attempt."""
     total = 0.0 * load(w, base + ROWS.step)
     for i in range(N_CONTROLLED):
         row = base + i * WIDTH
@@ -409,7 +409,7 @@ def attempt(
 def load_cell(
     w: Any, base: int, lane: int, frequency: float, p: Any, slack: float, scratch: Any, edge_table: Any
 ) -> None:
-    """Give a lane the constants and edges of a cell; the state stays."""
+    """Give a lane the constants and edges of a cell; the lane's state stays."""
     constants(frequency, p, scratch)
     for i in range(N_OWN):
         w[base + ROWS.constants + i * WIDTH + lane] = scratch[i]
@@ -472,7 +472,7 @@ def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> i
 
 
 def in_bounds(w: Any, base: int, lane: int) -> bool:
-    """Whether no state of a lane has escaped or is NaN."""
+    """Tell whether all states of a lane are finite and within bounds."""
     for i in range(N):
         if not abs(w[base + ROWS.state + i * WIDTH + lane]) <= ESCAPE[i]:
             return False
@@ -593,7 +593,7 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, 
 
 
 def has_failed(status: int) -> bool:
-    """Whether a cell's sections are not to be used."""
+    """Tell whether a cell's sections must not be used."""
     return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW or status == ENDS_IN_CHATTER
 
 

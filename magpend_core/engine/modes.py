@@ -1,4 +1,4 @@
-"""What happens at events: switches turn, states jump, tangent vectors with them.
+"""Act on events: change switch modes, apply impacts to states and tangent vectors.
 
 Templates for the engine's scalar pass, see `lanes`; they run once per event, on plain numbers of one lane.
 
@@ -103,7 +103,7 @@ def mode_bindings(system: System) -> dict[str, Any]:
 
 
 def lane_pairs(w: Any, base: int, lane: int, dy: Any) -> Any:
-    """Values and rates of a lane's events, for any rates `dy` of its states."""
+    """Return values and rates of a lane's events, for any rates `dy` of its states."""
     y = lane_states(w, base + ROWS.state + lane)
     c = lane_constants(w, base + ROWS.constants + lane)
     level = w[base + ROWS.level + lane] if HAS_SECTION else 0.0
@@ -111,7 +111,7 @@ def lane_pairs(w: Any, base: int, lane: int, dy: Any) -> Any:
 
 
 def lane_rates(w: Any, base: int, lane: int) -> Any:
-    """Rates of a lane's states."""
+    """Return the rates of a lane's states."""
     c = lane_constants(w, base + ROWS.constants + lane)
     u = forcing(w[base + ROWS.time + lane], c)
     return rhs(lane_states(w, base + ROWS.state + lane), u, c)
@@ -132,19 +132,19 @@ def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
 
 
 def gradient_along(w: Any, base: int, lane: int, k: int, vector: Any) -> float:
-    """Derivative of event `k`'s function along a change of the states."""
+    """Return the derivative of event `k`'s function along a change of the states."""
     at_rest = lane_pairs(w, base, lane, ZEROS)
     return lane_pairs(w, base, lane, vector)[2 * k + 1] - at_rest[2 * k + 1]
 
 
 def switch_rate(w: Any, base: int, lane: int, k: int, side: float) -> float:
-    """Rate of switch `k` with the right-hand side of one side."""
+    """Return the rate of switch `k` under the right-hand side of a given side."""
     w[base + ROWS.constants + (N_OWN + k) * WIDTH + lane] = side
     return lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * k + 1]
 
 
 def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
-    """Mode of switch `k` after its event."""
+    """Return the mode of switch `k` after its event."""
     if not SLIDES[k]:
         return -mode
     above, below = switch_rate(w, base, lane, k, 1.0), switch_rate(w, base, lane, k, -1.0)
@@ -196,12 +196,12 @@ def begin_events(w: Any, base: int, lane: int) -> None:
 
 
 def contact_row(base: int, lane: int, k: int) -> int:
-    """Where the mode of the contact with the surface of impact `k` stands."""
+    """Return the row of the contact mode of impact `k`."""
     return base + ROWS.constants + (N_OWN + N_SWITCHES + k) * WIDTH + lane
 
 
 def bend(w: Any, base: int, lane: int, event: int) -> float:
-    """Second time derivative of an event's value along the motion, by a difference."""
+    """Return the second time derivative of an event's value along the motion, by a difference."""
     step = LOOK * w[base + ROWS.period + lane]
     y, t = lane_states(w, base + ROWS.state + lane), w[base + ROWS.time + lane]
     dy = lane_rates(w, base, lane)
@@ -217,7 +217,7 @@ def bend(w: Any, base: int, lane: int, event: int) -> float:
 
 
 def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
-    """Whether an impact, at the speed `arriving`, is one of infinitely many that end within a moment."""
+    """Tell whether an impact, at speed `arriving`, begins an infinite sequence that ends within a moment."""
     event = N_SWITCHES + k
     leaving = -DIRECTIONS[event] * lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * event + 1]
     if not (abs(leaving) < arriving and leaving > -ELASTIC * arriving):
@@ -350,7 +350,7 @@ def set_units(w: Any, base: int, lane: int) -> None:
 
 
 def log_volume(w: Any, at: int) -> float:
-    """Logarithm of the absolute determinant of the N_BASE vectors in rows from `at`, which are used up."""
+    """Return log |det| of the N_BASE vectors in rows from `at`; overwrites the vectors."""
     total, n = 0.0, N_BASE
     for j in range(n):
         best = j

@@ -1,4 +1,4 @@
-"""What the engine does at each completed period: record, measure, decide.
+"""Observe each completed period: record, measure, decide.
 
 An observer is a pair of functions bound at compile time.
 
@@ -39,7 +39,7 @@ FIRST_TURN = 1
 
 
 class Settings(NamedTuple):
-    """What the recording observers need to know."""
+    """The settings of the recording observers."""
 
     n_transient: int
     n_keep: int
@@ -50,7 +50,7 @@ class Settings(NamedTuple):
 
 
 def window_of(max_orbit_period: int) -> int:
-    """Sections that are looked at to say whether an orbit closes."""
+    """Return the number of sections examined to tell whether an orbit closes."""
     return max(64, 4 * max_orbit_period)
 
 
@@ -115,7 +115,7 @@ class Observer:
 
     @property
     def rewrites(self) -> bool:
-        """Whether `renew` does anything."""
+        """Tell whether `renew` does anything."""
         return self.renew is not _leave
 
 
@@ -139,7 +139,7 @@ def _lag_distance(ring: Any, i: int, j: int, window: int) -> float:
 
 
 def closed_period(ring: Any, last: int, settings: Settings) -> int:
-    """Period of the orbit on which the last sections close, or 0.
+    """Return the period of the orbit on which the last sections close, or 0.
 
     For each candidate period p, the distances between sections p apart are split into an older and
     a younger half, with largest values D1 and D2. If they go on shrinking by r = D2/D1 per half
@@ -175,7 +175,7 @@ def closed_period(ring: Any, last: int, settings: Settings) -> int:
 
 
 def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -> float:
-    """Largest distance between sections `i` and ``i - p`` for first < i <= last."""
+    """Return the largest distance between sections `i` and ``i - p`` for first < i <= last."""
     largest = 0.0
     for i in range(first + 1, last + 1):
         largest = max(largest, _lag_distance(ring, i, i - p, settings.window))
@@ -183,7 +183,7 @@ def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -
 
 
 def _smallest_divisor(ring: Any, last: int, half: int, p: int, settings: Settings) -> int:
-    """Smallest divisor of `p` that is a period too.
+    """Return the smallest divisor of `p` that is a period too.
 
     Near a slow spiral, sections p apart can settle before successive ones do. All of the younger
     half lie within a few tolerances of the orbit, so ten of them tell the periods apart.

@@ -1,4 +1,4 @@
-"""Tangent vectors of large systems: carried through the stages of a step by loops.
+"""Carry the tangent vectors of large systems through the stages of a step by loops.
 
 Templates for the engine, see `lanes`. For a small system the products of the Jacobian J and tangent vectors
 are written out in the right-hand side (see `variational.with_tangents`). For a large one the right-hand side
@@ -47,7 +47,7 @@ def n_entries(system: System) -> int:
 
 
 def _has_trace(system: System) -> bool:
-    """Whether a last state integrates the trace of the Jacobian."""
+    """Tell whether a last state integrates the trace of the Jacobian."""
     return system.state_names[-1] == DIVERGENCE
 
 

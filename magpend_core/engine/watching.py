@@ -1,4 +1,4 @@
-"""Minimum, maximum and mean of named quantities over the periods that end in a kept section.
+"""Track minimum, maximum and mean of named quantities over the periods that end in a kept section.
 
 Templates for the engine, see `lanes`. After an accepted step each quantity is known at its begin, its
 middle (from the pair's continuous extension) and its end: the parabola through the three gives the

@@ -1,4 +1,4 @@
-"""The models that ship with magpend, and the door through which everyone else sees them.
+"""Load the models that ship with magpend, by name or as text.
 
 `load_model` finds a model by name, or reads what a run keeps of it. Nothing here imports the compiler.
 """
@@ -41,7 +41,7 @@ def _texts() -> dict[str, Path]:
 
 
 def model_names() -> tuple[str, ...]:
-    """Names of the models that ship; those that are text are not read for it."""
+    """Return the names of the shipped models, without reading text models."""
     return (*_models(), *_texts())
 
 
@@ -141,12 +141,12 @@ def load_preset(name: str | None = None, **overrides: float) -> Parameters:
 
 
 def preset_names(model: str = DEFAULT) -> tuple[str, ...]:
-    """Names of a model's presets; the first is its default."""
+    """Return the names of a model's presets; the first is the default."""
     return load_model(model).preset_names
 
 
 def preset_provenance(name: str | None = None, model: str = DEFAULT) -> dict[str, str]:
-    """Where each parameter of a preset comes from: the paper, or a calibration.
+    """Return the source of each parameter of a preset: the paper, or a calibration.
 
     Returns
     -------

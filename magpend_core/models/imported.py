@@ -1,4 +1,4 @@
-"""Models that are Python objects: imported where a person names one, described everywhere else.
+"""Import models that are Python objects if the user names one; describe them otherwise.
 
 A run keeps a description: names, units, bounds, presets, and the digest of the files that decide the
 equations. Opening or drawing needs no more, and imports nothing. What integrates needs the object itself,
@@ -35,12 +35,12 @@ _imported: dict[str, Model] = {}
 
 
 def is_object_path(text: str) -> bool:
-    """Whether a text is the place of a Python object: ``package.module:NAME``."""
+    """Tell whether a text names a Python object: ``package.module:NAME``."""
     return _PATH.fullmatch(text) is not None
 
 
 def import_model(path: str, folder: str | Path | None = None) -> Model:
-    """Import a model: runs the code of its module. Call it where a person has named the object.
+    """Import a model; this runs its module's code. Call it only if the user has named the object.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def import_model(path: str, folder: str | Path | None = None) -> Model:
 
 
 def _description(path: str, model: Model) -> dict[str, Any]:
-    """What a run keeps of a model: plain data."""
+    """Return the description of a model that a run stores, as plain data."""
     table: dict[str, Any] = {KEY: path, "digest": model.digest}
     table |= {name: getattr(model, name) for name in ("name", "title", "section", "angle_dim")}
     table["autonomous"] = model.autonomous
@@ -107,7 +107,7 @@ def _description(path: str, model: Model) -> dict[str, Any]:
 
 
 def _plain(one: Any) -> dict[str, Any]:
-    """Fields of a dataclass without its name, those that are as by default left out."""
+    """Return the fields of a dataclass except its name and its default values."""
     values = {f.name: (getattr(one, f.name), f.default) for f in fields(one) if f.name != "name"}
     return {name: value for name, (value, default) in values.items() if value != default}
 
@@ -118,13 +118,13 @@ class DescribedModel(Model):
 
     @cached_property
     def digest(self) -> str:
-        """Digest that the object had when the description was made."""
+        """Return the object's digest at the time of the description."""
         assert self.text is not None
         return str(self.text["digest"])
 
     @cached_property
     def system(self) -> System:
-        """Refused: what a person has not named is not imported."""
+        """Raise: a described model has no object that could be integrated."""
         assert self.text is not None
         path = self.text[KEY]
         known = _imported.get(path)
@@ -139,7 +139,7 @@ class DescribedModel(Model):
 
 
 def origin(model: Model) -> tuple[str, str] | None:
-    """Return what another process gives `import_model`: place and folder; None if nothing was imported."""
+    """Return the arguments of `import_model` for another process; None if nothing was imported."""
     path = "" if model.text is None else str(model.text.get(KEY, ""))
     known = _imported.get(path)
     if known is None or known.text != model.text:
@@ -157,7 +157,7 @@ def known_model(table: Mapping[str, Any]) -> Model | None:
 
 
 def described_model(table: Mapping[str, Any]) -> Model:
-    """Return the model of a description, without the object: it names everything and integrates nothing.
+    """Return a model from its description alone; it names everything and integrates nothing.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def described_model(table: Mapping[str, Any]) -> Model:
 
 
 def _outer_problems(table: Mapping[str, Any]) -> list[str]:
-    """Keys of a description that are missing, too many, or of the wrong kind."""
+    """Return the keys of a description that are missing, unknown or of the wrong kind."""
     known = (KEY, *_TEXTS, *_TABLES, "autonomous", "mirror")
     problems = [f"{key}: no part of a model's description." for key in table if key not in known]
     problems += [f"{key}: must be a text." for key in _TEXTS if not isinstance(table.get(key), str)]

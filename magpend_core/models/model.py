@@ -1,4 +1,4 @@
-"""What a model is, for everyone above the engine. Imports no compiler: a model describes itself without it.
+"""Define a model for all code above the engine. Imports no compiler.
 
 A model names its states and parameters, its presets with their provenance, and the system that the engine
 integrates. It may bring more: quantities of state and time, a classifier of motions with its words, a
@@ -122,7 +122,7 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Drawing:
-    """What a model looks like, for portraits and animations.
+    """A model's appearance, for portraits and animations.
 
     Attributes
     ----------
@@ -203,81 +203,81 @@ class Model:
 
     @property
     def reference(self) -> str | Mapping[str, Any]:
-        """What runs keep of the model, and `load_model` finds it by: its name, or its text."""
+        """Return the model's stored reference for `load_model`: its name, or its text."""
         return self.name if self.text is None else self.text
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on what looks like an oversight in the model's text, such as a parameter without use."""
+        """Return warnings on likely oversights in the model's text, for example an unused parameter."""
         return ()
 
     @property
     def crossing(self) -> Crossing | None:
-        """The section by crossing that the model is seen through; None at the period of a drive."""
+        """Return the model's section by crossing; None for a stroboscopic section."""
         return None
 
     @property
     def flow(self) -> Model:
-        """The model without a section by crossing: its trajectories are the same."""
+        """Return the model without a section by crossing; its trajectories are the same."""
         return self
 
     @property
     def section_states(self) -> tuple[str, ...]:
-        """Names of the states that differ from section to section, in order."""
+        """Return the names of the states that differ from section to section, in order."""
         return self.state_names
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the states in order."""
+        """Return the names of the states in order."""
         return tuple(s.name for s in self.states)
 
     @property
     def state_units(self) -> tuple[str, ...]:
-        """Units of the states in order."""
+        """Return the units of the states in order."""
         return tuple(s.unit for s in self.states)
 
     @property
     def is_angle(self) -> tuple[bool, ...]:
-        """Which states are on a circle."""
+        """Return a flag per state: whether it is an angle."""
         return tuple(s.on_circle for s in self.states)
 
     @property
     def angles(self) -> tuple[str, ...]:
-        """Names of the states on circles."""
+        """Return the names of the angles among the states."""
         return tuple(s.name for s in self.states if s.on_circle)
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """Scale of each state."""
+        """Return the scale of each state."""
         return tuple(s.scale for s in self.states)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters in order."""
+        """Return the names of the parameters in order."""
         return tuple(p.name for p in self.parameters)
 
     @property
     def portraits(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of states that phase portraits show: each with its rate, else neighbours."""
+        """Return the state pairs of phase portraits: each with its rate, else neighbours."""
         pairs = tuple((s.name, s.rate) for s in self.states if s.rate)
         names = self.state_names
         return pairs or tuple(itertools.pairwise(names)) or ((names[0], names[0]),)
 
     @property
     def preset_names(self) -> tuple[str, ...]:
-        """Names of the presets; the first is the default."""
+        """Return the names of the presets; the first is the default."""
         return tuple(p.name for p in self.presets)
 
     @cached_property
     def system(self) -> System:
-        """What the engine integrates; imports the compiler."""
+        """Return the system for the engine; imports the compiler."""
         module, _, attribute = self.system_path.partition(":")
         found: System = getattr(importlib.import_module(module), attribute)
         return found
 
     @cached_property
     def digest(self) -> str:
-        """Digest of what the model's own sources mean; comments and docstrings do not count."""
+        """Return the digest of the model's own sources, without comments and docstrings."""
         from magpend_core.meaning import meaning_digest
 
         return meaning_digest(self.sources)

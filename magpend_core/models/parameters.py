@@ -87,7 +87,7 @@ def near_names(name: str, known: Iterable[str], what: str) -> str:
 
 
 def unknown_name_problem(name: str, known: Iterable[str]) -> str:
-    """Sentence for an unknown parameter name, with the nearest known names."""
+    """Return the sentence for an unknown parameter name, with the nearest known names."""
     return f"{name!r} is not a parameter; {near_names(name, known, 'names')}"
 
 
@@ -159,11 +159,11 @@ class Parameters(Mapping[str, float]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all parameters in the order of `pack`."""
+        """Return the names of all parameters in the order of `pack`."""
         return self.model.parameter_names
 
     def as_dict(self) -> dict[str, float]:
-        """All values by name, in the order of `pack`."""
+        """Return all values by name, in the order of `pack`."""
         return dict(self._values)
 
     def pack(self) -> np.ndarray:

@@ -88,7 +88,7 @@ class Preset:
 
 
 def _problems(tables: Mapping[str, Any]) -> list[str]:
-    """Sentences on what is no part of a preset's file."""
+    """Return sentences on entries that do not belong in a preset's file."""
     problems = [
         f"{key} = {tables[key]!r}: must be a text in quotes."
         for key in KEYS
@@ -115,7 +115,7 @@ def _problems(tables: Mapping[str, Any]) -> list[str]:
 
 
 def is_file(name: str | Path) -> bool:
-    """Whether a preset is named by its file and not as one that ships: it is a path, or ends in ``.toml``."""
+    """Tell whether a preset is named by a file: a path, or a name that ends in ``.toml``."""
     return isinstance(name, Path) or str(name).endswith(SUFFIX)
 
 
@@ -179,7 +179,7 @@ def completed(preset: Preset, model: Model) -> Preset:
 
 
 def value_problems(model: Model, values: Mapping[str, Any], sources: Mapping[str, str]) -> list[str]:
-    """Sentences on names, values and provenance that are none of a model's."""
+    """Return sentences on names, values and provenance that do not fit a model."""
     problems = []
     for name, value in values.items():
         try:

@@ -37,12 +37,12 @@ class SectionedModel(Model):
 
     @property
     def crossing(self) -> Crossing | None:
-        """The section."""
+        """Return the section."""
         return self.through
 
     @property
     def flow(self) -> Model:
-        """The model without the section."""
+        """Return the model without the section."""
         return self.whole
 
     @property
@@ -52,19 +52,19 @@ class SectionedModel(Model):
 
     @property
     def reference(self) -> str | Mapping[str, Any]:
-        """What runs keep of the model without the section."""
+        """Return the stored reference of the model without the section."""
         return self.whole.reference
 
     @cached_property
     def system(self) -> System:
-        """What the engine integrates, with its crossing; imports the compiler."""
+        """Return the system with its crossing, for the engine; imports the compiler."""
         from magpend_core.engine.crossing import with_section
 
         return with_section(self.whole.system, self.through.of, self.through.sign)
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the model's meaning and of the state and direction of the section."""
+        """Return the digest of the model, and of the section's state and direction."""
         seen = f"{self.whole.digest} {self.through.of} {self.through.direction}"
         return hashlib.sha256(seen.encode()).hexdigest()[: len(self.whole.digest)]
 
@@ -112,7 +112,7 @@ def sectioned(model: Model, crossing: Crossing) -> SectionedModel:
 
 
 def of_flow(parameters: Parameters) -> Parameters:
-    """Return the parameters of the flow without its section, whose trajectories are the same."""
+    """Return the parameters of the flow without its section; its trajectories are the same."""
     model = parameters.model.flow
     if model is parameters.model:
         return parameters

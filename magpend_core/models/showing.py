@@ -1,4 +1,4 @@
-"""What a model is in the end: what was found in its equations, and whether they hold what they promise."""
+"""Describe a model: the features found in its equations, and the results of the checks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from magpend_core.models.parameters import Parameters
 
 
 def checks_of(model: Model) -> list[str]:
-    """What `describe` looks at, in words."""
+    """Return the names of the checks that `describe` makes."""
     return [
         "finite at the starts",
         "Jacobian equal to differences",
@@ -23,7 +23,7 @@ def checks_of(model: Model) -> list[str]:
 
 @dataclass(frozen=True)
 class Description:
-    """What `describe` finds.
+    """The result of `describe`.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Description:
 
 
 def describe(parameters: Parameters, frequency_hz: float, states: np.ndarray) -> Description:
-    """Look at a model where it is to be run; brings the compiler, and compiles nothing.
+    """Check a model at the parameters of a run; imports the compiler, and compiles nothing.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def describe(parameters: Parameters, frequency_hz: float, states: np.ndarray) ->
 
 
 def _written(model: Model) -> tuple[dict[str, str], dict[str, str], list[str]]:
-    """Definitions, equations and LaTeX of a model as text."""
+    """Return definitions, equations and LaTeX of a model as text."""
     from magpend_core.models.text.model import TextModel
 
     if not isinstance(model, TextModel):

@@ -1,5 +1,5 @@
-"""The explorer: a page on which one sees a run, served on loopback or exported as files.
+"""Show a run on an interactive page, served on loopback or exported as files.
 
-Python says what stands in a run (`view`, `diagram`, `orbits`), computes what the page asks for while one
-watches (`live`) and serves both (`server`); `page/` has the page's sources, `static/` what is built of them.
+Python describes the run (`view`, `diagram`, `orbits`), computes live requests (`live`) and serves both
+(`server`). `page/` has the page's sources, `static/` the files built from them.
 """

@@ -1,4 +1,4 @@
-"""The answers that the page can ask for, by name: what each takes from an address, and what it gives."""
+"""Define the answers that the page can request by name: their arguments and their content."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _AT = "at."
 
 @dataclass(frozen=True)
 class Query:
-    """What a request says.
+    """The arguments and the body of a request.
 
     Attributes
     ----------
@@ -45,14 +45,14 @@ class Query:
     body: bytes = b""
 
     def text(self, name: str, default: str | None = None) -> str:
-        """An argument; raises `ExplorerError` if it is missing and has no default."""
+        """Return an argument; raise `ExplorerError` if it is missing and has no default."""
         found = self.words.get(name, default)
         if found is None:
             raise ExplorerError(f"{name} is missing.")
         return found
 
     def count(self, name: str, default: int | None = None) -> int:
-        """A whole number, 0 or more."""
+        """Return an argument as a whole number, 0 or more."""
         text = self.text(name, None if default is None else str(default))
         if not (text.isascii() and text.isdigit() and len(text) < 16):
             raise ExplorerError(f"{name} = {text[:40]!r}: must be a whole number, 0 or more.")
@@ -60,14 +60,14 @@ class Query:
 
     @property
     def at(self) -> dict[str, int]:
-        """Index by axis: the arguments ``at.NAME``."""
+        """Return the index by axis: the arguments ``at.NAME``."""
         names = [name for name in self.words if name.startswith(_AT)]
         return {name.removeprefix(_AT): self.count(name) for name in names}
 
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer: bytes, their type, and the name of a file if it is a download."""
+    """An answer: bytes, their type, and a file name if it is a download."""
 
     content: bytes
     kind: str
@@ -88,9 +88,9 @@ class Answer:
         ``give(run, query, live)``.
     method : str
     fresh : bool
-        Whether the directory is looked at again before.
+        Whether the directory is read again first.
     integrates : bool
-        Whether it takes compiled code.
+        Whether it needs compiled code.
     """
 
     name: str
@@ -101,7 +101,7 @@ class Answer:
 
 
 def json_reply(value: Any) -> Reply:
-    """JSON without NaN: a gap is null."""
+    """Return JSON without NaN: a gap is null."""
     return Reply(json.dumps(value, allow_nan=False).encode(), JSON)
 
 
@@ -132,7 +132,7 @@ def _attractors(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
 
 
 def _orbit(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
-    # compiling what gives multipliers would take longer than anybody waits for an orbit
+    # compiling the code for multipliers would delay the orbit too long
     linearised = live is None or live.is_warm("maps")
     return Reply(orbit(run, query.count("cell"), query.count("point"), linearised=linearised), BINARY)
 
@@ -176,12 +176,12 @@ ANSWERS: dict[str, Answer] = {
 
 
 def first_answers(run: ExploredRun, live: LiveRun | None) -> None:
-    """Prepare what the page asks for first: the view, and the diagram that it begins with."""
+    """Prepare the page's first requests: the view, and the diagram shown first."""
     try:
         _view(run, Query({}), live)
         axis = next((a for a in run.axes if a.name == run.path), run.axes[0])
         at = {f"{_AT}{a.name}": "0" for a in run.axes if a.swept and a is not axis}
         _diagram(run, Query({"x": axis.name, "y": verticals(run)[0].name, **at}), live)
-    except Exception as error:  # whoever asks hears what is wrong, too
+    except Exception as error:  # the request itself reports the error, too
         LOG.warning("the first picture could not be prepared: %s", error)
         LOG.debug("where it came from", exc_info=True)

@@ -1,4 +1,4 @@
-"""Arrays as the page takes them: one run of bytes, read without copying.
+"""Pack arrays for the page into one byte string that it reads without copying.
 
 A little-endian uint32 says how long the header is; the header is JSON in UTF-8, padded with spaces so that
 what follows begins at a multiple of 8; then come the arrays in C order, each padded to 8 bytes::
@@ -27,14 +27,14 @@ def _padding(length: int) -> int:
 
 
 def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
-    """Return arrays and attributes as one run of bytes.
+    """Return arrays and attributes as one byte string.
 
     Parameters
     ----------
     arrays
         By name, of a type in `DTYPES`.
     attrs
-        What JSON can say; no NaN and no infinity: None stands for what has no value.
+        Values that JSON can store. NaN and infinity are not allowed; None stands for a missing value.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | Non
     for name, values in arrays.items():
         if values.dtype.name not in DTYPES:
             raise ValueError(f"array {name} is of type {values.dtype}: one of {', '.join(DTYPES)} is needed")
-        # joined from where they lie: a copy of each would double the memory of a large diagram
+        # join without copies, which would double the memory of a large diagram
         data = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).reshape(-1).view(np.uint8)
         places[name] = {"dtype": values.dtype.name, "shape": list(values.shape), "offset": offset}
         parts += [data, bytes(_padding(len(data)))]
@@ -58,7 +58,7 @@ def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | Non
 
 
 def unpack_arrays(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return what `pack_arrays` was given: arrays by name, and attributes."""
+    """Return the arrays by name and the attributes given to `pack_arrays`."""
     begin = 4 + int.from_bytes(data[:4], "little")
     header = json.loads(data[4:begin])
     arrays = {}

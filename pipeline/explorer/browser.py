@@ -1,4 +1,4 @@
-"""Open the page in a browser without showing its address to others: arguments of processes are no secret."""
+"""Open the page in a browser without showing its address: process arguments are public."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _REDIRECT = """<!doctype html>
 
 
 def redirect_file(folder: Path, address: str) -> Path:
-    """Write a file, for this user alone, that leads a browser to an address."""
+    """Write a file, readable by this user alone, that redirects a browser to an address."""
     path = folder / "open.html"
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(handle, "w", encoding="utf-8") as file:
@@ -36,9 +36,9 @@ def redirect_file(folder: Path, address: str) -> Path:
 
 @contextlib.contextmanager
 def browser() -> Iterator[Callable[[str], None]]:
-    """Yield what opens an address in the person's browser, if there is one; nobody waits for it.
+    """Yield a function that opens an address in the user's browser, if there is one, without waiting.
 
-    The file by which that is done is there for as long as the block takes.
+    The redirect file exists as long as the block runs.
     """
     folder = Path(tempfile.mkdtemp(prefix="magpend-explore-"))
 

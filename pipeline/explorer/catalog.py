@@ -1,4 +1,4 @@
-"""What attracts at a parameter point, as far as it is known, and which of it a live trajectory has reached.
+"""List the known attractors at a parameter point, and tell which one a live trajectory has reached.
 
 Where the run's attractors are kept in ``derived/``, those of the point are taken from there with their ids,
 and a trajectory is matched as `pipeline.analysis.attractors` matches the cube's cells: closed or on its way
@@ -56,7 +56,7 @@ SAME_SECONDS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """Something that trajectories end on.
+    """An attractor, or a class of cells, on which trajectories end.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What a run's analysis says of a parameter point.
+    """The stored analysis at a parameter point.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Known:
     index: tuple[int, ...] | None = None
 
     def here(self) -> xr.Dataset | None:
-        """Attractors at the point."""
+        """Return the attractors at the point."""
         if self.attractors is None or self.index is None or self.cells is None:
             return None
         dims, _ = split_dims(self.attractors["attractor_id"])
@@ -149,7 +149,7 @@ class Catalog:
     # ---- what the run knows ------------------------------------------------------------------
 
     def _take(self, here: xr.Dataset, cells: xr.Dataset) -> None:
-        """Enter the attractors of the run."""
+        """Add the run's attractors as entries."""
         present = np.flatnonzero(here["kind"].values != ABSENT)
         points = {int(i): _finite(here["attractor_points"].values[i]) for i in present}
         periods = here["orbit_period"].values
@@ -173,7 +173,7 @@ class Catalog:
                     self._sets.append((entry, cloud))
 
     def _cloud_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Cloud | None:
-        """Cloud of the cube's cells that are on a set that does not close."""
+        """Return the cloud of the cube's cells on a set that does not close."""
         block = self._point(cells).whole()
         ids = here["attractor_id"].transpose(*split_dims(cells["status"])[1]).values.ravel()
         own = np.flatnonzero((ids == number) & block.is_bounded)
@@ -195,7 +195,7 @@ class Catalog:
     # ---- where trajectories are ----------------------------------------------------------------
 
     def on_orbits(self, block: Block) -> np.ndarray:
-        """Entry of the orbit that each cell is on or certain to end on, -1 for none."""
+        """Return the entry of the orbit that each cell has reached or is certain to reach, -1 for none."""
         with self._lock:
             orbits, numbers = list(self._orbits), np.array([*self._orbit_entries, -1])
         if not orbits:
@@ -204,7 +204,7 @@ class Catalog:
         return np.asarray(numbers[label])
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Which undecided cells are worth running on: those that come back near, as the analysis does it."""
+        """Return the undecided cells worth integrating further, by the rule of the analysis."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         near = np.zeros(len(numbers), bool)
         longest = self.options.max_orbit_period
@@ -214,7 +214,7 @@ class Catalog:
         return near
 
     def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
-        """Entry of each cell; what closes elsewhere gets an entry of its own.
+        """Return the entry of each cell; an unknown closed orbit gets a new entry.
 
         Parameters
         ----------
@@ -238,7 +238,7 @@ class Catalog:
         return numbers
 
     def _rest(self, block: Block, numbers: np.ndarray) -> Block:
-        """Tell cells at equilibria and on limit cycles of a flow, in place; returns cells without them."""
+        """Assign cells at equilibria and on limit cycles of a flow, in place; return the other cells."""
         point = self._point(_dataset_of(block, self.model))
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):
@@ -261,7 +261,7 @@ class Catalog:
         return Block(block.cells, block.section, status, block.orbit_period, block.turns, block.rest)
 
     def _learn(self, block: Block, numbers: np.ndarray) -> None:
-        """Polish what closes on no known orbit, and enter it, in place."""
+        """Polish closed orbits that match no known one, and add them, in place."""
         for row in np.flatnonzero(block.is_closed & (numbers < 0)):
             if numbers[row] >= 0 or self._n_new >= MOST_ENTRIES:
                 continue
@@ -283,7 +283,7 @@ class Catalog:
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Tell which of the run's sets that do not close the other bounded cells are on, in place."""
+        """Assign the remaining bounded cells to the run's sets that do not close, in place."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return
@@ -325,7 +325,7 @@ class Catalog:
         return None
 
     def _class_of(self, block: Block, row: int) -> Entry:
-        """Entry of a cell that is on nothing known: one for each status, period and motion."""
+        """Return the entry for a cell on no known attractor: one per status, period and motion."""
         status = int(block.status[row])
         alive = bool(block.is_bounded[row] or block.is_closed[row])
         period = int(block.orbit_period[row]) if alive else 0
@@ -341,11 +341,11 @@ class Catalog:
     # ---- motions -------------------------------------------------------------------------------
 
     def motions(self, block: Block) -> np.ndarray:
-        """Codes of the model's classifier for each cell."""
+        """Return the classifier's code for each cell."""
         return features.sides_of(block.section, block.turns, self.place.frequency, self.place.parameters)
 
     def _motion_of(self, orbit: Orbit) -> int:
-        """Code of an orbit's motion, its turns counted over its period."""
+        """Return the motion code of an orbit; its turns are counted over its period."""
         if self.model.classifier is None:
             return 0
         is_flow = self.model.crossing is not None
@@ -367,10 +367,10 @@ class Catalog:
 
 
 class _WholePoint(Point):
-    """A point all of whose cells are one block."""
+    """A parameter point whose cells form one block."""
 
     def whole(self) -> Block:
-        """All cells."""
+        """Return all cells."""
         return next(self.blocks())
 
 
@@ -379,7 +379,7 @@ def _finite(points: np.ndarray) -> np.ndarray:
 
 
 def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
-    """Options with which the run's attractors were found; else those by default."""
+    """Return the options that found the run's attractors, else the defaults."""
     attrs: Mapping[Any, Any] = {} if here is None else here.attrs
     given = {}
     for name, field in IdentifyOptions.model_fields.items():
@@ -390,13 +390,13 @@ def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
 
 
 def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
-    """Within which a closed cell belongs to an orbit: as `identify` takes it."""
+    """Return the distance within which a closed cell belongs to an orbit, as in `identify`."""
     found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
     return found or max(1e-4, 10.0 * closure_tolerance)
 
 
 def _dataset_of(block: Block, model: Model) -> xr.Dataset:
-    """Cells as a dataset of one parameter point."""
+    """Return cells as a dataset of one parameter point."""
     dims = "initial_condition"
     variables: dict[str, Any] = {
         "section": ((dims, "period_index", "state"), block.section),

@@ -1,4 +1,4 @@
-"""What the points of a diagram can be coloured by: each a code per cell, with words and colours for codes."""
+"""Define the colour schemes of a diagram: a code per cell, with labels and colours for codes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _STATUS = {
 
 @dataclass(frozen=True)
 class Category:
-    """One colour of a scheme, and what it stands for."""
+    """One colour of a scheme, and its meaning."""
 
     number: int
     label: str
@@ -72,7 +72,7 @@ class Scheme:
     needs: tuple[str, ...] = ()
 
     def describe(self) -> dict[str, Any]:
-        """The scheme as the page has it."""
+        """Return the scheme in the page's form."""
         return {
             "name": self.name,
             "title": self.title,
@@ -81,7 +81,7 @@ class Scheme:
 
 
 def schemes(run: ExploredRun) -> list[Scheme]:
-    """Return the schemes that a run has, the one to begin with first."""
+    """Return the colour schemes of a run, the default first."""
     return run.remembered("schemes", lambda: list(_schemes(run)))
 
 
@@ -121,7 +121,7 @@ def _schemes(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _seeds(run: ExploredRun) -> Iterator[Scheme]:
-    """By the initial state, where there are few enough."""
+    """Colour by the initial state, if there are few."""
     cube, dims = run.cube(), run.start_dims
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in dims]
     walked = BRANCH in dims
@@ -143,7 +143,7 @@ def _seeds(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
-    """Code of what each cell ends on: the id of an attractor, or a grey beyond all ids; and these greys.
+    """Return codes of the cells' ends: an attractor id, or a grey beyond all ids; and the greys.
 
     Cells that diverged, failed or are pending have none.
     """
@@ -160,7 +160,7 @@ def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
 
 
 def _told(codes: xr.DataArray) -> xr.DataArray:
-    """Codes of motions, none where there was nothing to judge."""
+    """Return motion codes, with none for cells that were not classified."""
     return codes.where(codes > 0, -1)
 
 
@@ -169,7 +169,7 @@ def _directions(words: xr.DataArray) -> xr.DataArray:
 
 
 def rgb(colour: str) -> str:
-    """A colour of figures as ``#rrggbb``."""
+    """Convert a figure colour to ``#rrggbb``."""
     from matplotlib.colors import to_hex
 
     return str(to_hex(colour))

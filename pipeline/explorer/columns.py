@@ -1,4 +1,4 @@
-"""The columns of a copy in one file: exact where they fit, else rounded, else fewer sections; and said so."""
+"""Fit the columns of a one-file copy: exact if possible, else rounded, else with fewer sections."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.explorer.packing import packed
 
 @dataclass(frozen=True)
 class Level:
-    """How much of the columns is copied.
+    """A level of detail for the copied columns.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Columns that fit.
+    """Columns that fit the size limit.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Fitted:
     others: int
 
     def sentences(self) -> list[str]:
-        """What a reader must know of them."""
+        """Return notes for the reader on the columns."""
         found = []
         if self.level.dtype == "float32":
             found.append("Numbers are rounded to 24 bits, so each is right to 6e-8 of its size.")
@@ -73,7 +73,7 @@ def _ordinal(n: int) -> str:
 
 
 def levels(most: int) -> Iterator[Level]:
-    """From all there is to a section of each cell."""
+    """Return levels from full detail down to one section per cell."""
     yield Level("float64", 0)
     yield Level("float32", 0)
     for each in itertools.chain([1], *([2 * 2**k, 3 * 2**k] for k in range(most.bit_length()))):
@@ -81,7 +81,7 @@ def levels(most: int) -> Iterator[Level]:
 
 
 def fit(columns: Mapping[str, Column], period: np.ndarray, most_bytes: float) -> Fitted | None:
-    """Return as much of the columns as takes at most so many bytes; None if nothing does.
+    """Return the columns at the finest level within a size limit; None if no level fits.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def fit(columns: Mapping[str, Column], period: np.ndarray, most_bytes: float) ->
 def _packed(
     columns: Mapping[str, Column], period: np.ndarray, level: Level, most_bytes: float
 ) -> dict[str, bytes] | None:
-    """All columns at a level; None as soon as they are too large."""
+    """Pack all columns at a level; return None as soon as they are too large."""
     objects, size = {}, 0
     for name, column in columns.items():
         part = thinned(column, period, level.each)
@@ -119,7 +119,7 @@ def _packed(
 
 
 def thinned(column: Column, period: np.ndarray, each: int) -> Column:
-    """Leave sections out: all but the last period of closed orbits, of other cells all but every `each`-th.
+    """Keep the last period of closed orbits, and every `each`-th section of other cells.
 
     The last section of every cell stays. Nothing is left out if `each` is 0.
     """

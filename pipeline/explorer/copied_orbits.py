@@ -1,4 +1,4 @@
-"""Orbits of a copy: integrated when it is made, one for each attractor at each parameter point."""
+"""Integrate the orbits of a copy when it is made: one per attractor and parameter point."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SAMPLE = 6
 
 @dataclass(frozen=True)
 class Room:
-    """What the orbits of a copy may take.
+    """The limits for the orbits of a copy.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Room:
 
 @dataclass(frozen=True)
 class Chosen:
-    """Which orbit stands for which cell.
+    """The choice of an orbit for each cell.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Chosen:
 
 
 def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray, most: int) -> Chosen:
-    """Choose the cells whose orbits stand for all.
+    """Choose the cells whose orbits stand for all cells.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray
 
 
 def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """A number by which the cells of a parameter point are told apart."""
+    """Return a number that distinguishes the cells of a parameter point."""
     if "colour_attractor" in layers:
         return np.asarray(layers["colour_attractor"], np.int64)
     motion = layers.get("colour_motion", np.zeros_like(layers["status"])).astype(np.int64)
@@ -114,7 +114,7 @@ def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
-    """Number of each cell's parameter point, and where the points lie on the axes, each from 0 to 1."""
+    """Return each cell's parameter point, and the points' axis positions, each from 0 to 1."""
     swept = [a.name for a in run.axes if a.swept]
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in swept]
     index = dict(zip(run.plan.dims, np.indices(run.plan.shape).reshape(len(run.plan.dims), -1), strict=True))
@@ -128,7 +128,7 @@ def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
 def _nearest(
     groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The orbit that stands for each group of cells: its own, else the nearest, of its label if it can be."""
+    """Return the orbit for each group of cells: its own, else the nearest, same label preferred."""
     number = np.full(len(groups), NONE, np.uint32)
     means = np.full(len(groups), NEAREST, np.uint8)
     number[taken], means[taken] = np.arange(len(taken)), same
@@ -142,7 +142,7 @@ def _nearest(
 
 
 def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndarray, room: Room) -> int:
-    """Integrate orbits and add them; returns how many.
+    """Integrate orbits and add them to a copy; return their number.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
 
 
 def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -> float:
-    """What an orbit takes, by some of them; at least 1."""
+    """Estimate the bytes per orbit from a sample; at least 1."""
     some = chosen.cells[:: max(1, len(chosen.cells) // SAMPLE)][:SAMPLE]
     sizes = []
     for cell in some.tolist():
@@ -200,7 +200,7 @@ def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -
 def _orbit(
     run: ExploredRun, cell: int, count: np.ndarray, room: Room
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The orbit from a cell's last section, in the digits and at the instants that there is room for."""
+    """Integrate the orbit from a cell's last section, at the precision that fits."""
     try:
         arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
     except (ExplorerError, ArithmeticError) as error:  # of one cell: the page says so where it is asked for
@@ -215,7 +215,7 @@ def _orbit(
 
 
 def brief(arrays: Mapping[str, np.ndarray], closed: bool) -> dict[str, np.ndarray]:
-    """An orbit for a page: where it does not close, its first periods, at every second instant."""
+    """Shorten an orbit for a page: first periods at every second instant unless it closes."""
     sections = arrays["section_times"][: BRIEF_PERIODS + 1]
     if closed or len(sections) <= BRIEF_PERIODS:
         return dict(arrays)
@@ -225,7 +225,7 @@ def brief(arrays: Mapping[str, np.ndarray], closed: bool) -> dict[str, np.ndarra
 
 
 def rounded(values: np.ndarray, short: bool) -> np.ndarray:
-    """Numbers to 24 bits; for a page to 16, which no picture shows, and gzip makes a third smaller."""
+    """Round numbers to 24 bits, or to 16 for a page, so that gzip compresses them better."""
     single = np.ascontiguousarray(values, np.float32)
     if not short:
         return single

@@ -1,4 +1,4 @@
-"""The HTML of copies: one file that needs nothing beside it but, in a folder, data."""
+"""Write the HTML of copies: a single file, or a page with a data folder."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _DATA = '<script type="application/octet-stream;base64" id="data-{name}">{conten
 
 
 def static_text(name: str) -> str:
-    """A file of the built page."""
+    """Return a file of the built page."""
     return resources.files("pipeline.explorer").joinpath("static", name).read_text("utf-8")
 
 
 def inline_html(title: str, generator: str, objects: Mapping[str, bytes]) -> str:
-    """The page with its data in itself; it asks for nothing."""
+    """Return a page that contains its data and makes no requests."""
     data = "".join(
         _DATA.format(name=escape(name), content=base64.b64encode(content).decode())
         for name, content in objects.items()
@@ -45,12 +45,12 @@ def inline_html(title: str, generator: str, objects: Mapping[str, bytes]) -> str
 
 
 def folder_html(title: str, generator: str, list_sha256: str) -> str:
-    """The page of a folder; it holds the digest of the list of digests."""
+    """Return the page of a folder; it holds the digest of the list of digests."""
     return _page("folder", title, generator, "explorer-folder.js", "'self'", f' data-objects="{list_sha256}"')
 
 
 def inline_bytes(objects: Mapping[str, bytes]) -> int:
-    """Size of objects in a page [bytes]."""
+    """Return the size of objects in a page [bytes]."""
     frame = len(_DATA)
     return sum(frame + len(name) + 4 * -(-len(content) // 3) for name, content in objects.items())
 
@@ -73,5 +73,5 @@ def _page(
 
 
 def _digest(text: str) -> str:
-    """A text as a content policy names it."""
+    """Return a text's digest in the form of a content policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

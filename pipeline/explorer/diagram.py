@@ -1,4 +1,4 @@
-"""The points of a bifurcation diagram: every kept section of the cells at one place of the other axes.
+"""Read the points of a bifurcation diagram: the kept sections at fixed values of the other axes.
 
 The cube is read block by block in the chunks of the store, each compared with its sha256; what stays in
 memory is one number per point. A diagram of more than `MOST_POINTS` shows the last sections of each cell, as
@@ -59,7 +59,7 @@ class Points:
 
 
 def diagram(run: Run, x: str, y: str, at: Mapping[str, int]) -> bytes:
-    """Return a diagram as the page takes it.
+    """Return a diagram in the page's form.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def diagram(run: Run, x: str, y: str, at: Mapping[str, int]) -> bytes:
     x
         Name of a swept axis.
     y
-        What is drawn upwards: a state, or a kept extreme such as ``NAME.max``.
+        Vertical axis: a state, or a kept extreme such as ``NAME.max``.
     at
         Index on each other swept axis.
 
@@ -112,7 +112,7 @@ def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
 
 
 def _numbered(run: ExploredRun) -> xr.Dataset:
-    """The cube with the place of each cell along every dim, as ``_DIM``."""
+    """Return the cube with each cell's index along every dim, as ``_DIM``."""
     ds = run.cube()
     return ds.assign_coords({
         f"_{d}": (d, np.arange(n)) for d, n in zip(run.plan.dims, run.plan.shape, strict=True)
@@ -120,14 +120,14 @@ def _numbered(run: ExploredRun) -> xr.Dataset:
 
 
 def _cell_numbers(run: ExploredRun, place: Mapping[str, int]) -> np.ndarray:
-    """Flat numbers of the selected cells, in the shape of the selection."""
+    """Return the flat numbers of the selected cells, in the shape of the selection."""
     dims, shape = run.plan.dims, run.plan.shape
     chosen = [np.array([place[d]]) if d in place else np.arange(n) for d, n in zip(dims, shape, strict=True)]
     return np.asarray(np.ravel_multi_index(np.ix_(*chosen), shape)).astype(np.uint32)
 
 
 class _Table:
-    """Values, status and codes of the selected cells, in the order of the cube's dims."""
+    """The values, status and codes of the selected cells, in the order of the cube's dims."""
 
     def __init__(self, run: ExploredRun, upwards: Vertical, sizes: tuple[int, ...], kept: int) -> None:
         self.dims, self.upwards, self.kept = run.plan.dims, upwards, kept
@@ -155,7 +155,7 @@ class _Table:
             self.codes[scheme.name][where] = np.where(found.values < 0, NONE, found.values)
 
     def points(self, x: np.ndarray, cells: np.ndarray) -> Points:
-        """What was read, along the horizontal axis, and only what is there to be drawn."""
+        """Return the drawable points read, sorted along the horizontal axis."""
         n = self.status.size
 
         def ordered(array: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What is done for each kind of message."""
+"""Map each kind of message to the function that handles it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def works(live: LiveRun) -> Mapping[str, Work]:
-    """Return what does each kind of job, with what a session remembers between them."""
+    """Return the handler of each kind of job, with the state shared within a session."""
     return {
         "start": partial(start, live),
         "slice": partial(slice_of, live),

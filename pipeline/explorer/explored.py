@@ -1,4 +1,4 @@
-"""A run as the explorer reads it: its cube and the results that are kept of its cells, each opened once."""
+"""Open a run for the explorer: its cube and its stored results, each read once."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ MOST_LARGE = 2
 
 
 class ExplorerError(ValueError):
-    """What is asked for is not there; the message is a sentence for whoever looks at the page."""
+    """A request for something that does not exist; the message is shown on the page."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """What can be the horizontal axis of a diagram.
+    """A possible horizontal axis of a diagram.
 
     Attributes
     ----------
@@ -68,14 +68,14 @@ class ExploredRun(Run):
 
     @classmethod
     def of(cls, source: str | Path | Run) -> ExploredRun:
-        """Return what stands in a run directory now, or the cells that an opened run speaks of."""
+        """Return the current content of a run directory, or the cells of an opened run."""
         run = Run.open(source)
         if isinstance(run, cls):
             return run
         return cls(**{f.name: getattr(run, f.name) for f in fields(Run)})
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
-        """The cube, lazily; every chunk is checked whenever it is read."""
+        """Return the cube, lazily; every chunk is checked when it is read."""
         if chunks is not None or check is not None:
             return super().cube(chunks, check=check)
         with self._lock:
@@ -87,7 +87,7 @@ class ExploredRun(Run):
             return found
 
     def kept(self, name: str) -> xr.Dataset | None:
-        """What ``derived/`` has of an analysis of these cells; None if it has nothing."""
+        """Return the stored result of an analysis from ``derived/``; None if there is none."""
         with self._lock:
             key = f"derived {name}"
             if key not in self._opened:
@@ -96,7 +96,7 @@ class ExploredRun(Run):
             return found
 
     def refreshed(self) -> ExploredRun:
-        """The same run with what has been added since: cells, and results of analyses."""
+        """Return the run with cells and results added since it was opened."""
         if not self.complete:
             return ExploredRun.of(Run.open(self.info.files))
         if self._derived_names() == self.remembered("derived names", self._derived_names):
@@ -111,7 +111,7 @@ class ExploredRun(Run):
         return sorted(place.name for place in products_in(self.info.files.below(DERIVED)))
 
     def remembered(self, key: str, make: Callable[[], T]) -> T:
-        """What was made under a name, made once however many ask at the same time."""
+        """Return a value made once per key, even under concurrent requests."""
         with self._lock:
             lock = self._opened.setdefault(f"lock {key}", threading.Lock())
         with lock:
@@ -121,7 +121,7 @@ class ExploredRun(Run):
             return found
 
     def large(self, key: str, make: Callable[[], T]) -> T:
-        """As `remembered`, but for what is large: made one at a time, and the last few alone are kept."""
+        """Return a large value by key: made one at a time, with only the last few kept."""
         with self._lock:
             last: list[str] = self._opened.setdefault("large", [])
             if key in last:
@@ -135,12 +135,12 @@ class ExploredRun(Run):
 
     @property
     def path(self) -> str | None:
-        """The axis that walks follow; None in a sweep."""
+        """Return the continuation axis; None in a sweep."""
         return None if self.plan.path is None else self.plan.dims[self.plan.path]
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """What can be the horizontal axis: swept parameters, or else the one value that all cells share."""
+        """Return the possible horizontal axes: swept parameters, or else the one shared value."""
         swept = tuple(Axis(a.dim, a.parameter, a.values) for a in parameter_axes(self.spec))
         if swept:
             return swept
@@ -150,7 +150,7 @@ class ExploredRun(Run):
         return (Axis(first, first, np.array([self.parameters[first]]), False),)
 
     def axis(self, name: str) -> Axis:
-        """An axis by name; raises `ExplorerError` with the nearest names if there is none."""
+        """Return an axis by name; raise `ExplorerError` with the nearest names if there is none."""
         for axis in self.axes:
             if axis.name == name:
                 return axis
@@ -158,16 +158,16 @@ class ExploredRun(Run):
 
     @property
     def start_dims(self) -> tuple[str, ...]:
-        """Dims that tell the cells of one parameter point apart."""
+        """Return the dims that distinguish the cells of one parameter point."""
         return tuple(d for d in self.plan.dims if is_start_dim(d))
 
     @property
     def n_keep(self) -> int:
-        """Sections that the cube keeps of each cell."""
+        """Return the number of sections kept of each cell."""
         return int(self.plan.sizes["period_index"])
 
     def check_axes(self, at: Mapping[str, int]) -> None:
-        """Refuse indices on axes that the run does not have; raises `ExplorerError`."""
+        """Raise `ExplorerError` for indices on axes that the run does not have."""
         known = [a.name for a in self.axes]
         for name in at:
             if name not in known:
@@ -204,7 +204,7 @@ class ExploredRun(Run):
         return found
 
     def cell(self, number: int) -> dict[str, int]:
-        """Index on each of the cube's dims of a cell by its flat number.
+        """Return a cell's index on each of the cube's dims, from its flat number.
 
         Raises
         ------
@@ -219,5 +219,5 @@ class ExploredRun(Run):
         return {dim: int(i) for dim, i in zip(self.plan.dims, index, strict=True)}
 
     def inputs(self, index: Mapping[str, int]) -> Inputs:
-        """What the kernel was given for a cell: packed parameters, frequency, initial state."""
+        """Return the kernel's inputs for a cell: packed parameters, frequency, initial state."""
         return CellMap(self.spec).inputs(tuple(slice(index[d], index[d] + 1) for d in self.plan.dims))

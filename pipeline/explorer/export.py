@@ -1,6 +1,6 @@
-"""The explorer without a server: copies of a run that a browser opens, in one file or in a folder.
+"""Export a run for a browser without a server, as one file or as a folder.
 
-A copy computes nothing: its orbits were integrated when it was made, and it says what it has not.
+A copy computes nothing: its orbits were integrated when it was made, and it lists its gaps.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ RESERVE = 10_000
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written.
+    """The result of an export.
 
     Attributes
     ----------
@@ -113,13 +113,13 @@ def export_page(
 
 
 def _html(copied: Copied) -> bytes:
-    """The page with all that was copied so far."""
+    """Return the page with the objects copied so far."""
     generator = f"magpend {copied.view['version']}"
     return inline_html(copied.run.info.title, generator, finished(copied)).encode()
 
 
 def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> Fitted:
-    """As much of the columns as fits beside the rest of the page."""
+    """Return the columns in as much detail as fits beside the rest of the page."""
     # base64 makes four of three
     room = (most_bytes - len(_html(copied)) - RESERVE) * 3 / 4
     found = fit(columns, periods(copied.run), room) if room > 0 else None
@@ -132,7 +132,7 @@ def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> F
 
 
 def check_place(out: Path, force: bool) -> None:
-    """Refuse a place that is taken or cannot be written to, before anything is computed.
+    """Raise `RefusedError` if a path is taken or not writable, before any computation.
 
     Raises
     ------
@@ -161,14 +161,14 @@ def read_columns(copied: Copied) -> tuple[dict[str, Column], dict[str, np.ndarra
 
 
 def periods(run: ExploredRun) -> np.ndarray:
-    """Period of each cell's closed orbit; 0 where there is none."""
+    """Return the period of each cell's closed orbit; 0 where there is none."""
     return np.asarray(run.cube()["orbit_period"].values).ravel()
 
 
 def add_all_orbits(
     copied: Copied, columns: Mapping[str, Column], layers: Mapping[str, np.ndarray], room: Room
 ) -> int:
-    """Integrate the orbits that stand for the cells' and add them; returns how many."""
+    """Integrate the representative orbits and add them; return their number."""
     run = copied.run
     count = columns[next(iter(columns))].count
     known = {**layers, "orbit_period": periods(run)}
@@ -176,13 +176,13 @@ def add_all_orbits(
 
 
 def finished(copied: Copied) -> dict[str, bytes]:
-    """All objects, what the copy says of itself first."""
+    """Return all objects, the copy's description first."""
     about = {**copied.about, "notice": notice(copied)}
     return {"view": packed_json({"view": copied.view, "about": about}), **copied.objects}
 
 
 def notice(copied: Copied) -> str:
-    """What a reader must know of a copy."""
+    """Return the notes that a reader of a copy needs."""
     view = copied.view
     first = (
         f"This is a copy of the run {view['name']} (digest {view['digest'][:12]}), made by "

@@ -1,4 +1,4 @@
-"""A copy in a folder: for any static host or object store, read column by column as one looks."""
+"""Export a run as a folder for any static host, read column by column on demand."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def export_folder(
 
 
 def check_folder(out: Path, force: bool) -> None:
-    """Refuse a place that is taken or cannot be written to, before anything is computed.
+    """Raise `RefusedError` if a folder is taken or not writable, before any computation.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def _write(run: ExploredRun, folder: Path, quantities: Sequence[str], most_orbit
 
 
 def _quantity(run: ExploredRun, name: str, column: Column) -> Layer:
-    """A quantity at the sections that are drawn, as an array of the cube; NaN where there are none."""
+    """Return a quantity at the drawn sections, as an array of the cube; NaN where there are none."""
     values = np.full((run.plan.n_cells, run.n_keep), np.nan)
     values[np.arange(run.n_keep) < column.count[:, None]] = column.y
     quantity = run.model.quantity(name)
@@ -152,7 +152,7 @@ def _quantity(run: ExploredRun, name: str, column: Column) -> Layer:
 
 
 def _layers_of(copied: Copied, layers: dict[str, np.ndarray]) -> dict[str, Layer]:
-    """Codes of colours in the shape of the cube, each with what its codes mean."""
+    """Return colour codes in the shape of the cube, with the meaning of each code."""
     shape = copied.run.plan.shape
     titles = {f"colour_{c['name']}": c for c in copied.view["colours"]}
     return {

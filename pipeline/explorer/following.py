@@ -1,4 +1,4 @@
-"""Periodic orbits that follow a parameter which is dragged, stable or not.
+"""Follow periodic orbits, stable or not, while a parameter is dragged.
 
 The orbit is a fixed point of the stroboscopic or return map. From one value of the parameter to the next it
 is predicted along its tangent and corrected by Newton's method at that value
@@ -77,7 +77,7 @@ class Held:
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """How far an orbit was followed.
+    """The result of following an orbit.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class Reached:
 
 
 class Follower:
-    """Follows the orbits of a session.
+    """The worker that follows the orbits of a session.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Follower:
         self._next = 0
 
     def follow(self, job: Job) -> None:
-        """Do a job."""
+        """Run a job."""
         request = job.request
         assert isinstance(request, FollowRequest)
         if self._live.model.autonomous and self._live.model.crossing is None:
@@ -186,7 +186,7 @@ def _value(place: Place, name: str) -> float:
 
 
 def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
-    """Orbit that a cell of the cube is on.
+    """Return the closed orbit of a cell of the cube.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
 
 
 def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
-    """Period of the closed orbit that the analysis says a cell ends on; 0 if there is none."""
+    """Return the period of the closed orbit on which a cell ends; 0 if there is none."""
     attractors = live.attractors
     if attractors is None:
         return 0
@@ -239,7 +239,7 @@ def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
 
 
 def _followed(family: Family, state: np.ndarray, begin: float, target: float, job: Job) -> Reached:
-    """Follow an orbit from one value of its parameter to another."""
+    """Follow an orbit from one parameter value to another."""
     problem, scale = OrbitProblem(family), family.scales[0]
     normal = np.zeros(problem.size)
     normal[-1] = 1.0
@@ -270,7 +270,7 @@ def _followed(family: Family, state: np.ndarray, begin: float, target: float, jo
 
 
 def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -> Point | None:
-    """Return the orbit at a value of the parameter a move away; None if it is not found near by."""
+    """Return the orbit after a parameter step; None if none is found nearby."""
     slope = here.tangent / here.tangent[-1] if abs(here.tangent[-1]) > 1e-6 else normal
     ahead = move * slope
     if np.abs(ahead[:-1]).max(initial=0.0) > LONGEST_MOVE:
@@ -286,7 +286,7 @@ def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -
 
 
 def _has_halved(family: Family, point: Point) -> bool:
-    """Whether an orbit of an even period is one of half of it."""
+    """Tell whether an orbit of even period also closes after half of it."""
     if family.period % 2:
         return False
     half = family.mismatch(point.u, point.value.images[family.period // 2 - 1])
@@ -294,7 +294,7 @@ def _has_halved(family: Family, point: Point) -> bool:
 
 
 def _why(point: Point, family: Family, target: float) -> str:
-    """Say why an orbit could not be followed beyond a point."""
+    """Explain why an orbit could not be followed beyond a point."""
     value = float(point.u[-1] * family.scales[0])
     multipliers = np.linalg.eigvals(point.value.monodromy)
     name = family.free[0]
@@ -310,7 +310,7 @@ def _why(point: Point, family: Family, target: float) -> str:
 def described(
     live: LiveRun, place: Place, family: Family, point: Point
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and attributes of an orbit, as the page takes those of a cell."""
+    """Return an orbit's arrays and attributes in the page's form."""
     model, is_flow = live.model, live.model.crossing is not None
     seconds = point.value.seconds
     images = point.value.images

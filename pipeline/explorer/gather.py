@@ -1,4 +1,4 @@
-"""What a copy is made of: the view, answers for every place of the axes, planes, columns, layers."""
+"""Collect the content of a copy: view, answers, planes, columns, layers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Place = dict[str, int]
 
 @dataclass
 class Copied:
-    """What is copied of a run.
+    """The copied content of a run.
 
     Attributes
     ----------
@@ -63,16 +63,16 @@ class Copied:
 
     @property
     def x(self) -> str:
-        """The horizontal axis to begin with."""
+        """Return the default horizontal axis."""
         return str(self.view["axes"][0]["name"])
 
     def size(self) -> int:
-        """Size of the data [bytes]."""
+        """Return the size of the data [bytes]."""
         return sum(map(len, self.objects.values()))
 
 
 def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
-    """Return what both kinds of copies have of a run; the columns are still to come.
+    """Return the content that both kinds of copies share; columns are added later.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
 
 
 def _view(run: ExploredRun, quantities: Sequence[str]) -> tuple[dict[str, Any], int]:
-    """What stands in the run, with those quantities alone on the vertical axis; and how many are not."""
+    """Return the view with these quantities only, and the number left out."""
     known = [q.name for q in run.model.quantities]
     if problems := [unknown_name("--quantity", name, known) for name in quantities if name not in known]:
         raise SpecError(problems)
@@ -137,14 +137,14 @@ def _view(run: ExploredRun, quantities: Sequence[str]) -> tuple[dict[str, Any], 
 
 
 def places(run: ExploredRun, but: str = "") -> Iterator[Place]:
-    """Every combination of indices on the swept axes but one."""
+    """Yield every combination of indices on the swept axes but one."""
     swept = [a for a in run.axes if a.swept and a.name != but]
     for indices in itertools.product(*(range(len(a.values)) for a in swept)):
         yield {a.name: i for a, i in zip(swept, indices, strict=True)}
 
 
 def place_key(run: ExploredRun, at: Mapping[str, int], x: str = "") -> str:
-    """Name of an answer for a place; the page makes the same (`placeKey`)."""
+    """Return the name of an answer for a place; the page builds the same name (`placeKey`)."""
     parts = [f"{a.name}={at.get(a.name, 0)}" for a in run.axes if a.name != x]
     return "&".join([*([f"x={x}"] if x else []), *parts])
 
@@ -181,7 +181,7 @@ def _answers(
 
 
 def add_planes(copied: Copied, most_bytes: float) -> None:
-    """Add the planes of initial states, as long as they take less than so many bytes together."""
+    """Add the planes of initial states, up to a total size."""
     run, size, none = copied.run, 0, None
     objects: dict[str, str] = {}
     found = list(itertools.islice(places(run), MOST_PLACES + 1))
@@ -227,7 +227,7 @@ class Column:
 
 
 def column(run: ExploredRun, x: str, y: str) -> tuple[Column, dict[str, np.ndarray]]:
-    """Read the points of a vertical axis, and status and codes of colours, in the cube's order of cells.
+    """Read the points of a vertical axis, with status and colour codes, in cell order.
 
     Raises
     ------
@@ -256,7 +256,7 @@ def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 def place_of(run: ExploredRun, vertical: Vertical) -> tuple[str, list[int | None]]:
-    """Where the values of a vertical axis stand in the cube: a variable, an index on each dim of its own.
+    """Return where a vertical axis is stored: a variable, and an index on each of its own dims.
 
     The index is None on the dim of sections.
     """

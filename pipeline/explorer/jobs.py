@@ -1,4 +1,4 @@
-"""Jobs of those who watch: one of a kind at a time, cancelled when a newer one comes."""
+"""Run live jobs: one of each kind at a time; a newer job cancels the older one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Emit = Callable[[Answer], None]
 
 
 class Job:
-    """A request on its way.
+    """A request in progress.
 
     Parameters
     ----------
@@ -41,49 +41,49 @@ class Job:
         self.began = time.perf_counter()
 
     def answers_to(self, emit: Emit) -> None:
-        """Say where answers go."""
+        """Set the receiver of answers."""
         self._emit = emit
 
     def cancel(self) -> None:
-        """Let the job end at its next look."""
+        """Ask the job to end at its next check."""
         self._cancelled.set()
 
     @property
     def is_cancelled(self) -> bool:
-        """Whether the job is no longer wanted."""
+        """Tell whether the job is cancelled."""
         return self._cancelled.is_set()
 
     def check(self) -> None:
-        """Raise `CancelledError` if the job is no longer wanted."""
+        """Raise `CancelledError` if the job is cancelled."""
         if self._cancelled.is_set():
             raise CancelledError
 
     def wait(self, seconds: float) -> None:
-        """Wait, and raise `CancelledError` as soon as the job is no longer wanted."""
+        """Wait, and raise `CancelledError` as soon as the job is cancelled."""
         self._cancelled.wait(seconds)
         self.check()
 
     def tell(self, kind: str, **fields: Any) -> None:
-        """Emit JSON."""
+        """Send a JSON answer."""
         if kind != "done" or not fields.get("cancelled"):
             self.check()
         self._emit({"id": self.id, "kind": kind, **fields})
 
     def show(self, kind: str, arrays: Mapping[str, np.ndarray], **attrs: Any) -> None:
-        """Emit arrays."""
+        """Send an answer of arrays."""
         self.check()
         self._emit(pack_arrays(arrays, {"id": self.id, "kind": kind, **attrs}))
 
 
 def _nowhere(answer: Answer) -> None:
-    """Take what nobody waits for."""
+    """Discard an answer that has no receiver."""
 
 
 Work = Callable[[Job], None]
 
 
 class Desk:
-    """Where jobs of one kind are done, one at a time, in a thread while there are any.
+    """The worker for jobs of one kind, one at a time, in a thread that runs only while there are jobs.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class Desk:
         self._closed = False
 
     def put(self, job: Job) -> None:
-        """Take a job in; one that waits or is at work makes way."""
+        """Accept a job; it replaces the waiting and the running one."""
         job.answers_to(self._emit)
         with self._lock:
             if self._closed:
@@ -117,7 +117,7 @@ class Desk:
             left.tell("done", cancelled=True)
 
     def cancel(self, number: int) -> None:
-        """Cancel the job of a number, if it is here."""
+        """Cancel the job with a given number, if it is here."""
         left = None
         with self._lock:
             if self._waiting is not None and self._waiting.id == number:
@@ -128,7 +128,7 @@ class Desk:
             left.tell("done", cancelled=True)
 
     def close(self) -> None:
-        """Cancel all, and take no more."""
+        """Cancel all jobs, and accept no more."""
         with self._lock:
             self._closed, self._waiting = True, None
             if self._current is not None:
@@ -136,11 +136,11 @@ class Desk:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a job is at work or waits."""
+        """Tell whether a job is running or waiting."""
         return self._thread is not None
 
     def join(self, timeout: float) -> None:
-        """Wait until nothing is at work."""
+        """Wait until no job is running."""
         thread = self._thread
         if thread is not None:
             thread.join(timeout)
@@ -165,7 +165,7 @@ class Desk:
 
 
 def sentence_of_error(error: Exception) -> str:
-    """One sentence for whoever asked; what nobody foresaw goes to the log."""
+    """Return one sentence for the user; log unexpected errors."""
     problems = getattr(error, "problems", None)
     if isinstance(error, SpecError | ParameterError) and problems:
         return str(problems[0])

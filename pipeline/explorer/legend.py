@@ -1,4 +1,4 @@
-"""Names and colours of what live trajectories end on: those of the run's figures, where it has them."""
+"""Name and colour the ends of live trajectories, like the run's figures where possible."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Legend:
         self._free = [colour for colour in COLOURS if colour not in taken] or [OTHERS]
 
     def lines(self) -> list[dict[str, Any]]:
-        """All entries: number, name, colour and the run's id, by number."""
+        """Return all entries: number, name, colour and the run's id, by number."""
         new = 0
         found: list[dict[str, Any]] = []
         for entry in sorted(list(self._catalog.entries), key=lambda e: e.number):
@@ -57,11 +57,11 @@ class Legend:
         return found
 
     def line(self, entry: Entry) -> dict[str, Any]:
-        """One entry, as in `lines`."""
+        """Return one entry in the form of `lines`."""
         return next(line for line in self.lines() if line["id"] == entry.number)
 
     def name(self, entry: Entry) -> str:
-        """What an entry is called."""
+        """Return the name of an entry."""
         if entry.attractor is not None:
             return self._names[entry.attractor]
         if entry.status:
@@ -79,7 +79,7 @@ class Legend:
         return f"not among the run's: {text}" if self._known and entry.kind != ABSENT else text
 
     def motion(self, code: int) -> str:
-        """Word of the model's classifier; empty if it says nothing."""
+        """Return the classifier's label; empty if it has none."""
         classifier = self._model.classifier
         if classifier is None or not code or code in classifier.neutral:
             return ""
@@ -110,7 +110,7 @@ def _status_word(status: int) -> str:
 
 
 def _shown(stability: int) -> str:
-    """What has been shown of something that does not attract; of what attracts nothing is said."""
+    """Describe the stability shown for a set that does not attract; empty for an attractor."""
     return "" if stability in (0, ATTRACTS) else STABILITIES[stability].replace("_", " ")
 
 

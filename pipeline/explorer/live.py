@@ -1,4 +1,4 @@
-"""What is computed while one watches: starts, slices, orbits that follow a parameter, runs of a region.
+"""Compute live requests: starts, slices, orbits that follow a parameter, runs of a region.
 
 `LiveRun` is what all who watch a run share: compiled code, the attractors of parameter points, threads for
 the kernel. `LiveSession` is one of those who watch: it takes messages (see `messages`) and gives answers to
@@ -54,7 +54,7 @@ CLOSING_S = PATIENCE_S + 2.0
 
 
 def live_problem(run: Run) -> str | None:
-    """Say in one sentence why nothing can be computed live for a run; None if it can."""
+    """Return the reason why a run allows no live computing; None if it does."""
     if run.spec.recorded is not None:
         return (
             f"the drive of {run.name} is the recording {run.spec.recorded.file}, and a live trajectory would "
@@ -68,7 +68,7 @@ def live_problem(run: Run) -> str | None:
 
 
 class LiveRun:
-    """A run as those who watch it share it.
+    """The state shared by all live sessions of a run.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class LiveRun:
         self._warming = Warming(self)
 
     def close(self) -> None:
-        """End all sessions and what they have begun, runs of a region among it; waits until it has ended."""
+        """End all sessions and their jobs, including runs of a region; wait until they have ended."""
         with self._lock:
             sessions = list(self._sessions)
         for session in sessions:
@@ -104,7 +104,7 @@ class LiveRun:
         self.pool.shutdown(wait=False, cancel_futures=True)
 
     def enter(self, session: LiveSession) -> None:
-        """Take a session in, which is ended with the run."""
+        """Register a session, so that it ends with the run."""
         with self._lock:
             self._sessions.add(session)
 
@@ -114,17 +114,17 @@ class LiveRun:
             self._sessions = {s for s in self._sessions if s is not session and not s.is_over}
 
     def warm(self, tell: Callable[[int, int], None] | None = None) -> None:
-        """Compile and read in the background what jobs need; `tell` hears how much of it is done."""
+        """Compile and read in the background; `tell` receives the progress."""
         self._warming.begin(tell)
 
     def is_warm(self, what: str) -> bool:
-        """Whether what work needs is compiled: ``series``, ``sections``, ``maps`` or ``attractors``."""
+        """Tell whether a step is compiled: ``series``, ``sections``, ``maps`` or ``attractors``."""
         return self._warming.has_done(what)
 
     # ---- parameter points --------------------------------------------------------------------
 
     def place(self, values: Mapping[str, float], frequency: float | None) -> Place:
-        """Return a parameter point; what is not given is the run's own.
+        """Return a parameter point; missing values are the run's own.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class LiveRun:
         parameters = self.spec.values.replace(**values)
         hertz = self._frequency(frequency)
         index = self._index(parameters, hertz)
-        if index is not None:  # the cube's own bits, whatever became of the last digit on the way
+        if index is not None:  # use the cube's exact value: the request may have lost the last digit
             for axis, i in zip(parameter_axes(self.spec), index, strict=True):
                 if axis.parameter == FREQUENCY:
                     hertz = float(axis.values[i])
@@ -179,7 +179,7 @@ class LiveRun:
         return tuple(found)
 
     def state(self, values: Mapping[str, float], place: Place) -> np.ndarray:
-        """Return an initial state by name, 0 where nothing is given.
+        """Return an initial state by name; missing values are 0.
 
         Raises
         ------
@@ -196,7 +196,7 @@ class LiveRun:
         return state
 
     def check_states(self, states: np.ndarray, place: Place) -> None:
-        """Refuse states at which the equations of a model as text have no value; raises `SpecError`."""
+        """Raise `SpecError` for states at which the equations of a text model have no value."""
         point = {**place.parameters, FREQUENCY: place.frequency}
         check_states(self.model.flow, states, [point])
 
@@ -204,14 +204,14 @@ class LiveRun:
 
     @property
     def attractors(self) -> xr.Dataset | None:
-        """The run's attractors, if they are kept in ``derived/``; nothing is computed."""
+        """Return the run's attractors stored in ``derived/``, if any; compute nothing."""
         with self._lock:
             if self._attractors is None:
                 self._attractors = stored(self.run, "attractors")
             return self._attractors
 
     def catalog(self, place: Place) -> Catalog:
-        """Attractors of a parameter point as far as known; the same object for the same point."""
+        """Return the known attractors of a parameter point; the same object for the same point."""
         known = self._known(place)
         key = (float(known.attractors is not None), *place.key)
         with self._lock:
@@ -235,18 +235,18 @@ class LiveRun:
 
     @property
     def cube(self) -> xr.Dataset:
-        """The run's cube, opened once."""
+        """Return the run's cube, opened once."""
         with self._lock:
             if self._cube is None:
                 self._cube = self.run.cube()
             return self._cube
 
     def legend(self, catalog: Catalog) -> Legend:
-        """Names and colours of what trajectories of a point end on."""
+        """Return the names and colours of a point's attractors."""
         return Legend(catalog, self.attractors)
 
     def first_start(self) -> tuple[Place, np.ndarray]:
-        """A parameter point of the run, and a start there."""
+        """Return a parameter point of the run, and a start there."""
         cells = CellMap(self.spec)
         block = tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
         inputs = cells.inputs(block)
@@ -260,17 +260,17 @@ def _same(a: float, b: float) -> bool:
 
 
 class Warming:
-    """Compiles what jobs need, once, in a thread of its own."""
+    """The thread that compiles the code for jobs, once."""
 
     def __init__(self, live: LiveRun) -> None:
         self._live, self._lock = live, threading.Lock()
         self._thread: threading.Thread | None = None
         self._done, self._listeners = 0, list[Callable[[int, int], None]]()
-        # the orbit behind a point is what is asked for first
+        # the orbit behind a point is usually requested first
         self._steps = (self._series, self._sections, self._maps, self._attractors)
 
     def begin(self, tell: Callable[[int, int], None] | None) -> None:
-        """Begin unless that was done; `tell` hears of every step from now on."""
+        """Begin unless already begun; `tell` receives every step from now on."""
         with self._lock:
             if tell is not None and self._done < len(self._steps):
                 self._listeners.append(tell)
@@ -282,7 +282,7 @@ class Warming:
             tell(done, len(self._steps))
 
     def has_done(self, what: str) -> bool:
-        """Whether a step is over, well or not."""
+        """Tell whether a step has ended, with or without success."""
         with self._lock:
             return f"_{what}" in [step.__name__ for step in self._steps[: self._done]]
 
@@ -290,7 +290,7 @@ class Warming:
         for step in self._steps:
             try:
                 step()
-            except Exception as error:  # a job that needs it will say what is wrong
+            except Exception as error:  # the job that needs it will report the error
                 LOG.info("warming: %s", error)
             with self._lock:
                 self._done += 1
@@ -328,7 +328,7 @@ class Warming:
 
 
 class LiveSession:
-    """One who watches a run.
+    """One user's live session.
 
     Parameters
     ----------
@@ -355,7 +355,7 @@ class LiveSession:
             self._emit(answer)
 
     def receive(self, text: str | bytes) -> None:
-        """Take a message; whatever is wrong with it is answered, and nothing is raised."""
+        """Handle a message; errors are answered, never raised."""
         try:
             request: Request = read_request(text)
         except RequestError as error:
@@ -373,7 +373,7 @@ class LiveSession:
         self._desks[request.do].put(Job(request))
 
     def close(self) -> None:
-        """Cancel all jobs; nothing is emitted from now on."""
+        """Cancel all jobs; emit nothing from now on."""
         self._closed.set()
         for desk in self._desks.values():
             desk.close()
@@ -382,7 +382,7 @@ class LiveSession:
 
     @property
     def is_over(self) -> bool:
-        """Whether it is closed and no job is at work."""
+        """Tell whether the session is closed and no job is running."""
         return self._closed.is_set() and not any(desk.is_busy for desk in self._desks.values())
 
     def join(self, timeout: float = 30.0) -> None:

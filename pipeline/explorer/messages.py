@@ -1,7 +1,7 @@
-"""What a page asks for over the live connection: read, bounded and refused in one sentence.
+"""Read the page's live requests: check, bound, or refuse each with one sentence.
 
 A message is a JSON object with an ``id`` of the page's choice and ``do``, the name of a job; see the classes
-here. Nothing of it names a file.
+here. No field of a message names a file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Pair = tuple[float, float]
 
 
 class RequestError(ValueError):
-    """A message cannot be taken.
+    """A message that cannot be accepted.
 
     Attributes
     ----------
@@ -40,19 +40,19 @@ class RequestError(ValueError):
 
 
 class Message(BaseModel):
-    """What all messages have: strict types, no unknown keys, no NaN and no infinity."""
+    """The base of all messages: strict types, no unknown keys, no NaN and no infinity."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
 
 
 class Job(Message):
-    """A job of the page's number `id`."""
+    """A job with the page's number `id`."""
 
     id: int = Field(ge=0, le=2**53)
 
 
 class StartRequest(Job):
-    """Integrate a start and say where it ends."""
+    """A request to integrate a start and tell where it ends."""
 
     do: Literal["start"]
     parameters: Values = {}
@@ -62,7 +62,7 @@ class StartRequest(Job):
 
 
 class SliceRequest(Job):
-    """Say where the starts of a plane end."""
+    """A request for the ends of the starts of a plane."""
 
     do: Literal["slice"]
     parameters: Values = {}
@@ -81,13 +81,13 @@ class CellPoint(Message):
 
 
 class KeptOrbit(Message):
-    """An orbit that an earlier answer has named."""
+    """An orbit named by an earlier answer."""
 
     orbit: int = Field(ge=0, le=2**53)
 
 
 class FollowRequest(Job):
-    """Follow a periodic orbit to another value of a parameter."""
+    """A request to follow a periodic orbit to another parameter value."""
 
     do: Literal["follow"]
     origin: CellPoint | KeptOrbit = Field(alias="from")
@@ -96,7 +96,7 @@ class FollowRequest(Job):
 
 
 class Region(Message):
-    """A part of what a run has computed.
+    """A part of a run's parameters or starts.
 
     Attributes
     ----------
@@ -117,13 +117,13 @@ class Region(Message):
 
 
 class RunRequest(Job, Region):
-    """Run the specification of a region."""
+    """A request to run the specification of a region."""
 
     do: Literal["run"]
 
 
 class CancelRequest(Job):
-    """Cancel a job."""
+    """A request to cancel a job."""
 
     do: Literal["cancel"]
     job: int = Field(ge=0, le=2**53)
@@ -151,7 +151,7 @@ def read_request(text: str | bytes) -> Request:
 
 
 def sentence_of(error: ValidationError) -> str:
-    """One sentence for the first thing that is wrong."""
+    """Return one sentence on the first error."""
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
     jobs = {"start", "slice", "follow", "run", "cancel"}
     if str(first["type"]).startswith("union_tag"):
@@ -162,7 +162,7 @@ def sentence_of(error: ValidationError) -> str:
 
 
 def number_in(text: str | bytes) -> int | None:
-    """The ``id`` of a message that is not read further; None if it has none."""
+    """Return the ``id`` of a rejected message; None if it has none."""
     try:
         number = json.loads(text)["id"]
     except (ValueError, KeyError, TypeError, RecursionError):

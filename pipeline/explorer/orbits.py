@@ -1,4 +1,4 @@
-"""The orbit behind a point of the diagram: integrated from the section point that the cube keeps."""
+"""Integrate the orbit behind a point of the diagram, from the section point in the cube."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MOST_SEEDS = 200
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of the cube, and where it was computed.
+    """A cell of the cube, with its parameters and its start.
 
     Attributes
     ----------
@@ -69,23 +69,23 @@ class Cell:
 
     @property
     def status(self) -> Status:
-        """What became of it."""
+        """Return the cell's status."""
         return Status(int(self.data["status"]))
 
     @property
     def section(self) -> np.ndarray:
-        """Kept sections, shape (n_keep, n_states); NaN where there are none."""
+        """Return the kept sections, shape (n_keep, n_states); NaN where there are none."""
         return np.asarray(self.data["section"].transpose("period_index", "state").values, np.float64)
 
     @property
     def period(self) -> int:
-        """Period in drive periods or returns, 0 if the kept sections do not close."""
+        """Return the period in drive periods or returns, 0 if the kept sections do not close."""
         closed = self.status in (Status.PERIODIC, Status.INFERRED)
         return int(self.data["orbit_period"]) if closed else 0
 
 
 def cell_of(run: ExploredRun, number: int) -> Cell:
-    """Read a cell; raises `ExplorerError` if there is none of this number, or it has no section."""
+    """Read a cell; raise `ExplorerError` if it does not exist or has no section."""
     index = run.cell(number)
     cube = run.cube()
     names = [n for n in ("section", "turns", "status", "orbit_period", "lyapunov") if n in cube]
@@ -97,7 +97,7 @@ def cell_of(run: ExploredRun, number: int) -> Cell:
 
 
 def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
-    """Return the orbit behind a point as the page takes it.
+    """Return the orbit behind a point in the page's form.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def _no_point(cell: Cell, point: int, n_points: int) -> str:
 
 
 def _seconds(run: Run, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndarray:
-    """When each of the periods from a section point ends [s]; they are integrated where no drive tells."""
+    """Return the end time of each period from a section point [s]; integrate if there is no drive."""
     if run.model.crossing is None:
         return np.asarray(np.arange(1, n_periods + 1) / cell.clock_hz)
     from magpend_core.sections import run_branches
@@ -208,14 +208,14 @@ _TOLD = ("attractor", "share", "low", "high", "kind", "stability", "evidence")
 
 
 def _is_stable(stability: str | None, multipliers: np.ndarray | None) -> bool | None:
-    """Whether an orbit attracts: as the analysis has shown, else by its multipliers; None if nobody knows."""
+    """Tell whether an orbit attracts: by the analysis, else by its multipliers; None if unknown."""
     if stability is not None:
         return {STABILITIES[ATTRACTS]: True, STABILITIES[UNSTABLE]: False}.get(stability)
     return None if multipliers is None else bool(np.abs(multipliers).max() < 1.0)
 
 
 def shown(one: xr.Dataset) -> dict[str, str | None]:
-    """Kind and stability of a set at a parameter point, and what the stability rests on, None for nothing."""
+    """Return a set's kind and stability at a point, with the evidence for the stability (or None)."""
     evidence = int(one["evidence"])
     return {
         "kind": KINDS[int(one["kind"])].replace("_", " "),
@@ -225,7 +225,7 @@ def shown(one: xr.Dataset) -> dict[str, str | None]:
 
 
 def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
-    """What the run's attractors say of the set that a cell is on; nothing where they are not known.
+    """Return the stored attractor data of a cell's set; empty if unknown.
 
     A cell whose sections do not close may be on its way to a closed orbit all the same.
     """
@@ -239,7 +239,7 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
         return nothing
     here = found.isel({**_parameter_index(run, cell), "attractor": number})
     told = {**nothing, "attractor": number, "share": finite(here["share"]), **shown(here)}
-    if BRANCH not in run.start_dims:  # walks are no sample of initial states
+    if BRANCH not in run.start_dims:  # branches of a continuation are no sample of initial states
         low, high = share_interval(np.array([int(here["n_cells"])]), np.array([float(here["share"])]))
         told |= {"low": finite(low[0]), "high": finite(high[0])}
     multipliers = here["multiplier_real"].values + 1j * here["multiplier_imag"].values
@@ -256,7 +256,7 @@ def _parameter_index(run: ExploredRun, cell: Cell) -> dict[str, int]:
 
 
 def linearise(cell: Cell) -> tuple[np.ndarray | None, float | None]:
-    """Floquet multipliers of the closed orbit that a cell is on, and its period [s].
+    """Return the Floquet multipliers and the period [s] of a cell's closed orbit.
 
     Newton's method begins at the last kept section; None if it does not end on an orbit of the cell's period
     within the distance at which cells of one orbit lie.
@@ -280,7 +280,7 @@ def linearise(cell: Cell) -> tuple[np.ndarray | None, float | None]:
 def _exponents(
     cell: Cell, multipliers: np.ndarray | None, seconds: float | None
 ) -> tuple[list[float] | None, str | None]:
-    """Lyapunov exponents [1/s]: those of the cube; of a closed orbit from its multipliers."""
+    """Return Lyapunov exponents [1/s] from the cube, or from a closed orbit's multipliers."""
     if "lyapunov" in cell.data:
         own = cell.data["lyapunov"].values
         if np.isfinite(own).all():
@@ -298,7 +298,7 @@ def _exponents(
 
 
 def finite(value: Any) -> float | None:
-    """A number as JSON has it."""
+    """Return a number, or None if it is not finite, for JSON."""
     number = float(value)
     return number if math.isfinite(number) else None
 
@@ -308,7 +308,7 @@ def _state(run: ExploredRun, values: np.ndarray) -> dict[str, float]:
 
 
 def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
-    """Initial states at the cell's parameter point that end on its attractor, its own first.
+    """Return the initial states at the cell's point that end on its attractor, its own first.
 
     Without attractors it is the cell's own alone. Each has a value of every state, and a ``label``.
     """
@@ -332,7 +332,7 @@ def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
 
 
 def _starts_of(run: ExploredRun, name: str) -> np.ndarray:
-    """Initial values of a state, over the dims of the starts."""
+    """Return the initial values of a state, over the dims of the starts."""
     coordinate = run.cube().coords[name]
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in run.start_dims]
     shaped = [n if d in coordinate.dims else 1 for d, n in zip(run.start_dims, sizes, strict=True)]

@@ -1,4 +1,4 @@
-"""What lies over, under and beside a diagram: branches, curves over the same axis, attractors of a point.
+"""Read the curves, branches and attractors shown with a diagram.
 
 All of it is read from the cube and from ``derived/``; what no analysis has found is not there.
 """
@@ -39,7 +39,7 @@ MOST_SECTION = 2000
 
 
 def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return exponents and shares over the horizontal axis.
+    """Return exponents and basin fractions over the horizontal axis.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """Exponents of the cells: their mean over the starts, least and largest as its band."""
+    """Return the mean exponents over the starts, with the least and largest as a band."""
     cube = run.cube()
     if "lyapunov" not in cube:
         return
@@ -99,7 +99,7 @@ def _size(array: xr.DataArray, dims: list[Any]) -> int:
 
 
 def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """Largest exponent and share of each attractor, with gaps where it is absent or does not attract."""
+    """Return each attractor's largest exponent and share, with gaps where it does not attract."""
     found = run.kept("attractors")
     if found is None:
         return
@@ -188,7 +188,7 @@ def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str, int]) -> bool:
-    """Whether a branch was followed at a place of the other axes."""
+    """Tell whether a branch was followed at given values of the other axes."""
     for name, index in place.items():
         value = float(run.axis(name).values[index])
         there = float(found[name][branch]) if name in found else _base(run, name)
@@ -198,7 +198,7 @@ def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str,
 
 
 def _base(run: ExploredRun, axis: str) -> float:
-    """Value that a swept parameter has in the specification beside its axis."""
+    """Return the base value of a swept parameter in the specification."""
     if axis == FREQUENCY_DIM:
         own = run.spec.frequency_hz
         return math.nan if own is None else float(own)
@@ -206,7 +206,7 @@ def _base(run: ExploredRun, axis: str) -> float:
 
 
 def _segments(x: np.ndarray, y: np.ndarray, stable: bool) -> Iterator[dict[str, Any]]:
-    """A polyline without the gaps that NaN makes."""
+    """Split a polyline at NaN."""
     gaps = np.flatnonzero(~np.isfinite(x))
     for first, stop in zip([0, *(gaps + 1)], [*gaps, len(x)], strict=True):
         if stop - first >= 2:
@@ -214,7 +214,7 @@ def _segments(x: np.ndarray, y: np.ndarray, stable: bool) -> Iterator[dict[str, 
 
 
 def _motion(found: xr.Dataset, branch: int) -> str | None:
-    """Class of the motion along a branch, by the model's words."""
+    """Return the class of motion along a branch, as the model's label."""
     classifier = model_of(found).classifier
     if classifier is None or "side" not in found:
         return None
@@ -223,7 +223,7 @@ def _motion(found: xr.Dataset, branch: int) -> str | None:
 
 
 def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
-    """A located bifurcation."""
+    """Return a located bifurcation in the page's form."""
     branch, kind = int(found["of_branch"][k]), KINDS[int(found["kind"][k])]
     period = int(found["orbit_period"][branch])
     criticality = CRITICALITIES[int(found["criticality"][k])]

@@ -1,4 +1,4 @@
-"""Data of a copy as its page takes them: arrays or JSON in gzip.
+"""Pack a copy's data for its page: arrays or JSON in gzip.
 
 Bytes of numbers lie apart, all first bytes before all second ones, which gzip makes a third smaller.
 `page/src/export-data.js` is the other end.
@@ -20,7 +20,7 @@ LEVEL = 6
 
 
 def packed(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
-    """Return arrays and attributes as an object of data.
+    """Return arrays and attributes as a packed object.
 
     Parameters
     ----------
@@ -47,10 +47,10 @@ def packed(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = N
 
 
 def packed_json(value: Any) -> bytes:
-    """Return what JSON can say as an object of data; no NaN and no infinity."""
+    """Return a JSON value as a packed object; no NaN and no infinity."""
     return _zipped(json.dumps(value, allow_nan=False, separators=(",", ":")).encode())
 
 
 def _zipped(content: bytes) -> bytes:
-    # without a time: the same content is the same bytes
+    # no time stamp, so that equal content gives equal bytes
     return gzip.compress(content, LEVEL, mtime=0)

@@ -1,4 +1,4 @@
-"""The page's HTML: everything else of it is the script and the style of `static/`."""
+"""Write the page's HTML; script and style come from `static/`."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _NOTE = """<!doctype html>
 
 
 def page(title: str, token: str) -> str:
-    """The page of a run; the token is what its script sends with every request."""
+    """Return the page of a run; its script sends the token with every request."""
     return _PAGE.format(title=escape(f"{title} - magpend"), token=escape(token))
 
 
 def note(sentence: str) -> str:
-    """A page with one sentence."""
+    """Return a page with one sentence."""
     return _NOTE.format(sentence=escape(sentence))

@@ -1,4 +1,4 @@
-"""Symbols of models as plain text: what a page shows where nothing sets LaTeX."""
+"""Write model symbols as plain text, for places that do not render LaTeX."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SUBSCRIPT = re.compile(r"_(?:\{([^{}]*)\}|(.))")
 
 
 def _letter(name: str) -> str:
-    """A Greek letter by its name in LaTeX; anything else stays a word."""
+    """Return a Greek letter by its LaTeX name; keep any other word."""
     known = name.lower().removeprefix("var")
     case = "SMALL" if name[0].islower() else "CAPITAL"
     # Unicode spells lambda differently
@@ -51,7 +51,7 @@ def plain(symbol: str, name: str) -> str:
 
 
 def _lowered(found: re.Match[str]) -> str:
-    """A subscript in small letters, if there are such for all of it."""
+    """Return a subscript in Unicode, if every letter has a subscript form."""
     text = (found[1] if found[1] is not None else found[2]).replace(" ", "")
     small = text.translate(_SUBSCRIPTS)
     return small if all(a != b for a, b in zip(text, small, strict=True)) else f"_{text}"

@@ -1,4 +1,4 @@
-"""The plane of initial states at a parameter point: which start leads where, as far as the run knows."""
+"""Label the plane of initial states at a parameter point by the known ends of the starts."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Plane:
 
 
 def plane(run: Run, at: Mapping[str, int]) -> bytes:
-    """Return the plane of initial states at a parameter point as the page takes it.
+    """Return the plane of initial states at a parameter point in the page's form.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def plane_of(run: ExploredRun, at: Mapping[str, int]) -> Plane:
 
 
 def _scheme(run: ExploredRun) -> Scheme:
-    """What starts are told apart by: attractors if they are known, else motions, else what became of them."""
+    """Return the scheme for starts: attractors if known, else motions, else status."""
     known = {s.name: s for s in schemes(run)}
     return next(known[name] for name in ("attractor", "motion", "status") if name in known)
 
@@ -122,7 +122,7 @@ def _of_grid(run: ExploredRun, place: Mapping[str, int], scheme: Scheme, dims: l
 
 
 def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Plane:
-    """Starts that are no grid, one by one: those of a continuation are where its walks begin."""
+    """Return starts that form no grid, one by one; for a continuation the starts of its branches."""
     from pipeline.explorer.view import planes
 
     pairs = planes(run)
@@ -140,7 +140,7 @@ def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Pl
 
 
 def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Dataset:
-    """The cells at a parameter point, with their places in the cube, loaded."""
+    """Load the cells at a parameter point, with their indices in the cube."""
     cube = run.cube()
     names = [n for n in cube.data_vars if n in {"status", *scheme.needs}]
     numbered = cube[names].assign_coords({
@@ -156,7 +156,7 @@ def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Data
 
 
 def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
-    """Label of each start."""
+    """Return the label of each start."""
     codes = part["_code"].values
     told = np.where(codes < 0, NONE, codes)
     if scheme.name != "status":
@@ -165,7 +165,7 @@ def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
 
 
 def _categories(scheme: Scheme, labels: np.ndarray) -> list[Category]:
-    """What the labels that occur stand for."""
+    """Return the meaning of each label that occurs."""
     present = set(np.unique(labels).tolist())
     found = [c for c in scheme.categories if c.number in present]
     if _DIVERGED in present:
@@ -178,7 +178,7 @@ def _state_of(run: ExploredRun, dim: str) -> str:
 
 
 def _fixed(run: ExploredRun, part: xr.Dataset, states: tuple[str, str]) -> dict[str, float]:
-    """Values of the states that are not shown, where all starts share one."""
+    """Return the values of hidden states that all starts share."""
     found = {}
     for state in run.model.states:
         values = np.unique(np.asarray(part.coords[grid_dim(state.name)].values, np.float64))
@@ -188,7 +188,7 @@ def _fixed(run: ExploredRun, part: xr.Dataset, states: tuple[str, str]) -> dict[
 
 
 def _spread(part: xr.Dataset, name: str, like: xr.DataArray) -> np.ndarray:
-    """A coordinate of the starts, one value for each cell."""
+    """Return a coordinate of the starts, one value for each cell."""
     coordinate = part.coords[name]
     values = xr.DataArray(coordinate.values.astype(np.float64), dims=coordinate.dims)
     plain = xr.DataArray(np.zeros(like.shape), dims=like.dims)

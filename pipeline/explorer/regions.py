@@ -1,4 +1,4 @@
-"""A region that one has drawn on the page, as a specification of its own, and its run beside this one."""
+"""Turn a region drawn on the page into a specification, and run it beside this run."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _PACKAGES = Path(__file__).parents[2]
 
 
 def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
-    """Return the specification of a region of a run, and notes on what reaches beyond the run.
+    """Return the specification of a region, and notes on parts outside the run.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
 
 
 def zoom_toml(run: Run, region: Region) -> str:
-    """Return the specification of a region as a TOML text, with a line that says where it is from."""
+    """Return the specification of a region as TOML, with a line on its origin."""
     spec, notes = zoomed(run, region)
     head = [
         f"# Zoom into a run, digest {run.info.digest}.",
@@ -70,7 +70,7 @@ def zoom_toml(run: Run, region: Region) -> str:
 
 
 def changes_of(run: Run, region: Region) -> Changes:
-    """Return what differs in the specification of a region."""
+    """Return the changes to the specification for a region."""
     swept = {axis.parameter: axis for axis in parameter_axes(run.spec)}
     first, second = _names(run, region, list(swept))
     ranges = {}
@@ -92,7 +92,7 @@ def changes_of(run: Run, region: Region) -> Changes:
 
 
 def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]:
-    """Keys of the specification that the intervals are of; None for one that is of neither axis nor start."""
+    """Return the specification keys of the intervals; None for one that is neither axis nor start."""
     walk = run.spec.continuation
     if region.axes is None:
         if not swept:
@@ -107,7 +107,7 @@ def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]
         raise RequestError(f"axes: {region.axes[0]!r} is not what the run sweeps: {', '.join(known)}.")
     if len(given) < 2 or given[1] == first:
         return first, None
-    # a state across a parameter is a diagram's height, and no range of starts
+    # a state over a parameter is the diagram's vertical axis, not a range of starts
     fits = given[1] in known and (given[1] in swept or first in states)
     return first, given[1] if fits else None
 
@@ -117,7 +117,7 @@ def _key(name: str) -> str:
 
 
 def _rounded(name: str, low: float, high: float) -> tuple[float, float]:
-    """Ends without the digits that a hand on a mouse cannot mean."""
+    """Round the ends to digits that a mouse drag can resolve."""
     if not low < high:
         raise RequestError(f"{name}: the interval {low:g} to {high:g} is empty; its end must be greater.")
     if not math.isfinite(high - low):
@@ -135,14 +135,14 @@ def _one_line(text: str) -> str:
 
 
 def region_name(run: Run, spec: Spec) -> str:
-    """Name of the directory for a region of a run: the same for the same specification."""
+    """Return the directory name for a region; equal specifications have equal names."""
     digest = hashlib.sha256(canonical(spec.as_dict()).encode()).hexdigest()[:8]
     base = re.sub(r"-zoom-[0-9a-f]{8}$", "", run.directory.resolve().name)
     return f"{base}-zoom-{digest}"
 
 
 class RegionRunner:
-    """Runs regions, one at a time for all who watch.
+    """The worker that runs regions, one at a time for all users.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ class RegionRunner:
         self._live, self._busy = live, live.region_lock
 
     def run(self, job: Job) -> None:
-        """Do a job."""
+        """Run a job."""
         request = job.request
         assert isinstance(request, RunRequest)
         spec = self._checked(request)
@@ -190,7 +190,7 @@ class RegionRunner:
         return spec
 
     def _watch(self, job: Job, spec: Spec, path: Path, out: Path) -> None:
-        """Start the run, tell how far it is, and wait for its end."""
+        """Start the run, report its progress, and wait for its end."""
         plan = make_plan(spec)
         words = ["run", str(path), "--out", str(out), *(["--workers", "0"] if plan.n_tasks == 1 else [])]
         job.tell("progress", done=0, total=plan.n_cells, name=out.name)
@@ -212,7 +212,7 @@ class RegionRunner:
 
 
 def _committed(out: Path) -> int:
-    """Cells that are committed; 0 before there is a run."""
+    """Return the number of committed cells; 0 before there is a run."""
     with contextlib.suppress(StoreError, OSError):
         return state(out).n_committed
     return 0
@@ -220,7 +220,7 @@ def _committed(out: Path) -> int:
 
 @contextlib.contextmanager
 def _group(words: list[str], folder: Path, said: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the command line in a group of its own, which ends with the block."""
+    """Run the command line in its own process group, which ends with the block."""
     path = os.pathsep.join([str(_PACKAGES), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     process = subprocess.Popen(
         [sys.executable, "-m", "pipeline.cli.main", *words], cwd=folder,
@@ -234,7 +234,7 @@ def _group(words: list[str], folder: Path, said: Any) -> Iterator[subprocess.Pop
 
 
 def _end_group(process: subprocess.Popen[bytes]) -> None:
-    """End a process and all that it started: in order, and after a while by force."""
+    """End a process group: first politely, then by force."""
     if process.poll() == 0:
         return
     if process.poll() is None:

@@ -1,4 +1,4 @@
-"""Who may talk to the explorer's server: whoever has the token, from this machine, and no other page.
+"""Decide which requests the explorer answers: only this machine's page with the token.
 
 A server on loopback can be reached by every process of the machine and, through a browser, by every page
 that is open in it. So there is a random token in the address that is printed, and every request but those
@@ -25,13 +25,13 @@ FROM_HERE = ("same-origin", "none")
 
 
 def new_token() -> str:
-    """A token that nobody can guess."""
+    """Return a random token that cannot be guessed."""
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
 @dataclass(frozen=True)
 class Guard:
-    """Says which requests are answered.
+    """The check of every request.
 
     Attributes
     ----------
@@ -44,11 +44,11 @@ class Guard:
 
     @property
     def hosts(self) -> tuple[str, ...]:
-        """Names by which this server may be called."""
+        """Return the host names of this server."""
         return f"127.0.0.1:{self.port}", f"localhost:{self.port}"
 
     def foreign(self, headers: Mapping[str, str]) -> str | None:
-        """Return why a request is none of this page's or of a person's, or None."""
+        """Return why a request is from neither this page nor a user, or None."""
         if headers.get("Host", "").lower() not in self.hosts:
             return "this server answers to its own address alone; use the one that it printed"
         origin = headers.get("Origin")
@@ -59,11 +59,11 @@ class Guard:
         return None
 
     def knows(self, given: str) -> bool:
-        """Whether this is the token; takes as long whatever is given."""
+        """Tell whether this is the token, in constant time."""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def authorised(self, headers: Mapping[str, str], argument: str = "") -> bool:
-        """Whether a request brings the token: in a header, or as the argument ``token``."""
+        """Tell whether a request has the token: in a header, or as the argument ``token``."""
         given = [headers.get(name, "") for name in TOKEN_HEADERS]
         bare = [g[len(_SCHEME) :] if g.lower().startswith(_SCHEME) else g for g in given]
         found = [self.knows(one) for one in (*bare, argument)]
@@ -71,7 +71,7 @@ class Guard:
 
 
 def content_policy(port: int) -> str:
-    """Content policy of the page: its own script and style, the workers that it makes, nothing else."""
+    """Return the page's content policy: its own script and style, and its workers."""
     sockets = f"ws://127.0.0.1:{port} ws://localhost:{port}"  # some browsers do not take 'self' for these
     return (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
@@ -81,7 +81,7 @@ def content_policy(port: int) -> str:
 
 
 def headers_of(port: int) -> dict[str, str]:
-    """Headers of every answer."""
+    """Return the headers of every answer."""
     return {
         "Content-Security-Policy": content_policy(port),
         "X-Content-Type-Options": "nosniff",
@@ -95,7 +95,7 @@ def headers_of(port: int) -> dict[str, str]:
 
 
 class Rate:
-    """Lets so many through per second on average, and a burst at once.
+    """A rate limit with a mean rate per second and a burst.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class Rate:
         self._left, self._then = float(burst), time.monotonic()
 
     def allows(self) -> bool:
-        """Take one, if there is one left."""
+        """Consume one allowance; return whether there was one."""
         now = time.monotonic()
         self._left = min(self._burst, self._left + (now - self._then) * self._per_second)
         self._then = now

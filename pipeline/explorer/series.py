@@ -1,4 +1,4 @@
-"""Time series of an orbit or of a start, with what the model can tell and draw of it."""
+"""Compute the time series of an orbit or a start, with the model's quantities and drawing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SAMPLES = 128
 
 
 def drawn_points(model: Model, parameters: Mapping[str, float], states: np.ndarray) -> np.ndarray | None:
-    """Places of the drawing's moving points, shape (n, n_points, 2); None if the model has no drawing.
+    """Return positions of the drawing's moving points, shape (n, n_points, 2), or None without a drawing.
 
     They are in the order in which `Drawing.points` names them.
     """
@@ -27,7 +27,7 @@ def drawn_points(model: Model, parameters: Mapping[str, float], states: np.ndarr
 
 
 def fixed_points(model: Model, parameters: Mapping[str, float]) -> dict[str, list[float]]:
-    """Places of the drawing's points that do not move, by name."""
+    """Return the positions of the drawing's fixed points, by name."""
     if model.drawing is None:
         return {}
     return {name: [float(x) for x in place] for name, place in model.drawing.fixed(parameters).items()}
@@ -43,7 +43,7 @@ def series(
     atol: float,
     with_quantities: bool = True,
 ) -> dict[str, np.ndarray]:
-    """States over time from a section, and what the model says of them.
+    """Integrate the states over time from a section, with quantities and drawing.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def orbit_series(
     parameters: Parameters, clock_hz: float, state: np.ndarray, n_periods: int, seconds: float,
     *, rtol: float = 1e-9, atol: float = 1e-9,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """`series` over the periods of an orbit, both ends included; `seconds` is how long all of them take."""
+    """Return `series` over the periods of an orbit, both ends included; `seconds` is their total time."""
     n = max(1, min(n_periods * SAMPLES, 65_536))
     times = seconds * np.arange(n + 1) / n
     return series(parameters, clock_hz, state, times, rtol=rtol, atol=atol)

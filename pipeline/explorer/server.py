@@ -1,4 +1,4 @@
-"""The explorer's server: answers one page on loopback from one run, which it only reads.
+"""Serve one read-only page of a run on loopback.
 
 What takes long to import is imported once the address is known, while a browser starts.
 
@@ -64,7 +64,7 @@ STATIC = {
 
 
 def static_files() -> dict[str, tuple[bytes, str]]:
-    """Content and type of the page's files, read once."""
+    """Return content and type of the page's files, read once."""
     folder = resources.files("pipeline.explorer") / "static"
     return {
         name: ((folder / name).read_bytes(), kind)
@@ -74,7 +74,7 @@ def static_files() -> dict[str, tuple[bytes, str]]:
 
 
 class Service:
-    """What the handlers share.
+    """The state shared by the request handlers.
 
     Parameters
     ----------
@@ -100,11 +100,11 @@ class Service:
         self.compiled: asyncio.Event | None = None
 
     def refresh(self) -> None:
-        """Look again at what stands in the directory: cells and analyses may have been added."""
+        """Read the directory again, for new cells and analyses."""
         self.run = self.run.refreshed()
 
     def warm(self) -> None:
-        """Begin with what the page asks for first, while the browser starts.
+        """Prepare the page's first requests while the browser starts.
 
         Called in the loop that answers: those who wait for something to be compiled wait there.
         """
@@ -140,28 +140,28 @@ class Service:
             self.waiting -= 1
 
     def close(self) -> None:
-        """Give up what is waiting."""
+        """Drop the waiting requests."""
         self.pool.shutdown(wait=False, cancel_futures=True)
         if self.live is not None:
             self.live.close()
 
 
 class TooManyError(ValueError):
-    """More is asked for than the server does at once."""
+    """More requests than the server handles at once."""
 
 
 class Handler(web.RequestHandler):
-    """What all handlers have in common."""
+    """The base of all handlers."""
 
     needs_token = True
     service: Service
 
     def initialize(self, service: Service) -> None:
-        """Take what the handlers share."""
+        """Store the shared state."""
         self.service = service
 
     def set_default_headers(self) -> None:
-        """Headers of every answer, errors too."""
+        """Set the headers of every answer, errors included."""
         service: Service | None = getattr(self, "service", None) or self.application.settings.get("service")
         if service is not None:
             for name, value in headers_of(service.guard.port).items():
@@ -172,14 +172,14 @@ class Handler(web.RequestHandler):
         return None
 
     def prepare(self) -> None:
-        """Refuse before anything is done."""
+        """Refuse invalid requests before any work."""
         guard, headers = self.service.guard, self.request.headers
         if len(self.request.uri or "") > MOST_ADDRESS:
             self.refuse(414, "the address is too long")
             return
         foreign = guard.foreign(headers)
         known = not foreign and guard.authorised(headers, self.get_query_argument("token", ""))
-        # whoever has no token uses up nothing of those who have it
+        # requests without a token must not use up the rate of valid ones
         free = known or not self.needs_token
         budget = self.service.rate if known else self.service.files if free else self.service.strangers
         if foreign is None and not budget.allows():
@@ -196,12 +196,12 @@ class Handler(web.RequestHandler):
         self.finish(json.dumps({"error": sentence}))
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """Say what went wrong, without anything of the inside."""
+        """Report an error without internal details."""
         self.refuse(status_code, self._reason)
 
 
 class PageHandler(Handler):
-    """The page itself."""
+    """The handler of the page itself."""
 
     def refuse(self, status: int, sentence: str) -> None:
         """Answer with a page that has one sentence: a person is reading."""
@@ -219,7 +219,7 @@ class PageHandler(Handler):
 
 
 class StaticHandler(Handler):
-    """The page's script and style, which are no secret."""
+    """The handler of the page's script and style, which are public."""
 
     needs_token = False
 
@@ -234,12 +234,12 @@ class StaticHandler(Handler):
 
 
 class ApiHandler(Handler):
-    """One kind of answer."""
+    """The handler of one kind of answer."""
 
     answer: Answer
 
     def initialize(self, service: Service, answer: Answer) -> None:  # type: ignore[override]
-        """Take what the handlers share, and what is answered."""
+        """Store the shared state and the kind of answer."""
         self.service, self.answer = service, answer
 
     async def get(self) -> None:
@@ -287,12 +287,12 @@ class ApiHandler(Handler):
             self.set_header("Content-Type", reply.kind)
             if reply.filename:
                 self.set_header("Content-Disposition", f'attachment; filename="{reply.filename}"')
-            with contextlib.suppress(Exception):  # whoever asked has gone
+            with contextlib.suppress(Exception):  # the client has disconnected
                 await self.finish(reply.content)
 
 
 class NothingHandler(Handler):
-    """Everything else."""
+    """The handler of all other addresses."""
 
     def prepare(self) -> None:
         """Refuse, and say no more than that there is nothing."""
@@ -302,7 +302,7 @@ class NothingHandler(Handler):
 
 
 def application(service: Service) -> web.Application:
-    """Return what answers requests for a run."""
+    """Return the web application that answers requests for a run."""
     from pipeline.explorer.answers import ANSWERS
 
     shared = {"service": service}
@@ -319,7 +319,7 @@ def application(service: Service) -> web.Application:
 
 
 def _live_routes(service: Service) -> list[Any]:
-    """The websocket of live computing, where the run allows any."""
+    """Return the websocket route for live computing, if the run allows it."""
     if service.live is None:
         return []
 

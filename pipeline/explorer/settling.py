@@ -1,4 +1,4 @@
-"""Trajectories of a parameter point, leg by leg, with the bits of a run's own cells."""
+"""Integrate trajectories at a parameter point in short legs, bit for bit like the run's cells."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LEG = 32
 
 
 class CancelledError(Exception):
-    """The job is no longer wanted."""
+    """The signal that a job is no longer wanted."""
 
 
 Check = Callable[[], None]
@@ -62,17 +62,17 @@ class Place:
 
     @property
     def key(self) -> tuple[float, ...]:
-        """What tells it from others."""
+        """Return the point's key."""
         return (self.frequency, *self.parameters.values())
 
 
 def system_at(place: Place, integration: Integration) -> System:
-    """What is integrated there, by the run's method."""
+    """Return the system to integrate at a point, with the run's method."""
     return replace(place.parameters.model.system, method=integration.method)
 
 
 class Flight:
-    """Cells on their way at one parameter point.
+    """Trajectories under way at one parameter point.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class Flight:
         self._seconds = 0.0
 
     def advance(self, rows: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Integrate some cells that go on for `n` periods, in calls short enough to be cancelled between.
+        """Integrate some active cells for `n` periods, in calls short enough to allow cancelling.
 
         Returns
         -------
@@ -144,14 +144,14 @@ class Flight:
         return found.section[:, 0], found.turns[:, 0]
 
     def closed(self, section: np.ndarray, integration: Integration) -> np.ndarray:
-        """Period on which each row of last sections closes, 0 if on none; as the run tells it."""
+        """Return the period on which each row of last sections closes, 0 if on none, by the run's rule."""
         return orbit_periods(
             section, closure_tolerance=integration.closure_tolerance,
             max_orbit_period=integration.max_orbit_period, system=self._system,
         )  # fmt: skip
 
     def block(self, rows: np.ndarray, section: np.ndarray, turns: np.ndarray, period: np.ndarray) -> Block:
-        """Cells as the analyses take them; what ended is what it is in the cube."""
+        """Return cells in the form of the analyses; ended cells have the cube's status."""
         status = self.status[rows].copy()
         kept = status == Status.BOUNDED
         status[kept & (period > 0)] = Status.PERIODIC
@@ -166,7 +166,7 @@ Tell = Callable[[np.ndarray, int], None]
 
 
 def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int | None = None) -> Block:
-    """Integrate one start as the run integrates its own cells; its sections are told as they come.
+    """Integrate one start like the run's cells; report its sections as they come.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int
 
 
 def taken(block: Block, rows: np.ndarray) -> Block:
-    """Some of the cells of a block, as a block of their own."""
+    """Return some cells of a block as a block."""
     rest = None if block.rest is None else block.rest[rows]
     return Block(
         slice(0, len(rows)), block.section[rows], block.status[rows], block.orbit_period[rows],
@@ -232,7 +232,7 @@ def run_on(
     place: Place, integration: Integration, ends: Catalog, block: Block, states: np.ndarray, check: Check,
     tell: Tell | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Run cells on until they are seen on an orbit; returns their entries, -1 for those that stay undecided.
+    """Extend the integration until cells reach an orbit; return their entries, -1 if undecided.
 
     As long, and as exactly, as the analysis of attractors runs its spirals on.
 
@@ -273,7 +273,7 @@ def _look(
     flight: Flight, rows: np.ndarray, last: np.ndarray, integration: Integration, ends: Catalog,
     *, strictly: bool = False,
 ) -> np.ndarray:  # fmt: skip
-    """Entries of cells on their way, -1 for those that are seen on none."""
+    """Return the entries of moving cells, -1 for those not yet on an orbit."""
     no_turns = np.zeros((len(rows), sum(ends.model.is_angle)), np.int64)
     period = np.zeros(len(rows), np.int16)
     alive = flight.status[rows] == Status.BOUNDED
@@ -287,7 +287,7 @@ def _look(
 def settle_cells(
     place: Place, integration: Integration, ends: Catalog, starts: np.ndarray, check: Check
 ) -> np.ndarray:
-    """Entry on which each start ends.
+    """Return the entry on which each start ends.
 
     A cell is given up as soon as it is on an orbit that is known, or certain to end there; the others go on
     for as long as the run's own cells, and then on as the analysis of attractors runs them on.
@@ -337,7 +337,7 @@ def conclude(
     place: Place, integration: Integration, ends: Catalog, block: Block, states: np.ndarray, check: Check,
     tell: Tell | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Entry of each cell at its end, after running on what comes back near and is on no known orbit."""
+    """Return each cell's entry at its end, after extending undecided cells that come back near."""
     numbers = ends.conclude(block, final=False)
     unsure = np.flatnonzero(ends.unsure(block, numbers))
     if len(unsure):

@@ -1,4 +1,4 @@
-"""A plane of initial states while one watches: where its starts end, coarse first, then finer.
+"""Compute live where the starts of a plane end, on grids from coarse to fine.
 
 The cells of the finest grid are squares of the plane, and the starts their centres. A coarser grid takes
 every second, fourth, ... of these starts, so that a finer one computes only what lies between. What a start
@@ -33,7 +33,7 @@ NOT_YET = -1
 
 
 def slice_of(live: LiveRun, job: Job) -> None:
-    """Do a slice."""
+    """Run a slice job."""
     request = job.request
     assert isinstance(request, SliceRequest)
     place = live.place(request.parameters, request.frequency)
@@ -50,7 +50,7 @@ def slice_of(live: LiveRun, job: Job) -> None:
 
 
 class _Grid:
-    """Starts of a plane, and what is known of them.
+    """The starts of a plane, and their labels so far.
 
     Attributes
     ----------
@@ -96,27 +96,27 @@ class _Grid:
         return grid
 
     def levels(self) -> Iterator[int]:
-        """Cells along a side, from the coarsest grid to the finest."""
+        """Return the cells along a side, from the coarsest grid to the finest."""
         n = LEAST_RESOLUTION
         while n <= self.n:
             yield n
             n *= 2
 
     def missing(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of the starts of a grid that are not known yet."""
+        """Return rows and columns of a grid's starts that are not known yet."""
         step = self.n // n
         rows, columns = np.nonzero(self.labels[::step, ::step] == NOT_YET)
         return rows * step, columns * step
 
     def starts(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Initial states at rows and columns of the finest grid."""
+        """Return initial states at rows and columns of the finest grid."""
         states = np.tile(self._base, (len(rows), 1))
         states[:, self._columns[0]] = self.axes[0][columns]
         states[:, self._columns[1]] = self.axes[1][rows]
         return states
 
     def image(self, n: int) -> np.ndarray:
-        """Labels of a grid; what is not known yet has that of the next coarser one."""
+        """Return a grid's labels; unknown ones take the label of the next coarser grid."""
         step = self.n // n
         own = self.labels[::step, ::step].astype(np.int16)
         if n == LEAST_RESOLUTION:
@@ -126,13 +126,13 @@ class _Grid:
 
 
 class _Slice:
-    """Computes the grids of a slice one after the other, in all threads."""
+    """The computation of a slice's grids, one after the other, in all threads."""
 
     def __init__(self, live: LiveRun, job: Job, grid: _Grid, catalog: Catalog) -> None:
         self._live, self._job, self._grid, self._catalog = live, job, grid, catalog
 
     def compute(self, n: int) -> None:
-        """Compute what a grid lacks; shows it now and then."""
+        """Compute a grid's missing labels, and show it now and then."""
         rows, columns = self._grid.missing(n)
         total, done, shown = len(rows), 0, time.perf_counter()
         size = FIRST_BATCH if n == LEAST_RESOLUTION else BATCH

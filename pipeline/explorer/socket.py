@@ -1,4 +1,4 @@
-"""The websocket over which a page asks for what is computed live; see `messages` and `live`."""
+"""Serve the websocket for live computing; see `messages` and `live`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Route = tuple[str, type[WebSocketHandler], dict[str, Any]]
 
 
 def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> list[Route]:
-    """Routes of a tornado application for the live connection.
+    """Return the routes of a tornado application for the live connection.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> 
 
 
 class LiveSocket(WebSocketHandler):
-    """One page that watches."""
+    """The live connection of one page."""
 
     def initialize(self, live: LiveRun, authorised: Authorised, others: set[LiveSocket]) -> None:
         """Take what the route gives."""
@@ -81,7 +81,7 @@ class LiveSocket(WebSocketHandler):
         self._session = LiveSession(self._live, emit)
 
     def on_message(self, message: str | bytes) -> None:
-        """Take a message; one too many is answered and not read."""
+        """Handle a message; beyond the limit it is refused unread."""
         now = time.monotonic()
         self._allowance = min(MOST_AT_ONCE, self._allowance + MOST_PER_SECOND * (now - self._heard)) - 1.0
         self._heard = now
@@ -112,14 +112,14 @@ class LiveSocket(WebSocketHandler):
             done.exception()  # a page that has gone is nobody's mistake
 
     def on_close(self) -> None:
-        """Cancel what was being computed."""
+        """Cancel the connection's jobs."""
         self._others.discard(self)
         if self._session is not None:
             self._session.close()
 
     @property
     def max_message_size(self) -> int:
-        """Longest message taken [bytes]."""
+        """Return the longest accepted message [bytes]."""
         return MOST_BYTES
 
 

@@ -1,4 +1,4 @@
-"""A start that is integrated while one watches: its path, its sections as it settles, and where it ends."""
+"""Integrate a start live: its path, its sections as it settles, and its end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_EVERY_S = 0.03
 
 
 def start(live: LiveRun, job: Job) -> None:
-    """Do a start."""
+    """Run a start job."""
     request = job.request
     assert isinstance(request, StartRequest)
     place = live.place(request.parameters, request.frequency)
@@ -52,7 +52,7 @@ def start(live: LiveRun, job: Job) -> None:
 
 
 def _end(live: LiveRun, job: Job, place: Place, block: Block, number: int, periods: int) -> None:
-    """Say where it ended."""
+    """Report where a start ended."""
     catalog = live.catalog(place)
     entry, legend = catalog.entry(number), live.legend(catalog)
     line = legend.line(entry)
@@ -74,7 +74,7 @@ class _Path:
         self._period = self._seconds()
 
     def _seconds(self) -> float:
-        """A drive period; of a flow the mean time of its first returns [s]."""
+        """Return a drive period, or a flow's mean return time over its first returns [s]."""
         place = self._place
         if self._live.model.crossing is None:
             return 1.0 / place.frequency
@@ -106,7 +106,7 @@ class _Path:
 
 
 class _Sections:
-    """Sections as they come, told in pieces that are not too small."""
+    """A buffer that sends sections in pieces of reasonable size."""
 
     def __init__(self, job: Job) -> None:
         self._job, self._told = job, time.perf_counter()
@@ -114,14 +114,14 @@ class _Sections:
         self.done = 0
 
     def take(self, section: np.ndarray, done: int) -> None:
-        """Take sections (k, n_states) in."""
+        """Add sections (k, n_states)."""
         self._kept.append(section[np.isfinite(section).all(axis=1)])
         self.done = done
         if time.perf_counter() - self._told >= MOST_EVERY_S:
             self.flush()
 
     def flush(self) -> None:
-        """Tell what has come."""
+        """Send the buffered sections."""
         section = np.concatenate(self._kept) if self._kept else np.zeros((0, 1))
         self._kept, self._told = [], time.perf_counter()
         if len(section):

@@ -1,4 +1,4 @@
-"""The numbers of what the page shows, as CSV for people's own figures or as NetCDF with their provenance."""
+"""Export the numbers of a view as CSV or as NetCDF with provenance."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _diagram(run: ExploredRun, asked: Asked) -> xr.Dataset:
 
 
 def _words(scheme: Scheme) -> np.ndarray:
-    """Label of each code of a scheme; empty for none."""
+    """Return the label of each code of a scheme; empty for none."""
     words = np.full(1 << 16, "", f"U{max((len(c.label) for c in scheme.categories), default=1)}")
     for category in scheme.categories:
         words[category.number] = category.label
@@ -200,12 +200,12 @@ def _unit(run: ExploredRun, axis: str) -> str:
 
 
 def _place(run: ExploredRun, x: str, at: Mapping[str, int]) -> dict[str, float]:
-    """Values of the axes that are not shown."""
+    """Return the values of the axes that are not shown."""
     return {f"at_{n}": float(run.axis(n).values[i]) for n, i in run.place(at, but=x).items()}
 
 
 def _of_rows(rows: list[dict[str, Any]], names: tuple[str, ...]) -> xr.Dataset:
-    """Rows as a dataset; what is missing is NaN, or an empty word."""
+    """Return rows as a dataset; missing values are NaN or an empty text."""
     variables = {}
     for name in names:
         column = [row[name] for row in rows]
@@ -239,7 +239,7 @@ def _heading(ds: xr.Dataset, name: str) -> str:
 
 
 def _rows(columns: list[np.ndarray]) -> Iterator[tuple[Any, ...]]:
-    """Rows of plain values; floats as short as they read back, NaN as nothing."""
+    """Return rows of plain values: shortest round-trip floats; NaN as empty."""
     n = len(columns[0]) if columns else 0
     for first in range(0, n, _ROWS_AT_ONCE):  # as objects, numbers take ten times their room
         yield from zip(*(_plain(c[first : first + _ROWS_AT_ONCE]) for c in columns), strict=True)
@@ -253,7 +253,7 @@ def _plain(column: np.ndarray) -> list[Any]:
 
 
 def _word(text: str) -> str:
-    """A word that a spreadsheet would take for a formula stays a word."""
+    """Escape a text that a spreadsheet would read as a formula."""
     formula = text[:1] in ("=", "+", "-", "@", "\t")
     return f"'{text}" if formula else text
 

@@ -1,4 +1,4 @@
-"""What the vertical axis of a diagram can show: states at the sections, quantities there, kept extremes."""
+"""List the possible vertical axes of a diagram: states, quantities, kept extremes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WORDS = {"min": "least", "max": "largest", "mean": "mean"}
 
 @dataclass(frozen=True)
 class Vertical:
-    """What a diagram draws upwards.
+    """A possible vertical axis of a diagram.
 
     Attributes
     ----------
@@ -44,12 +44,12 @@ class Vertical:
     values: Callable[[xr.Dataset], xr.DataArray]
 
     def describe(self) -> dict[str, Any]:
-        """As the page has it."""
+        """Return the axis in the page's form."""
         return {"name": self.name, "label": self.label, "unit": self.unit, "angle": self.angle}
 
 
 def verticals(run: ExploredRun) -> list[Vertical]:
-    """Return what a run's diagram can show, first the model's first state that differs between sections."""
+    """Return a run's vertical axes, first the model's first state that differs between sections."""
     return run.remembered("verticals", lambda: _verticals(run))
 
 
@@ -80,7 +80,7 @@ def _verticals(run: ExploredRun) -> list[Vertical]:
 
 
 def vertical(run: ExploredRun, name: str) -> Vertical:
-    """One of them by name; raises `ExplorerError` with the nearest names if there is none."""
+    """Return a vertical axis by name; raise `ExplorerError` with the nearest names if unknown."""
     known = {v.name: v for v in verticals(run)}
     if name not in known:
         raise ExplorerError(unknown_name("vertical axis", name, list(known)))
@@ -92,7 +92,7 @@ def _state(name: str) -> Callable[[xr.Dataset], xr.DataArray]:
 
 
 def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArray]:
-    """A quantity of the model at the instants of the sections, from the states that are kept there."""
+    """Return a model quantity at the sections, from the kept states."""
     model = run.model.flow
     column = [q.name for q in model.quantities].index(name)
 
@@ -122,7 +122,7 @@ def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArra
 
 
 def _point(run: ExploredRun, values: Mapping[str, float]) -> tuple[np.ndarray, float]:
-    """Packed parameters of the flow, and the frequency, at values of the swept axes."""
+    """Return packed flow parameters and frequency at values of the swept axes."""
     changed = {parameter_name(d): v for d, v in values.items() if d != FREQUENCY_DIM}
     own = run.parameters
     packed = np.array([changed.get(n, own[n]) for n in run.model.flow.parameter_names], np.float64)

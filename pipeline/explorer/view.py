@@ -1,4 +1,4 @@
-"""What stands in a run, as the page needs it to begin with."""
+"""Describe a run for the page's start: content, names, drawing and colours."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LOWEST = {POSITIVE: 0.0, NON_NEGATIVE: 0.0, FRACTION: 0.0}
 
 
 def describe_view(run: Run, live: bool) -> dict[str, Any]:
-    """Say what stands in a run: what there is to look at, and how it is named, drawn and coloured.
+    """Describe a run: its content, with names, drawing and colours.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def describe_view(run: Run, live: bool) -> dict[str, Any]:
 
 
 def _name(run: Run) -> str:
-    """The directory's name, never where it lies."""
+    """Return the directory's name without its path."""
     files = run.info.files
     return files.local.resolve().name if files.local else files.name.rstrip("/").rpartition("/")[2]
 
@@ -85,7 +85,7 @@ def _version() -> str:
 
 
 def _cells(run: ExploredRun) -> dict[str, int]:
-    """Numbers of cells, of those that are not computed yet, and of those that could not be."""
+    """Count the cells: all, not yet computed, and failed or diverged."""
     committed = sum(run.plan.cells_in(task) for task in run.commits)
     counts = np.zeros(1 + max(DIVERGED, *FAILED, PENDING), np.int64)
     if committed:
@@ -136,13 +136,13 @@ def _state(state: Any) -> dict[str, Any]:
 
 
 def _section(model: Model) -> str:
-    """What the section is, in words."""
+    """Describe the section in words."""
     where = model.section if model.crossing is None else model.crossing.sentence
     return f"{section_name(model)} at {where}"
 
 
 def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
-    """A parameter, its value if all cells share one, and the range in which it is worth dragging.
+    """Return a parameter, its value if all cells share one, and its range for dragging.
 
     That is the range of its axis; else from half to one and a half times its value, within its bound.
     """
@@ -162,7 +162,7 @@ def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
 
 
 def _drawing(run: ExploredRun) -> dict[str, Any] | None:
-    """What the model looks like; fixed points are those of the run's own parameters."""
+    """Return the model's drawing; fixed points use the run's own parameters."""
     drawing, model = run.model.drawing, run.model
     if drawing is None:
         return None
@@ -199,7 +199,7 @@ def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
 
 
 def planes(run: ExploredRun) -> list[tuple[str, str]]:
-    """Return the pairs of states whose plane of initial states is worth a look.
+    """Return the state pairs worth showing as a plane of initial states.
 
     First that of the run's own grid, then pairs of angles, then what phase portraits show.
     """
@@ -222,7 +222,7 @@ def _has(run: ExploredRun) -> dict[str, bool]:
 
 
 def commands(run: ExploredRun, directory: str) -> dict[str, str]:
-    """Return the command that gets each analysis that the page shows and the run has not, if it can."""
+    """Return the command for each missing analysis that the run can have."""
     wanted = [name for name in ("attractors", "branches", "basins") if run.kept(name) is None]
     return {
         name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if _can_have(run, name)
@@ -230,7 +230,7 @@ def commands(run: ExploredRun, directory: str) -> dict[str, str]:
 
 
 def _can_have(run: ExploredRun, name: str) -> bool:
-    """Whether a run has what an analysis takes with its default options."""
+    """Tell whether the run has the input of an analysis with default options."""
     if run.spec.recorded is not None:
         return False
     analysis = ANALYSES[name]

@@ -1,8 +1,8 @@
 """Figures of a cube: Dataset in, matplotlib Figure out.
 
-Nothing here opens a store or touches pyplot: figures are plain objects, so they can be made in any thread
-and without a display. `draw_figure` draws any figure of a run by name; `Frame` is the size of a figure and
-the part that it shows.
+No module here opens a store or uses pyplot. Figures are plain objects, so any thread can make them, and no
+display is needed. `draw_figure` draws any figure of a run by name. `Frame` holds the size of a figure and the
+ranges of its axes.
 """
 
 from pipeline.plots.basins import plot_basins

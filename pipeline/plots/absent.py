@@ -1,4 +1,4 @@
-"""Cells that have nothing to draw: their share below a diagram, and what is said of an empty one."""
+"""Show the share of cells without points below a diagram, and explain an empty diagram."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Se
     Parameters
     ----------
     ax, strip
-        Axes of the diagram, and those below.
+        Axes of the diagram, and of the strip below it.
     x
         Values of the parameter.
     survey
-        With the numbers of cells along the parameter.
+        Result of `pipeline.plots.points.survey`; it counts the cells along the parameter.
     layers
-        Those that the axes show.
+        Indices of the layers (directions) that the axes show.
     """
     edges = style.edges(x)
     cells = survey.cells[list(layers)].sum(0)
@@ -65,7 +65,7 @@ def shade_blank(ax: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) 
 
 
 def absent_handles(survey: Survey) -> list[Patch]:
-    """Handles of a legend for cells that are left out: why, and how many."""
+    """Return legend handles for cells that are left out: the reason and the number of each kind."""
     total = int(survey.cells.sum())
     return [
         Patch(label=f"{name}: {int(counts.sum())} of {total} cells", **LOOKS[name])
@@ -75,7 +75,7 @@ def absent_handles(survey: Survey) -> list[Patch]:
 
 
 def say_empty(ax: Axes, survey: Survey, shown: str = "") -> None:
-    """Say in empty axes why there is nothing to draw."""
+    """Write into empty axes why there is nothing to draw."""
     n_cells = int(survey.cells.sum())
     absent = {name: int(counts.sum()) for name, counts in survey.absent.items() if counts.any()}
     text = f"nothing to draw: of {n_cells} cells, " + style.join(f"{n} {name}" for name, n in absent.items())

@@ -1,6 +1,6 @@
-"""Moving pictures: the model's own drawing and its phase portraits, motion beside motion.
+"""Draw films of motions: the model's own drawing beside its phase portraits.
 
-What moves is drawn over a background that is drawn once; so a frame takes some milliseconds.
+The background is drawn once, and only the moving artists are drawn anew. So a frame takes a few milliseconds.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ Pixels = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Animation:
-    """A film that is drawn as it is asked for.
+    """A film whose frames are drawn on demand.
 
     Attributes
     ----------
     figure : DataFigure
-        Its `data` are what is drawn.
+        The figure; its `data` hold the numbers drawn.
     movers : tuple
-        What moves: each sets its artists for a sample.
+        Moving parts; each places its artists for a given sample.
     """
 
     figure: style.DataFigure
@@ -56,17 +56,17 @@ class Animation:
 
     @property
     def n_frames(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return int(self.figure.data.attrs["n_frames"])
 
     @property
     def fps(self) -> float:
-        """Frames per second."""
+        """Return the frames per second."""
         return float(self.figure.data.attrs["fps"])
 
     @property
     def summary(self) -> str:
-        """Frames, length [s], what time of the model is shown [s, drive periods], and how slowly."""
+        """Describe the film: frames, length [s], model time shown [s, drive periods], slow-down."""
         data = self.figure.data
         shown, frequencies = float(data["time"][-1]), np.unique(data["drive_frequency"].values)
         told = f"{shown:.4g} s of the model"
@@ -103,15 +103,16 @@ def plot_animation(
     degrees
         Degrees for angles and their rates.
     portrait
-        State whose phase portrait is shown; by default of one motion all, of several the model's first.
+        State whose phase portrait is shown. By default a single motion shows all portraits;
+        several motions show the model's first.
     size
-        Width of a frame [pixels]; even, as films want it.
+        Width of a frame [pixels]; must be even for video encoders.
 
     Returns
     -------
     Animation
-        Motions that repeat within the film have their whole path behind them; of others it is drawn as it
-        is gone. Dots are sections.
+        Motions that repeat within the film show their whole path from the start. Other paths grow as the film
+        runs. Dots are section points.
 
     Raises
     ------
@@ -148,7 +149,7 @@ def plot_animation(
 
 
 def portraits_of(model: Model, portrait: str, n: int, degrees: bool = False) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of states that `plot_animation` shows of each of `n` motions; raises as it does."""
+    """Return the state pairs that `plot_animation` shows for each of `n` motions; raise as it does."""
     labels.some_angle(model, degrees, "animations")
     if portrait:
         found = tuple(pair for pair in model.portraits if portrait in pair)
@@ -166,7 +167,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class _Plan:
-    """Places of the panels [in]: motions in columns, or what there is of a single one side by side."""
+    """Panel places [in]: several motions in columns, or the panels of one motion side by side."""
 
     n: int
     n_pairs: int
@@ -202,24 +203,24 @@ class _Plan:
 
     @property
     def row(self) -> float:
-        """Height of a row of motions."""
+        """Return the height of a row of motions."""
         if self.n == 1:
             return self.drawing + self.above
         return self.above + self.drawing + self.n_pairs * (self.portrait + self.below)
 
     @property
     def foot(self) -> float:
-        """Height of the line below."""
+        """Return the height of the line below."""
         return self.below if self.n == 1 else 0.5 * self.below
 
     @property
     def height(self) -> float:
-        """Height of the frame; an even number of pixels."""
+        """Return the height of the frame; an even number of pixels."""
         whole = self.foot + self.row * math.ceil(self.n / self.columns)
         return 2 * round(whole * SCREEN_DPI / 2) / SCREEN_DPI
 
     def boxes(self, k: int) -> list[Box]:
-        """Panels of a motion: its drawing, if there is one, then its portraits."""
+        """Return the panels of a motion: its drawing if there is one, then its portraits."""
         return [self._box(*inches) for inches in (self._single() if self.n == 1 else self._column(k))]
 
     def _single(self) -> list[Box]:
@@ -251,7 +252,7 @@ class _Plan:
 
 
 def _title(fig: style.DataFigure, plan: _Plan, box: Box, text: str) -> None:
-    """Write a motion's name above its panels, as far as there is room."""
+    """Write a motion's name above its panels, shortened to the room there."""
     room = plan.width / plan.columns - 0.2
     lines = style.folded(text, room, fig.look.legend).split("\n")
     short = lines[0] if len(lines) == 1 else lines[0].rstrip(",:") + " \N{HORIZONTAL ELLIPSIS}"

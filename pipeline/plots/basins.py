@@ -1,4 +1,4 @@
-"""Basins of attraction: which attractor each initial state of a grid ends on."""
+"""Draw basins of attraction: which attractor each initial state of a grid ends on."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def plot_basins(
     attractors
         Result of `pipeline.analysis.attractors.attractors.match` for a sweep over a grid of initial states.
     at
-        Values of all other axes, such as ``{"frequency": 2.2}`` [units of the axis, rad].
+        Values of all other axes, for example ``{"frequency": 2.2}`` [units of the axis].
     degrees
         Degrees instead of radians.
     n_periods
-        Drive periods or returns that each cell took, of the same cube; if given, cells that took longer to
-        close are darker, on a logarithmic scale from the 1st to the 99th percentile. Inferred cells took
-        none and keep the plain colour.
+        Drive periods or returns that each cell of the same cube took. If given, cells that took longer to
+        close are darker, on a logarithmic scale from the 1st to the 99th percentile. Inferred cells were not
+        integrated and keep the plain colour.
     frame
         Width of the figure and ranges of its axes.
 
@@ -53,14 +53,14 @@ def plot_basins(
     -------
     DataFigure
         Cells that end on no attractor are grey, with the reason. The legend gives each basin's share of the
-        cells drawn. Its `data` hold ``attractor_id``, ``status`` and ``outcome`` of these, and
+        cells drawn. Its `data` hold ``attractor_id``, ``status`` and ``outcome`` of the cells drawn, and
         ``n_periods`` if drawn.
 
     Raises
     ------
     ValueError
-        If the cells are not on a grid of two initial states or more, or an axis is left over that `at`
-        does not settle.
+        If the cells are not on a grid of two initial states or more, or an axis is left
+        without a value in `at`.
     """
     axes = _axes(attractors, at)
     part = choose(attractors, at, axes, f"an image of basins has the axes {' and '.join(axes)}")
@@ -89,7 +89,7 @@ def plot_basins(
 
 
 def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
-    """Write letters into what is shown of the image."""
+    """Write the attractors' letters into the visible part of the image."""
     left, right, bottom, top = ax.get_images()[0].get_extent()
     row, column = (
         np.clip(((np.arange(400) + 0.5) / 400 * (b - a) + a - low) / (high - low) * n, 0, n - 1).astype(int)
@@ -101,7 +101,7 @@ def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
 
 
 def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, str]:
-    """Names of the two axes of the image: horizontal, vertical."""
+    """Return the names of the two axes of the image: horizontal, vertical."""
     dims = start_dims(attractors)
     grid = [grid_dim(name) for name in model_of(attractors).state_names if grid_dim(name) in dims]
     if len(grid) < 2:
@@ -125,7 +125,7 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 def _codes(
     data: xr.Dataset, part: xr.Dataset, axes: tuple[str, str], cast: palette.Cast
 ) -> tuple[np.ndarray, dict[int, int]]:
-    """Code of each cell (id, or `_OTHERS`, or a grey from `_FIRST_GREY` down), and cells of each code."""
+    """Return each cell's code (id, `_OTHERS`, or a grey from `_FIRST_GREY` down), and the cells per code."""
     ids, dims = np.maximum(data["outcome"].values, -1), part["attractor_id"].dims
     table = np.full(len(cast.names) + 1, _OTHERS, np.int32)
     table[list(cast.main)] = cast.main
@@ -140,7 +140,7 @@ def _codes(
 
 
 def _colour_table(cast: palette.Cast) -> np.ndarray:
-    """RGB by code, shape (codes, 3): ids first, so that negative codes index from the end."""
+    """Return RGB by code, shape (codes, 3): ids first, so that negative codes index from the end."""
     greys = list(reversed(palette.GREYS.values()))
     colours = [*(cast.colours[i] for i in range(len(cast.names))), *greys, palette.OTHERS]
     return np.array([to_rgb(c) for c in colours], dtype=np.float32)
@@ -160,14 +160,14 @@ def _painted(
 
 
 def _timed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
-    """Integrated cells on closed orbits: the time that others took is no time to converge."""
+    """Select integrated cells on closed orbits; for other cells the time is no convergence time."""
     closed = np.append(part["kind"].values == PERIODIC_ORBIT, False)
     ids = np.maximum(data["outcome"].values, -1)
     return np.asarray(closed[ids] & (data["status"].values != INFERRED))
 
 
 def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
-    """Scale of the shading, from the times of the cells on closed orbits, without the extremes."""
+    """Return the scale of the shading, from the times of cells on closed orbits without the extremes."""
     if "n_periods" not in data:
         return None
     times = data["n_periods"].values[_timed(data, part)]
@@ -180,7 +180,7 @@ def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
 def _extent(
     data: xr.Dataset, attractors: xr.Dataset, axes: tuple[str, str], degrees: bool
 ) -> tuple[float, float, float, float]:
-    """Limits of the image: the outer edges of the outer cells."""
+    """Return the limits of the image: the outer edges of the outer cells."""
     x, y = (
         labels.start_measure(attractors, d, degrees).shown(style.edges(data[d].values.astype(np.float64)))
         for d in axes
@@ -189,7 +189,7 @@ def _extent(
 
 
 def _is_square(data: xr.Dataset, attractors: xr.Dataset, axes: tuple[str, str]) -> bool:
-    """Whether both axes have one unit and the same range."""
+    """Tell whether both axes have the same unit and the same range."""
     left, right, bottom, top = _extent(data, attractors, axes, False)
     units = {labels.start_measure(attractors, d).unit for d in axes}
     return len(units) == 1 and bool(np.isclose(right - left, top - bottom, rtol=0.02))
@@ -204,7 +204,7 @@ def _dress(ax: Axes, attractors: xr.Dataset, axes: tuple[str, str], degrees: boo
 
 
 def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[tuple[str, str]]:
-    """Legend: attractors by falling share, then the others, then what has no attractor."""
+    """Return the legend: attractors by falling share, then the others, then cells without one."""
     own = sorted((i for i in counts if i >= 0), key=lambda i: (-counts[i], i))
     entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / total)}", cast.colours[i]) for i in own]
     if _OTHERS in counts:
@@ -217,7 +217,7 @@ def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[
 
 
 def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -> None:
-    """Draw how dark which time is, below the image."""
+    """Draw the scale below the image: the shade of each convergence time."""
     ramp = LinearSegmentedColormap.from_list("time", [(0.85,) * 3, (0.85 * (1.0 - _DARKEST),) * 3])
     bar = fig.colorbar(
         ScalarMappable(scale, ramp), ax=ax, orientation="horizontal", shrink=0.6, aspect=24, pad=0.02
@@ -232,7 +232,7 @@ def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -
 
 
 def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Dataset:
-    """What is kept beside the figure: the cells drawn, and the names of the attractors."""
+    """Return the data kept with the figure: the cells drawn, and the names of the attractors."""
     stored = data.reset_coords(drop=True).assign(share=part["share"].variable)
     stored = stored.assign_coords(
         attractor=part["attractor"].variable, name=("attractor", list(cast.names.values()))

@@ -1,7 +1,7 @@
-"""Bifurcation diagram: kept sections over the swept parameter, coloured by the kind of motion.
+"""Draw bifurcation diagrams: kept sections over the swept parameter, coloured by class of motion.
 
-The cube is read block by block, twice: once for the range of the points and the shares of cells that are
-absent, once for the points. So memory does not grow with the cube.
+The cube is read block by block, twice: first for the range of the points and the shares of absent cells,
+then for the points. So memory does not grow with the cube.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ def plot_bifurcation(
     at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw kept sections over the swept parameter, coloured by the kind of motion.
+    """Draw kept sections over the swept parameter, coloured by class of motion.
 
-    Everything is read from the cube; nothing is integrated. The kinds of motion are those that the
-    model's classifier tells apart; without one, all points have one colour. Where cells are pending,
-    diverged, failed or not reached, a strip below the diagram shows their share at each value of the
-    parameter, the legend gives their numbers, and the diagram is shaded where no cell at all is left to draw.
+    Everything is read from the cube; nothing is integrated. The model's classifier defines the classes of
+    motion; without a classifier, all points have one colour. Where cells are pending, diverged, failed or
+    not reached, a strip below the diagram shows their share at each value of the parameter. The legend gives
+    their numbers. The diagram is shaded where no cell is left to draw.
 
     Parameters
     ----------
@@ -67,13 +67,13 @@ def plot_bifurcation(
     -------
     DataFigure
         For a cube without a finished cell it says so. Its `data` hold the points drawn, as
-        `pipeline.plots.pixels.draw_points` says, and the numbers of ``cells`` and of those ``absent``.
+        `pipeline.plots.pixels.draw_points` says, and the numbers of ``cells`` and of ``absent`` cells.
 
     Raises
     ------
     ValueError
-        For an unknown state, quantity or layout, if there is not one swept parameter left, and for layout
-        ``side`` where the cube has not both directions.
+        If the state, quantity or layout is unknown, if not exactly one swept parameter is left, or if the
+        layout is ``side`` and the cube lacks a direction.
     """
     style.check_choice("layout", layout, LAYOUTS)
     diagram = Diagram.of(ds, state=state, quantity=quantity, degrees=degrees, at=at, frame=frame)
@@ -93,7 +93,7 @@ class Diagram:
     view : View
     survey : Survey
     measure : Measure
-        What is drawn upwards.
+        The vertical axis.
     parameter : str
     frame : Frame
     """
@@ -109,7 +109,7 @@ class Diagram:
         cls, ds: xr.Dataset, *, state: str = "", quantity: str = "", degrees: bool = False,
         at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE,
     ) -> Diagram:  # fmt: skip
-        """Look through a cube; arguments as for `plot_bifurcation`."""
+        """Survey a cube for its diagram; arguments as for `plot_bifurcation`."""
         if quantity and state:
             raise ValueError(
                 f"a diagram is drawn of a state or of a quantity; drop {state!r} or {quantity!r}"
@@ -132,26 +132,26 @@ class Diagram:
 
     @property
     def x(self) -> np.ndarray:
-        """Values of the swept parameter."""
+        """Return the values of the swept parameter."""
         return np.asarray(self.view.ds[self.parameter].values, dtype=np.float64)
 
     @property
     def layers(self) -> tuple[int, ...]:
-        """Indices of all directions."""
+        """Return the indices of all directions."""
         return tuple(range(len(self.view.layers)))
 
     @property
     def caption(self) -> str:
-        """Fixed values of the other axes."""
+        """Return the fixed values of the other axes."""
         return labels.caption(self.view.ds, drop=[self.parameter])
 
     @property
     def with_strip(self) -> bool:
-        """Whether there are absent cells."""
+        """Tell whether there are absent cells."""
         return any(counts.any() for counts in self.survey.absent.values())
 
     def dress(self, ax: Axes) -> None:
-        """Give axes the limits, ticks and the vertical label of the diagram."""
+        """Give axes the limits, ticks and vertical label of the diagram."""
         style.style_axes(ax)
         style.limits(ax, self.frame, style.span(self.x), self._heights())
         labels.angle_ticks(ax, self.measure)
@@ -172,7 +172,7 @@ class Diagram:
         return low - margin, high + margin
 
     def handles(self, *, layers: bool = True, absent: bool = True) -> list[Any]:
-        """Handles of a legend: motions, directions, absent cells."""
+        """Return legend handles: motions, directions, absent cells."""
         motions, kinds = self.view.motions, {code for _, code in self.survey.classes}
         found: list[Any] = []
         if motions.told:
@@ -202,14 +202,14 @@ class Diagram:
 
 
 def with_diagram(data: xr.Dataset, drawn: xr.Dataset) -> xr.Dataset:
-    """Add what a diagram shows to the data of a figure, under names that end in ``_diagram``."""
+    """Add a diagram's data to the data of a figure, under names that end in ``_diagram``."""
     drawn = drawn.drop_vars([c for c in drawn.coords if c in data.variables or c in data.dims])
     renamed = drawn.rename({str(n): f"{n}_diagram" for n in (*drawn.data_vars, *drawn.dims)})
     return data.merge(renamed).assign_attrs(data.attrs)
 
 
 def fixed_of(ds: xr.Dataset) -> dict[str, Any]:
-    """Coordinates of the values at which all of a dataset was taken."""
+    """Return the coordinates that are fixed for the whole dataset."""
     return {str(k): v.variable for k, v in ds.coords.items() if not v.ndim and v.dtype.kind == "f"}
 
 
@@ -219,7 +219,7 @@ def _section(ds: xr.Dataset, state: str, degrees: bool) -> tuple[Measure, Any]:
 
 
 def _extreme(ds: xr.Dataset, quantity: str, degrees: bool) -> tuple[Measure, Any]:
-    """Measure of an extreme, and what takes it from a block."""
+    """Return the measure of an extreme, and the function that takes its values from a block."""
     if "extremes" not in ds:
         wanted = quantity.rpartition(".")[0] or quantity
         raise ValueError(
@@ -242,7 +242,7 @@ def swept_parameters(ds: xr.Dataset) -> list[str]:
 
 
 def swept_parameter(ds: xr.Dataset) -> str:
-    """Return the one swept parameter of a cube; raises ValueError if there is none or more than one."""
+    """Return the one swept parameter of a cube; raise ValueError if there is none or more than one."""
     outer = swept_parameters(ds)
     long = [dim for dim in outer if ds.sizes[dim] > 1]
     if len(long) > 1:
@@ -258,7 +258,7 @@ def swept_parameter(ds: xr.Dataset) -> str:
 
 
 def _layers(names: Sequence[str], layout: str) -> list[tuple[int, ...]]:
-    """Layers of each panel; raises ValueError if there are not two for panels side by side."""
+    """Return the layers of each panel; raise ValueError if layout ``side`` lacks a direction."""
     if layout == "overlay":
         return [tuple(range(len(names)))]
     if len(names) < 2:

@@ -1,4 +1,4 @@
-"""Branches of periodic orbits over the brute-force diagram."""
+"""Draw branches of periodic orbits over the brute-force diagram."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def plot_branches(
 ) -> style.DataFigure:
     """Draw section points of periodic orbits over the parameter: solid stable, dashed unstable.
 
-    Bifurcations are marked; those at which a stable orbit is born or lost bear their name and period,
-    such as PD1, beside the curves where there is room.
+    All bifurcations are marked. Where a stable orbit appears or disappears, the name and period (for example
+    PD1) stand beside the curves if there is room.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def plot_branches(
     Returns
     -------
     DataFigure
-        Its `data` are the branches; with the suffix ``_diagram`` what lies below them.
+        Its `data` are the branches; names with the suffix ``_diagram`` are the data of the diagram below.
 
     Raises
     ------
@@ -99,14 +99,14 @@ def _below(
     at: Mapping[str, float] | None,
     frame: style.Frame,
 ) -> Diagram | None:
-    """The diagram under the branches, if there is a cube for one."""
+    """Return the diagram under the branches, if a cube is given."""
     if cube is None:
         return None
     return Diagram.of(cube, state=measure.name, degrees=degrees, at=at, frame=frame)
 
 
 def _dress(ax: Axes, frame: style.Frame, measure: Measure) -> None:
-    """Set look, limits and ticks where no diagram has."""
+    """Set look, limits and ticks for a figure without a diagram."""
     style.style_axes(ax)
     ax.margins(y=0.08)
     style.limits(ax, frame)
@@ -114,13 +114,13 @@ def _dress(ax: Axes, frame: style.Frame, measure: Measure) -> None:
 
 
 def _chosen(ds: xr.Dataset, max_period: int | None) -> list[int]:
-    """Branches whose period is short enough."""
+    """Select branches whose period is short enough."""
     periods = ds["orbit_period"].values.tolist()
     return [i for i, period in enumerate(periods) if max_period is None or period <= max_period]
 
 
 def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
-    """Draw branches and mark their bifurcations; return the names of these."""
+    """Draw branches and mark their bifurcations; return the bifurcations' names."""
     for i in chosen:
         for x, y, stable in pieces(ds, i, measure):
             ax.plot(x, y, scalex=scale, scaley=scale, **(_STABLE if stable else _UNSTABLE))
@@ -128,7 +128,7 @@ def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, s
 
 
 def _stored(ds: xr.Dataset) -> xr.Dataset:
-    """The branches without what NetCDF does not know."""
+    """Return the branches without the types that NetCDF cannot store."""
     plain = {k: v for k, v in ds.attrs.items() if isinstance(v, str | int | float | np.ndarray)}
     return ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object]).assign_attrs(
         {**plain, "title": "branches of periodic orbits"}
@@ -136,7 +136,7 @@ def _stored(ds: xr.Dataset) -> xr.Dataset:
 
 
 def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
-    """Polylines of one stability of a branch, one for each point of the orbit, cut where an angle wraps."""
+    """Return polylines of one stability of a branch, one per orbit point, cut where an angle wraps."""
     n = int(ds["n_points"][branch])
     period = int(ds["orbit_period"][branch])
     x = ds["parameter"].values[branch, :n]
@@ -164,7 +164,7 @@ def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.n
 
 @dataclass(frozen=True)
 class _Name:
-    """Text at a bifurcation: where it is, and the range of the orbit's points there."""
+    """A label at a bifurcation: its text, its position, and the range of the orbit's points there."""
 
     period: int
     x: float
@@ -174,7 +174,7 @@ class _Name:
 
 
 def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
-    """Put markers on bifurcations; return names for those where a stable orbit is born or lost."""
+    """Draw markers on bifurcations; return labels where a stable orbit appears or disappears."""
     names = []
     size = 3.4 if style.figure_of(ax).frame.compact else 4.5
     for k in range(ds.sizes["bifurcation"]):
@@ -197,9 +197,9 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
 
 
 def _name(ax: Axes, names: list[_Name]) -> None:
-    """Write names where they cover neither lines nor other names, joined to their point by a thin line.
+    """Write labels where they cover neither lines nor other labels, joined to their point by a thin line.
 
-    Short periods come first; a name without room in reach is left out, for its marker still stands.
+    Short periods come first. A label without room nearby is left out; its marker remains.
     """
     figure = ax.figure
     points = 72.0 / figure.dpi
@@ -224,7 +224,7 @@ def _name(ax: Axes, names: list[_Name]) -> None:
 
 
 def _ink(drawn: Line2D, points: float) -> np.ndarray:
-    """Where a line or its markers are [pt]; lines every 3 pt, so that none of their pieces is passed over."""
+    """Return points [pt] covered by lines (sampled every 3 pt) and markers."""
     line = drawn.get_transform().transform(np.asarray(drawn.get_xydata(), dtype=np.float64)) * points
     line = line[np.isfinite(line).all(axis=1)]
     if len(line) < 2 or drawn.get_linestyle() == "None":
@@ -246,7 +246,7 @@ def _free(
     taken: list[np.ndarray],
     bounds: np.ndarray,
 ) -> np.ndarray | None:  # fmt: skip
-    """Return the nearest place for a text of a size about an anchor [pt] that covers nothing, or None."""
+    """Return the nearest free place for a text of a given size about an anchor [pt], or None."""
     half = 0.5 * np.asarray(size)
     for distance in (9.0, 14.0, 20.0, 28.0, 38.0):
         for angle in (0.0, 0.6, -0.6, 1.1, -1.1):

@@ -1,4 +1,4 @@
-"""Diagram of all coexisting attractors: each id in its colour over the swept parameter."""
+"""Draw the diagram of all coexisting attractors: each id in its colour over the swept parameter."""
 
 from __future__ import annotations
 
@@ -54,16 +54,17 @@ def plot_coexisting(
     Returns
     -------
     DataFigure
-        In a sweep the area of the points of an attractor shares out its basin fraction. In a
-        continuation in both directions small dark points are met upwards, large light ones downwards.
-        A set that does not close is drawn by the points of it that are stored. Where a set does not attract,
-        it is drawn in small grey points. Its `data` hold ``value`` and what decides the look of each point:
-        ``stability`` and ``share``, or ``present`` for each direction.
+        In a sweep the area of each point grows with the attractor's basin fraction, divided among its points.
+        In a continuation in both directions small dark points belong to the upward continuation, large light
+        points to the downward one. A set that does not close is drawn by its stored points. Where a set does
+        not attract, its points are small and grey.
+        Its `data` hold ``value`` and the variables that set the look
+        of each point: ``stability`` and ``share``, or ``present`` for each direction.
 
     Raises
     ------
     ValueError
-        For an unknown state, and if there is not one swept parameter left.
+        If the state is unknown, or not exactly one swept parameter is left.
     """
     measure = labels.state_measure(attractors, state, degrees)
     parameter = swept_parameter(attractors, at, "attractors")
@@ -89,7 +90,7 @@ def plot_coexisting(
 
 
 def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> xr.Dataset:
-    """Values to draw, with what decides their look."""
+    """Return the values to draw, with the variables that set their look."""
     values = part["attractor_points"].sel(state=measure.name, drop=True)
     values = values.transpose(parameter, "attractor", "point")
     shown = values.copy(data=measure.shown(values.values, wrap=True))
@@ -118,7 +119,7 @@ def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> xr.Dat
 
 
 def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[float, float]]:
-    """Limits of the loops at the chosen values of the other parameters: half a step beyond their points."""
+    """Return the limits of the loops at the chosen other parameters, widened by half a step."""
     axis = part[parameter].values.astype(np.float64)
     edges = style.edges(axis)
     here = np.ones(found.sizes["loop"], bool)
@@ -134,7 +135,7 @@ def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[fl
 
 
 def _spread(one: xr.Dataset, parameter: str, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position, value and index along the parameter of an attractor's points, where chosen."""
+    """Return position, value and parameter index of an attractor's chosen points."""
     values = one["value"].transpose(parameter, "point").values
     row, column = np.nonzero(np.isfinite(values) & chosen[:, None])
     return one[parameter].values[row].astype(np.float64), values[row, column], row
@@ -152,7 +153,7 @@ def _draw_weighted(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast
 
 
 def _draw_others(ax: Axes, data: xr.Dataset, parameter: str) -> None:
-    """Draw sets where they do not attract, in the grey of what they are."""
+    """Draw sets where they do not attract, in the grey of their stability."""
     for code, grey in palette.GREY_OF.items():
         chosen = (data["stability"].values == code)[..., None] & np.isfinite(data["value"].values)
         row, *_ = np.nonzero(chosen)
@@ -169,12 +170,12 @@ def _word(stability: int) -> str:
 
 
 def _diameter(share: Any) -> Any:
-    """Diameter of a point [pt]: its area grows with the basin fraction that falls to it."""
+    """Return the diameter of a point [pt]: its area grows with its share of the basin fraction."""
     return np.sqrt(_LEAST_PT**2 + _GROWTH_PT**2 * np.asarray(share))
 
 
 def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast) -> None:
-    """Draw large light points below small dark ones, so that both are seen where they coincide."""
+    """Draw large light points below small dark ones, so that both show where they coincide."""
     number = int(one["attractor"])
     for word in one["direction"].values[::-1]:
         chosen = (one["present"].sel(direction=word).values > 0) & (one["stability"].values == ATTRACTS)
@@ -207,7 +208,7 @@ def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> l
 
 
 def draw(run: Run, options: CoexistingOptions) -> style.DataFigure:
-    """Draw the figure ``attractors`` of a run, with its hysteresis if it was walked up and down."""
+    """Draw the figure ``attractors`` of a run, with its hysteresis if it was continued in both directions."""
     at, notes = values_of(run, options)
     found = attractors_of(run, options)
     both = "direction" in found.coords and {"up", "down"} == set(

@@ -1,4 +1,4 @@
-"""Convergence of Lyapunov exponents: few cells as lines, many as bands."""
+"""Draw the convergence of Lyapunov exponents: few cells as lines, many as bands."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def plot_convergence(
     ds
         Cube with the product ``lyapunov``, as `pipeline.open_run` gives it.
     exponent
-        Which one, 1 the largest.
+        Rank of the exponent; 1 is the largest.
     per
         ``s``: per unit time [1/s]; ``period``: per drive period or return.
     at
@@ -61,11 +61,12 @@ def plot_convergence(
     Returns
     -------
     DataFigure
-        Above, the mean up to each block, a line per cell in the colour of its motion, or of more than
-        `MOST_LINES` cells bands that hold half and nine tenths of them, with the median; on the right the
-        stored exponents, the largest first, with their standard errors (open: flagged), and bands of one
-        standard error about the mean of each kind of motion. Below, the growth rate in each block: there
-        chaos that ends shows as a step. Its `data` hold ``running``, ``in_block``, ``exponent_value``,
+        Above: the mean up to each block, one line per cell in the colour of its motion. For more than
+        `MOST_LINES` cells: the median, and bands that hold half and nine tenths of the cells. On the right:
+        the stored exponents, largest first, with their
+        standard errors (open markers: flagged), and a band of one
+        standard error about the mean of each class of motion. Below: the growth rate in each block, where the
+        end of transient chaos shows as a step. Its `data` hold ``running``, ``in_block``, ``exponent_value``,
         ``exponent_stderr``, ``motion``.
 
     Raises
@@ -97,7 +98,7 @@ def plot_convergence(
 
 
 def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float] | None) -> xr.Dataset:
-    """What is drawn, with the dims `cell` and `period`."""
+    """Return the data to draw, with the dims `cell` and `period`."""
     part = select_points(ds, at, purpose="convergence is drawn at one parameter point")
     dims, starts = split_dims(part["status"])
     summary = summarise(part)
@@ -134,7 +135,7 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
 
 
 def _own(data: xr.Dataset, kind: Motion) -> np.ndarray:
-    """Cells of a kind of motion, by index."""
+    """Return the indices of the cells of one class of motion."""
     return np.flatnonzero((data["motion"].values == kind) & np.isfinite(data["exponent_value"].values))
 
 
@@ -170,7 +171,7 @@ def _draw_running(ax: Axes, final: Axes, data: xr.Dataset) -> list[Any]:
 
 
 def _draw_final(final: Axes, data: xr.Dataset, own: np.ndarray, rank: np.ndarray, colour: str) -> None:
-    """Draw stored exponents with errors by their rank; without errors where there are many."""
+    """Draw stored exponents with errors by their rank; omit the errors where there are many cells."""
     value, error = data["exponent_value"].values, data["exponent_stderr"].values
     flagged = data["lyapunov_flag"].values[own] > GOOD
     many = data.sizes["cell"] > 4 * MOST_LINES
@@ -185,7 +186,7 @@ def _draw_final(final: Axes, data: xr.Dataset, own: np.ndarray, rank: np.ndarray
 
 
 def _draw_cells(ax: Axes, data: xr.Dataset, variable: str, kind: Motion, colour: str) -> None:
-    """Draw the cells of a kind of motion: lines, or bands of quantiles about the median."""
+    """Draw the cells of one class of motion: lines, or bands of quantiles about the median."""
     own = _own(data, kind)
     if not own.size:
         return

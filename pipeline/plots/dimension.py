@@ -1,4 +1,4 @@
-"""The correlation sum behind a correlation dimension."""
+"""Draw the correlation sum that a correlation dimension is fitted to."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     ----------
     ds
         Result of `pipeline.analysis.chaos.dimensions.correlation_dimension` for one set of points, or of
-        `pipeline.analysis.chaos.staying.section_dimension` for one parameter point: of its attractors the one
-        with the most cells among those that have a dimension.
+        `pipeline.analysis.chaos.staying.section_dimension` for one parameter point. In the latter
+        case the attractor with the most cells is drawn, among those with a dimension.
     frame
-        Width of the figure, range of the radius, and of the correlation sum.
+        Width of the figure; ranges of the radius and the correlation sum.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
 
 
 def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
-    """Take the attractor with the most cells, of those of which there is a correlation sum."""
+    """Select the attractor with the most cells, among those with a correlation sum."""
     if "attractor" not in ds["correlation_dimension"].dims:
         return ds
     others = [d for d in ds["n_points"].dims if d != "attractor"]
@@ -87,7 +87,7 @@ def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
 
 
 def _scales(ds: xr.Dataset) -> str:
-    """What counts as 1, such as ``1 for 1 rad, 10 rad/s``."""
+    """Return the unit lengths as text, for example ``1 for 1 rad, 10 rad/s``."""
     model = model_of(ds)
     units = {s.unit: s.scale for s in model.states}
     return "1 for " + ", ".join(
@@ -96,7 +96,7 @@ def _scales(ds: xr.Dataset) -> str:
 
 
 def _draw_fit(top: Axes, bottom: Axes, data: xr.Dataset) -> None:
-    """Draw the fitted line and the radii that it was fitted to."""
+    """Draw the fitted line and the range of radii used in the fit."""
     fit = tuple(float(data[name]) for name in ("fit_low", "fit_high"))
     if not np.isfinite(fit).all():
         return
@@ -115,7 +115,7 @@ def _draw_fit(top: Axes, bottom: Axes, data: xr.Dataset) -> None:
 
 
 def _correlation(ds: xr.Dataset) -> xr.Dataset:
-    """What is drawn: radii with pairs, the share of pairs, the slope between neighbouring radii."""
+    """Return the data to draw: radii with pairs, the share of pairs, the slope between neighbouring radii."""
     dims = [str(d) for d in ds["correlation_dimension"].dims]
     one = ds.isel(dict.fromkeys(dims, 0))
     x, y = one["log_radius"].values, one["log_correlation_sum"].values

@@ -1,8 +1,8 @@
-"""From a run and the options of a figure to the figure: what every ``draw`` needs, and `draw_figure`.
+"""Draw a figure of a run: `draw_figure`, and the helpers that every ``draw`` function needs.
 
 Each figure of `pipeline.products.registry` names a function ``draw(run, options)`` of this package. It
 reads ``run.cube()`` and ``run.derive(name, **options)``, and hands numbers to a ``plot_...`` function,
-which knows nothing of runs. What was asked for, and where the numbers come from, is added here.
+which knows nothing about runs. This module adds the request and the provenance to the figure's data.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from pipeline.products.registry import FIGURES
 
 
 class Run(Protocol):
-    """What a figure uses of a run; see `pipeline.runs.derive.AnalysedRun`."""
+    """The parts of a run that figures use; see `pipeline.runs.derive.AnalysedRun`."""
 
     @property
     def info(self) -> Any:
-        """What ``run.json`` holds."""
+        """Return the content of ``run.json``."""
 
     @property
     def digest(self) -> str:
-        """Digest of the committed cells."""
+        """Return the digest of the committed cells."""
 
     @property
     def echo(self) -> Callable[[str], None]:
-        """Prints a line."""
+        """Return the function that prints a line."""
 
     def of(self, source: str) -> Run:
-        """Another run."""
+        """Open another run."""
 
     def cube(self, chunks: Any = None) -> xr.Dataset:
-        """Cells of the run."""
+        """Return the cells of the run."""
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Result of an analysis."""
+        """Return the result of an analysis."""
 
 
 def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
@@ -56,13 +56,13 @@ def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
     name
         One of `pipeline.products.registry.FIGURES`.
     options
-        Those of the figure.
+        The figure's options.
 
     Returns
     -------
     DataFigure
-        The attributes of its `data` say what was drawn of what: the figure and the options that are not
-        as by default, title and digest of the run, digest of the cells, model and parameters, versions,
+        The attributes of its `data` hold the provenance: the figure and its options that differ from the
+        defaults, title and digest of the run, digest of the cells, model and parameters, versions,
         host, date and commit as in ``run.json``.
 
     Raises
@@ -78,13 +78,13 @@ def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
 
 
 def request(name: str, options: Options) -> dict[str, Any]:
-    """Return what was asked for: the figure, and its options that are not as by default."""
+    """Return the request: the figure, and its options that differ from the defaults."""
     wanted = {key: value for key, value in options.changed().items() if key not in ("out", "format")}
     return {"figure": name, "options": wanted}
 
 
 def run_provenance(run: Run) -> dict[str, Any]:
-    """Return where the numbers of a run come from."""
+    """Return the provenance of a run's numbers."""
     info, attrs = run.info, run.cube().attrs
     found: dict[str, Any] = {
         "source": str(attrs.get("source", "magpend")), "run": info.title, "digest": info.digest,
@@ -94,18 +94,17 @@ def run_provenance(run: Run) -> dict[str, Any]:
 
 
 def frame_of(options: FigureOptions) -> Frame:
-    """Return the size and the ranges that are asked for."""
+    """Return the size and the ranges from the options."""
     return Frame(options.width, options.xlim, options.ylim)
 
 
 def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict[str, float], list[str]]:
-    """Return the values of axes that are drawn, and what to say where they are not those asked for.
+    """Return the axis values that are drawn, and notes where they differ from the request.
 
     Raises
     ------
     ValueError
-        If an axis is unknown, or does not have a value and ``nearest`` is not asked for: before anything
-        is computed.
+        If an axis is unknown, or lacks the value and ``nearest`` is not set. Raised before any computation.
     """
     given: Mapping[str, float] = options.at
     cube = run.cube()
@@ -127,13 +126,13 @@ def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict
 
 
 def noted(figure: DataFigure, notes: list[str]) -> DataFigure:
-    """Return a figure that says more to whoever asked for it."""
+    """Add notes to a figure, to be shown to the user."""
     figure.notes.extend(notes)
     return figure
 
 
 def attractors_of(run: Run, options: Options) -> xr.Dataset:
-    """Return the attractors of a run, found with those options that say how."""
+    """Return the attractors of a run, matched with the options that concern matching."""
     from pipeline.products.attractors import AttractorOptions
 
     return run.derive("attractors", **options.part(AttractorOptions))

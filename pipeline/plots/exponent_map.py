@@ -1,4 +1,4 @@
-"""Map of the largest Lyapunov exponent over two parameters."""
+"""Draw the map of the largest Lyapunov exponent over two parameters."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ def plot_lyapunov_map(
     Returns
     -------
     DataFigure
-        At each point the largest exponent that any of its cells has: chaos shows wherever one of
-        the coexisting attractors is chaotic. White is 0, and the same distance from it has the same
-        depth of colour on both sides. Grey where no cell has one; the line above says how many cells have
-        none, and why. Its `data` hold ``exponent_value`` and
+        Each point shows the largest exponent among its cells, so chaos shows wherever one of the
+        coexisting attractors is chaotic. White is 0; equal distances from 0 have the same depth of colour
+        on both sides. A point is grey where no cell has an exponent. The line above says how many cells
+        have none, and why. Its `data` hold ``exponent_value`` and
         ``chaotic_share``, the share of cells whose exponent is positive.
 
     Raises
     ------
     ValueError
-        If there are no exponents, if an option is unknown, or if not two parameters are left.
+        If there are no exponents, if an option is unknown, or if not exactly two parameters are left.
     """
     style.check_choice("unit (per)", per, UNITS)
     demand(ds)
@@ -103,7 +103,7 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
 
 
 def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
-    """Return a scale as far below 0 as above it, and which of its ends values exceed."""
+    """Return a colour scale symmetric about 0, and the ends that values exceed."""
     known = grid[np.isfinite(grid)]
     most = float(np.abs(known).max(initial=0.0))
     half = float(np.quantile(np.abs(known), _SHOWN)) if known.size else 1.0

@@ -1,4 +1,4 @@
-"""How figures become files: the picture, and beside it the data drawn, both with their provenance."""
+"""Write figures to files: the picture and the data drawn, both with their provenance."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
 
     The file holds no time stamp of its own and no random identifier: the same figure gives the same bytes
     with the same version of matplotlib. Texts of PDF and SVG stay texts; PDF embeds the fonts as outlines.
-    It is written only once it has been drawn completely.
+    The file is written only after the drawing is complete.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
 def save_data(fig: DataFigure, path: str | Path) -> Path:
     """Write the data of a figure as NetCDF beside it: the same path with the suffix ``.nc``.
 
-    What is empty is left out: a dim of length 0 is NetCDF's sign for one that may grow.
+    Empty variables are left out, because NetCDF reads a dim of length 0 as an unlimited one.
     """
     target = Path(path).with_suffix(".nc")
     empty = [name for name, variable in fig.data.variables.items() if variable.size == 0]
@@ -81,7 +81,7 @@ def save_data(fig: DataFigure, path: str | Path) -> Path:
 
 
 def with_provenance(ds: xr.Dataset, provenance: Mapping[str, Any]) -> xr.Dataset:
-    """Return a dataset whose attributes also say where it comes from; what is no text or number, as JSON."""
+    """Return a dataset with its provenance in the attributes; values other than text or numbers as JSON."""
     plain = {
         key: value if isinstance(value, str | int | float) else json.dumps(value, sort_keys=True)
         for key, value in provenance.items()
@@ -90,7 +90,7 @@ def with_provenance(ds: xr.Dataset, provenance: Mapping[str, Any]) -> xr.Dataset
 
 
 def _metadata(attrs: Mapping[Any, Any], suffix: str) -> dict[str, Any]:
-    """Metadata of a file in the words that its format has for them."""
+    """Return the metadata of a file under the keys that its format defines."""
     title, source = str(attrs.get("title", "")), str(attrs.get("source", "magpend"))
     rest = {k: v for k, v in attrs.items() if isinstance(v, str | int | float) and k not in ("title",)}
     about = "; ".join(f"{key}: {value}" for key, value in rest.items()).replace("\n", ", ")
@@ -104,10 +104,10 @@ def _metadata(attrs: Mapping[Any, Any], suffix: str) -> dict[str, Any]:
 
 
 def _save_vectors(fig: Figure, buffer: io.BytesIO, options: dict[str, Any]) -> None:
-    """Save with fonts as texts and with identifiers that do not change from run to run.
+    """Save with fonts as text and with reproducible identifiers.
 
-    matplotlib takes these from the shared settings alone; these few keys are set while the lock is held,
-    and all others are left as they are.
+    matplotlib reads these options from its shared settings only. The keys are set while the lock is held;
+    all others stay unchanged.
     """
     settings: Any = matplotlib.rcParams
     before = {key: settings[key] for key in _SETTINGS}

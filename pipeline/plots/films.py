@@ -1,4 +1,4 @@
-"""How films become files: GIF and WebP by Pillow, MP4 by ffmpeg where it is installed."""
+"""Write films to files: GIF and WebP by Pillow, MP4 by ffmpeg where it is installed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PALETTE_FRAMES, PALETTE_COLOURS = 8, 96
 
 
 def film_problems(path: Path, fps: float) -> list[str]:
-    """Return sentences for what would keep a film from being written there, before anything is drawn."""
+    """Return the reasons why a film cannot be written to a path, before anything is drawn."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         return [f"{path}: the suffix must be one of {', '.join(SUFFIXES)}."]
@@ -45,7 +45,7 @@ def film_problems(path: Path, fps: float) -> list[str]:
 def save_animation(film: Animation, path: str | Path) -> Path:
     """Write a film as GIF, WebP or MP4, by the suffix of the path.
 
-    GIF and WebP are repeated for ever. The file appears once it is whole; an existing one is replaced.
+    GIF and WebP loop for ever. The file appears only when it is complete; an existing file is replaced.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def save_animation(film: Animation, path: str | Path) -> Path:
     path = Path(path)
     if problems := film_problems(path, film.fps):
         raise ValueError(" ".join(problems))
-    part = temporary_beside(path).with_suffix(path.suffix)  # Pillow and ffmpeg go by the suffix
+    part = temporary_beside(path).with_suffix(path.suffix)  # both writers go by the suffix
     write = {".gif": _gif, ".webp": _webp, ".mp4": _mp4}[path.suffix.lower()]
     try:
         with writing(path):
@@ -81,7 +81,7 @@ def save_animation(film: Animation, path: str | Path) -> Path:
 
 
 def _about(film: Animation) -> str:
-    """What the file says of itself."""
+    """Return the file's metadata."""
     attrs = film.figure.data.attrs
     return "magpend; " + "; ".join(
         f"{k}: {v}" for k, v in attrs.items() if k in ("title", "source", "run", "cube_digest")
@@ -89,7 +89,7 @@ def _about(film: Animation) -> str:
 
 
 def durations(n: int, fps: float, grain_ms: int) -> list[int]:
-    """Milliseconds that each frame is shown, in whole grains, which add up as they should."""
+    """Return the duration of each frame [ms], in whole grains that add up to the film's length."""
     ends = np.round(np.arange(n + 1) * (1000.0 / fps / grain_ms)).astype(int)
     return [int(d) * grain_ms for d in np.diff(ends)]
 
@@ -107,15 +107,15 @@ def _gif(film: Animation, path: Path) -> None:
 
 
 def _palette(film: Animation) -> Image.Image:
-    """Colours that serve all frames: those of some of them, since a palette each would flicker."""
+    """Return one palette for all frames, from a sample of them; a palette per frame would flicker."""
     chosen = np.unique(np.linspace(0, film.n_frames - 1, PALETTE_FRAMES).astype(int))
     frames = np.vstack([f for k, f in enumerate(_until(film, int(chosen[-1]))) if k in chosen])
     inked = frames[(frames != 255).any(axis=-1)]
-    # paper stays white: among all pixels its colour would be a mean of it and of what is nearly white
+    # keep the background pure white: quantisation would average it with nearly white pixels
     found = Image.fromarray(inked[None]).quantize(PALETTE_COLOURS - 1, Image.Quantize.MEDIANCUT)
     palette = Image.new("P", (1, 1))
     colours = np.array((found.getpalette() or [])[: 3 * (PALETTE_COLOURS - 1)]).reshape(-1, 3)
-    # nor may one be so near to white that the search, which is rough, takes it for the nearest
+    # no palette colour may be so near to white that the rough search picks it for white
     kept = colours[(colours < 248).any(axis=1)]
     palette.putpalette([255, 255, 255, *kept.ravel().tolist()])
     return palette
@@ -153,7 +153,7 @@ def _mp4(film: Animation, path: Path) -> None:
         for frame in frames:
             process.stdin.write(frame.tobytes())
     except BrokenPipeError:
-        pass  # it has ended, and says why
+        pass  # ffmpeg has ended; its message follows
     _, said = process.communicate()
     if process.returncode:
         raise OSError(f"ffmpeg could not write {path.name}: {said.decode(errors='replace').strip()[-300:]}")

@@ -1,4 +1,4 @@
-"""Basin fractions over the swept parameter, as bands."""
+"""Draw basin fractions over the swept parameter, as bands."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def plot_fractions(
     attractors
         Result of `pipeline.analysis.attractors.attractors.match` for a sweep over one parameter or more.
     at
-        Values of the other swept parameters, such as ``{"q": 1.5}``.
+        Values of the other swept parameters, for example ``{"q": 1.5}``.
     frame
         Width of the figure and ranges of its axes.
 
@@ -43,17 +43,17 @@ def plot_fractions(
     -------
     DataFigure
         Bands are stacked, the largest at the bottom; cells without an attractor are grey, at
-        the top. Each value of the parameter is a column, for between two of them nothing is known. Its
+        the top. Each parameter value is a column, because nothing is known between two values. Its
         `data` hold ``fraction`` and the number of cells, ``n_cells``; of a sweep also ``low`` and ``high``,
         the 95 % Wilson interval of each fraction, as if the starts were drawn independently. The widest
-        stands above, and thin bars, `MOST_BARS` at most, show it for what lies below the edge of a band.
-        What the cells in grey may change is not in them. The branches of a continuation are no sample of
-        initial states: their shares have no intervals.
+        interval is written above. Thin bars, `MOST_BARS` at most, show the interval of the summed bands below
+        an edge. The intervals do not cover the uncertainty from grey cells. The branches of a continuation
+        are no sample of initial states, so their shares have no intervals.
 
     Raises
     ------
     ValueError
-        If there is not one swept parameter left.
+        If not exactly one swept parameter is left.
     """
     parameter = swept_parameter(attractors, at, "fractions")
     keep = (parameter, *start_dims(attractors))
@@ -94,7 +94,7 @@ def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what
 
 
 def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Dataset:
-    """Share of each attractor and of each kind of cell without one, per value of the parameter."""
+    """Return the share of each attractor and of each kind of grey cell, per parameter value."""
     n = part.sizes[parameter]
     ids = outcomes(part).transpose(parameter, ...).values.reshape(n, -1)
     kinds, others = list(palette.GREYS), palette.other_cells(part)
@@ -134,7 +134,7 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
 
 
 def _about(data: xr.Dataset) -> str:
-    """How many cells there are, and how well they tell the fractions."""
+    """Describe the number of cells and the width of the intervals."""
     n = int(data["n_cells"].max())
     if "low" not in data:
         return f"{n} branches each"
@@ -145,7 +145,7 @@ def _about(data: xr.Dataset) -> str:
 
 @dataclass(frozen=True)
 class _Band:
-    """A band: its name, colour, height at each value of the parameter, and id, -1 for none."""
+    """A band: its name, colour, height at each parameter value, and id (-1 for none)."""
 
     name: str
     colour: str
@@ -154,7 +154,7 @@ class _Band:
 
 
 def _bands(data: xr.Dataset, cast: palette.Cast) -> list[_Band]:
-    """Bands from below: attractors by falling share, the others, cells without an attractor."""
+    """Return bands from below: attractors by falling share, the others, cells without an attractor."""
     share = data["fraction"].values
     n = len(cast.names)
     total = share[:, :n].sum(axis=0)
@@ -193,7 +193,7 @@ def _write_letters(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_
 
 
 def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) -> None:
-    """Draw the interval of what lies below each edge between bands, side by side in a column."""
+    """Draw the interval of the summed share below each band edge, side by side in a column."""
     limits = style.edges(data[parameter].values.astype(np.float64))
     n = data["n_cells"].values
     floor = np.zeros(n.size)
@@ -215,7 +215,7 @@ def _raster(
     xlim: tuple[float, float],
     ylim: tuple[float, float],
 ) -> np.ndarray:
-    """Code of the band at each place of the axes, 300 x 300 from below; -1 for none."""
+    """Return the band's code at each raster point, 300 x 300 from below; -1 for none."""
     place = (np.arange(300) + 0.5) / 300
     x, y = (low + place * (high - low) for low, high in (xlim, ylim))
     column = np.clip(np.searchsorted(edges, x) - 1, 0, heights.shape[1] - 1)

@@ -1,4 +1,4 @@
-"""Gallery of attractors: phase portraits of each, and the path of a point of the model's drawing."""
+"""Draw the gallery of attractors: phase portraits of each, and the path of a point of the model's drawing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plot_gallery(
     attractors
         Result of `pipeline.analysis.attractors.attractors.match`; gives colours and names.
     portraits
-        Result of `pipeline.analysis.attractors.portraits.portraits` for a parameter point of it.
+        Result of `pipeline.analysis.attractors.portraits.portraits` for one of its parameter points.
     degrees
         Degrees instead of radians.
     frame
@@ -50,8 +50,8 @@ def plot_gallery(
         Lines are the motion, dots its section. The portrait of an angle that turns over is
         drawn on the circle, from -pi to pi. The `MAX_ROWS` attractors with the largest share are
         drawn, in the order of their ids; where there are fewer, also sets that do not attract, in grey. The
-        head says which cells end elsewhere and why. A single panel makes a figure of `LONE_MM` at most. Its
-        `data` are the portraits of these.
+        heading counts the cells that end elsewhere, with the reason. A figure with a single panel is at most
+        `LONE_MM` wide. Its `data` are the portraits drawn.
 
     Raises
     ------
@@ -85,10 +85,10 @@ def plot_gallery(
 
 @dataclass(frozen=True)
 class _Layout:
-    """Places of the panels [in]: so many attractors beside one another, each with so many panels.
+    """Panel places [in] for a number of attractors side by side, each with its panels.
 
-    The last panel of each is a path if the model has a `drawing`. Above all stand `lines` of text and a
-    legend.
+    The last panel of each attractor is a path if the model has a `drawing`. Above all panels stand
+    `lines` lines of text and a legend.
     """
 
     frame: style.Frame
@@ -127,7 +127,7 @@ class _Layout:
         return _LINE_IN * (self.lines + 1) + 0.08 + self.rows * self.row
 
     def axes(self, fig: style.DataFigure, k: int, column: int) -> Axes:
-        """Axes of a panel of the k-th attractor."""
+        """Make the axes of one panel of the k-th attractor."""
         width, height = self.panel
         x = self.left + ((k % self.beside) * self.each + column) * self.pitch
         if self.drawing and column == self.each - 1:
@@ -141,7 +141,7 @@ class _Layout:
 
 
 def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
-    """The attractors at the portraits' point."""
+    """Select the attractors at the portraits' parameter point."""
     at = {
         d: float(portraits[d]) for d in attractors["kind"].dims if d in portraits.coords and d != "attractor"
     }
@@ -149,7 +149,7 @@ def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
 
 
 def _title(one: xr.Dataset, cast: palette.Cast, layout: _Layout) -> str:
-    """Name and share of an attractor, in the lines that its panels have room for."""
+    """Return name and share of an attractor, broken into as many lines as there is room for."""
     attracts = int(one["stability"]) == ATTRACTS
     share = f", share {palette.percent(float(one['share']))}" if attracts else ""
     room, size = layout.each * layout.pitch - layout.left, style.look_at(layout.frame).legend
@@ -187,13 +187,13 @@ def _draw_one(
 
 
 def _parameters(one: xr.Dataset) -> dict[str, float]:
-    """Values of the parameters at the point of a portrait."""
+    """Return the parameter values at the point of a portrait."""
     values = parameters_of(one).as_dict()
     return {name: float(one[name]) if name in one.coords else value for name, value in values.items()}
 
 
 def _told(data: xr.Dataset, portraits: xr.Dataset, here: xr.Dataset) -> str:
-    """The parameter point, and what of it is not drawn and why."""
+    """Describe the parameter point, and the attractors that are not drawn, with the reason."""
     text = labels.caption(portraits.assign_attrs(data.attrs), with_start=False)
     if (rest := portraits.sizes["attractor"] - data.sizes["attractor"]) > 0:
         share = palette.percent(float(portraits["share"].sum() - data["share"].sum()))

@@ -1,6 +1,6 @@
-"""What the axes and captions of figures say: symbols and units of states, parameters, fixed values.
+"""Build axis labels and captions: symbols and units of states, parameters and fixed values.
 
-All of it comes from the model and from the coordinates of what is drawn; no name is known here.
+Names, symbols and units come from the model and from the dataset's coordinates; none is hard-coded here.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PI_STEPS = tuple(0.125 * 2**k for k in range(24))
 
 @dataclass(frozen=True)
 class Measure:
-    """How a state or a quantity is drawn.
+    """A drawn state or quantity: its symbol, its unit, and the factor to that unit.
 
     Attributes
     ----------
@@ -36,11 +36,11 @@ class Measure:
     symbol : str
         For an axis: between dollar signs, or the plain name.
     unit : str
-        In which it is drawn.
+        Unit on the axis.
     factor : float
-        From the stored unit to that.
+        Factor from the stored unit to the unit on the axis.
     on_circle : bool
-        Whether full turns of it do not matter.
+        Whether values that differ by full turns are the same.
     """
 
     name: str
@@ -51,32 +51,32 @@ class Measure:
 
     @property
     def label(self) -> str:
-        """Symbol and unit for an axis."""
+        """Return symbol and unit for an axis."""
         return with_unit(self.symbol, self.unit)
 
     @property
     def half_turn(self) -> float:
-        """Half a turn of an angle in the unit drawn."""
+        """Return half a turn in the unit drawn."""
         return math.pi * self.factor
 
     def shown(self, values: np.ndarray, *, wrap: bool = False) -> np.ndarray:
-        """Values in the unit drawn, angles brought to half a turn about 0 if asked for."""
+        """Convert values to the unit drawn; wrap angles to half a turn about 0 if `wrap` is set."""
         folded = wrapped(values) if wrap and self.on_circle else values
         return np.asarray(folded * self.factor if self.factor != 1.0 else folded)
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Name and unit of an axis; no unit for pure numbers."""
+    """Return name and unit of an axis; no unit for pure numbers."""
     return name if unit in ("", "1") else f"{name} [{raised(unit)}]"
 
 
 def raised(unit: str) -> str:
-    """Unit with its powers raised: m/s2 as m/s²."""
+    """Write the powers of a unit as superscripts: m/s2 as m/s²."""
     return re.sub(r"(?<=[A-Za-z])[23]", lambda power: {"2": "²", "3": "³"}[power[0]], unit)
 
 
 def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Measure:
-    """Say how a state of a dataset is drawn.
+    """Return the measure of a state of a dataset.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Mea
 
 
 def quantity_measure(ds: xr.Dataset, name: str, degrees: bool = False) -> Measure:
-    """Say how a quantity of the model, or a state, is drawn; raises ValueError if there is none."""
+    """Return the measure of a quantity or state of the model; raise ValueError if there is none."""
     model = model_of(ds)
     if name in model.state_names:
         return state_measure(ds, name, degrees)
@@ -120,7 +120,7 @@ def _measure(name: str, symbol: str, unit: str, degrees: bool, on_circle: bool) 
 
 
 def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
-    """Say how the initial values of a state are drawn; `degrees` count for angles alone."""
+    """Return the measure of a state's initial values; `degrees` counts for angles alone."""
     model = model_of(ds)
     one = model.state(dim.removesuffix("_0"))
     return _measure(
@@ -130,7 +130,7 @@ def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
 
 
 def some_angle(model: Model, degrees: bool, what: str) -> None:
-    """Refuse degrees where no state is an angle."""
+    """Raise ValueError if degrees are requested and no state is an angle."""
     if degrees and not any(s.unit.startswith("rad") for s in model.states):
         raise ValueError(f"{what} of {model.name} have no angle; draw them without degrees")
 
@@ -148,7 +148,7 @@ def on_circle(angle: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def angle_ticks(ax: Axes, measure: Measure, axis: str = "y", most: float | None = None) -> None:
-    """Put ticks of an angle's axis at round values: multiples of pi in wide ranges, of 15, 30 ... degrees."""
+    """Set round ticks on an angle's axis: multiples of pi in wide ranges, of 15, 30 ... degrees."""
     if not measure.on_circle:
         return
     low, high = ax.get_ylim() if axis == "y" else ax.get_xlim()
@@ -185,7 +185,7 @@ def pi_fraction(value: float, _position: int | None = None) -> str:
 
 
 def parameter_label(coordinate: xr.DataArray) -> str:
-    """Axis label of a parameter: what it is, and its unit."""
+    """Return the axis label of a parameter: its meaning and its unit."""
     name = str(coordinate.attrs.get("long_name", coordinate.name))
     if coordinate.name == "frequency":
         name = "drive frequency"
@@ -193,12 +193,12 @@ def parameter_label(coordinate: xr.DataArray) -> str:
 
 
 def swept_label(name: str, units: str) -> str:
-    """Axis label of what branches are followed along."""
+    """Return the axis label of the continuation parameter of branches."""
     return "drive frequency [Hz]" if name in ("frequency", "frequency_hz") else with_unit(name, units)
 
 
 def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True) -> str:
-    """Name the values at which everything drawn was taken: of parameters, then of the initial state.
+    """Name the fixed values of a figure: parameters first, then the initial state.
 
     Parameters
     ----------
@@ -241,5 +241,5 @@ def _assignment(symbol: str, value: float, unit: str) -> str:
 
 
 def shown_at(ds: xr.Dataset, dims: Iterable[str]) -> dict[str, Any]:
-    """Values of the parameter dims of one point, by name."""
+    """Return the values of the parameter dims of one point, by name."""
     return {d: float(ds[d].values.ravel()[0]) for d in dims if d in ds.coords}

@@ -1,4 +1,4 @@
-"""Lyapunov exponents under the bifurcation diagram; for the map over two parameters see `exponent_map`."""
+"""Draw Lyapunov exponents under the bifurcation diagram; for two parameters see `exponent_map`."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def plot_lyapunov(
 
 
 def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
-    """The diagram's absent cells, and those that have points but no exponent."""
+    """Return the diagram's absent cells, and the cells with points but no exponent."""
     found = diagram.survey
     value = data["exponent_value"].isel(exponent=0)
     others = [d for d in value.dims if d != diagram.parameter]
@@ -112,7 +112,7 @@ def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
 
 
 def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Survey) -> None:
-    """Draw the share of lost cells in a strip, and shade both panels where they show nothing."""
+    """Draw the share of lost cells in a strip, and shade both panels where all cells are lost."""
     style.style_axes(strip, minor=False)
     shade_blank(top, diagram.x, diagram.survey, diagram.layers)
     draw_absent(bottom, strip, diagram.x, lost, diagram.layers)
@@ -120,7 +120,7 @@ def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Sur
 
 
 def left_out(part: xr.Dataset) -> str:
-    """Say how many cells have no exponent, by what became of them; empty if all have one."""
+    """Count the cells without an exponent, by reason; empty if all have one."""
     status = part["status"]
     missing = part["lyapunov"].isel(exponent=0, drop=True).isnull().transpose(*status.dims)
     counts = {name: int((missing & status.isin(codes)).sum()) for name, codes in ABSENT.items()}
@@ -138,7 +138,7 @@ def demand(ds: xr.Dataset) -> None:
 
 
 def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
-    """Return what is drawn: exponents and errors in the unit asked for, flags and kinds of motion."""
+    """Return exponents and errors in the unit asked for, with flags and classes of motion."""
     scale = period_seconds(part) if per == "period" else xr.DataArray(1.0)
     chosen = part if spectrum else part.isel(exponent=slice(1))
     dims = chosen["lyapunov"].dims
@@ -154,14 +154,14 @@ def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
         data[name].attrs.update(
             units="1/s" if per == "s" else "1", per="unit time" if per == "s" else period_of(model_of(part))
         )
-    # words of objects are no NetCDF; the numbers of branches and starts say enough
+    # NetCDF cannot store object labels; the numbers of branches and starts suffice
     keep = {"exponent", *data["lyapunov_flag"].dims}
     keep |= {str(c) for c, v in data.coords.items() if not v.ndim and v.dtype.kind == "f"}
     return data.drop_vars([c for c in data.coords if c not in keep]).assign_attrs(title="Lyapunov exponents")
 
 
 def rate_unit(data: xr.Dataset) -> str:
-    """Unit of the exponents for an axis."""
+    """Return the unit of the exponents for an axis."""
     per = str(data["exponent_value"].attrs["per"])
     return "1/s" if per == "unit time" else f"1/{per.split()[-1]}"
 
@@ -198,7 +198,7 @@ def _draw_exponents(
 def _draw_class(
     ax: Axes, x: np.ndarray, value: np.ndarray, error: np.ndarray, flag: np.ndarray, colour: str, gid: str
 ) -> None:
-    """Points and the band of one colour; `value` and the others have shape (x, cell)."""
+    """Draw the points and the error band of one colour; the arrays have shape (x, cell)."""
     there = np.isfinite(value)
     if not there.any():
         return
@@ -223,7 +223,7 @@ def _draw_class(
 
 
 def _union(value: np.ndarray, error: np.ndarray) -> list[tuple[float, float]]:
-    """Intervals value +- error, those that overlap joined."""
+    """Return the intervals value +- error, with overlapping intervals joined."""
     joined: list[tuple[float, float]] = []
     for low, high in sorted(zip((value - error).tolist(), (value + error).tolist(), strict=True)):
         if joined and low <= joined[-1][1]:

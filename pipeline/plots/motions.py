@@ -1,4 +1,4 @@
-"""Colours of the kinds of motion that a model's classifier tells apart."""
+"""Assign colours to the classes of motion that a model's classifier distinguishes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PLAIN = "#1A3A5C"
 
 @dataclass(frozen=True)
 class Motions:
-    """The words for the motions of a dataset, and their colours, by code.
+    """The classes of motion of a dataset: labels and colours by code.
 
     Attributes
     ----------
@@ -44,12 +44,12 @@ class Motions:
 
     @property
     def told(self) -> bool:
-        """Whether motions are told apart."""
+        """Tell whether the model distinguishes classes of motion."""
         return len(self.words) > 1
 
 
 def motions_of(ds: xr.Dataset) -> Motions:
-    """Return the words and colours of the model of a dataset; one for all without a classifier."""
+    """Return labels and colours of a dataset's model; a single class without a classifier."""
     classifier = model_of(ds).classifier
     if classifier is None:
         return Motions(("motion",), (PLAIN,), (0,))
@@ -62,6 +62,6 @@ def motions_of(ds: xr.Dataset) -> Motions:
 
 
 def motion_codes(cells: xr.Dataset) -> xr.DataArray:
-    """Code of the motion of each cell of a cube's part, on the dims of ``status``."""
+    """Return the motion code of each cell of a part of the cube, on the dims of ``status``."""
     found = classify(cells)
     return xr.zeros_like(cells["status"], dtype=np.int8) if found is None else found

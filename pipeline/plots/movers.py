@@ -1,4 +1,4 @@
-"""What moves in an animation: points with their trails, links, the time; each sets its artists."""
+"""Build the moving parts of an animation: points with trails, links, the clock."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trail:
-    """Samples behind what moves: round the film's end where it repeats, else from the beginning on.
+    """The samples of a trail; in a repeating film it runs across the film's end.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Trail:
     repeats : bool
         Whether the film does.
     closed : int
-        Samples after which the motion has come back; 0 if it does not within the film.
+        Samples until the motion repeats; 0 if it does not repeat within the film.
     """
 
     n: int
@@ -56,7 +56,7 @@ class Trail:
         return cls(samples, min(length, samples), bool(one.attrs["repeats"]), min(closed, samples))
 
     def before(self, i: int) -> npt.NDArray[np.intp]:
-        """Samples from the trail's end to `i`."""
+        """Return the samples from the trail's end to `i`."""
         if self.repeats:
             return np.arange(i - self.length, i + 1) % self.n
         return np.arange(max(0, i - self.length), i + 1)
@@ -99,7 +99,7 @@ class Point:
 def _point(
     ax: Axes, path: Floats, colour: str, trail: Trail, *, jumps: float, size: float, thick: float
 ) -> Point:
-    """Make what shows a point that moves."""
+    """Make the artists of a moving point."""
     colours = np.empty((max(trail.length, 1), 4))
     colours[:, :3], colours[:, 3] = to_rgb(colour), np.linspace(0.0, 1.0, len(colours)) ** 1.5
     comet = LineCollection([], linewidths=thick, animated=True, capstyle="butt")
@@ -115,7 +115,7 @@ def _point(
 
 
 def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Trail, degrees: bool) -> Point:
-    """Draw what stays of a phase portrait, and return what moves in it."""
+    """Draw the fixed parts of a phase portrait, and return its moving parts."""
     style.style_axes(ax)
     model, colour = model_of(one), str(one["colour"].values)
     orbit = {name: one["orbit"].sel(state=name).values for name in model.state_names}
@@ -171,7 +171,7 @@ class Scene:
         return cls(drawing, np.nanmin(places, axis=0), np.nanmax(places, axis=0))
 
     def limit(self, ax: Axes) -> float:
-        """Set limits with one scale both ways that hold all; returns the width."""
+        """Set equal-scale limits that hold everything; return the width."""
         box = ax.get_window_extent()
         shape = np.array([box.width, box.height])
         scale = 1.22 * max(*((self.high - self.low) / shape), 1e-12)
@@ -183,7 +183,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Machine:
-    """A model's drawing: its lines and points, and the path of the one that it traces."""
+    """The moving parts of a model's drawing: lines, points, and the traced path."""
 
     lines: tuple[Any, ...]
     corners: tuple[Floats, ...]
@@ -201,7 +201,7 @@ class Machine:
 
 
 def moving_machine(ax: Axes, scene: Scene, one: xr.Dataset, trail: Trail, *, named: bool) -> Machine:
-    """Draw what stays of a model's drawing, in one of them with names and scale; return what moves in it."""
+    """Draw the fixed parts of a model's drawing, and return its moving parts."""
     drawing, colour = scene.drawing, str(one["colour"].values)
     ax.set_axis_off()
     width = scene.limit(ax)
@@ -234,7 +234,7 @@ def moving_machine(ax: Axes, scene: Scene, one: xr.Dataset, trail: Trail, *, nam
 
 
 def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
-    """Draw points that do not move, with or without their names beside them."""
+    """Draw the fixed points, with names beside them if `named` is set."""
     ends = {name for names in scene.drawing.lines for name in names}
     for name, place in still.items():
         held = name in ends
@@ -251,7 +251,7 @@ def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
 
 
 def _scale_bar(ax: Axes, width: float, unit: str) -> None:
-    """Draw a bar of a round length, since there are no axes."""
+    """Draw a scale bar of round length, since there are no axes."""
     power = 10.0 ** math.floor(math.log10(0.25 * width))
     length = max(f * power for f in (1.0, 2.0, 5.0) if f * power <= 0.25 * width)
     share = length / width
@@ -262,7 +262,7 @@ def _scale_bar(ax: Axes, width: float, unit: str) -> None:
 
 @dataclass(frozen=True)
 class Clock:
-    """Time, in periods of the drive if all motions have one and the same."""
+    """The time shown, in drive periods if all motions have the same period."""
 
     text: Any
     time: Floats
@@ -279,7 +279,7 @@ class Clock:
 
 
 def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> Clock:
-    """Write the speed, and return what shows the time."""
+    """Write the playback speed, and return the part that shows the time."""
     frequencies = ds["drive_frequency"].values
     forced = not model_of(ds).autonomous and np.ptp(frequencies) == 0.0
     width, height = fig.get_size_inches()
@@ -289,7 +289,7 @@ def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> Clock:
     speed = float(ds.attrs["speed"])
     told = "real time" if abs(speed - 1.0) < 5e-3 else f"{speed:.2g} \N{MULTIPLICATION SIGN} real time"
     drive = f"drive {float(frequencies[0]):.6g} Hz, " if forced else ""
-    # as much as there is room for beside the time
+    # as many entries as fit beside the time
     for words in (f"{drive}{told}", told):
         if 0.48 * size / 72.0 * len(words) <= width - 1.5:
             fig.text(1.0 - 0.1 / width, y, words, fontsize=size, color="0.35", va="bottom", ha="right")

@@ -1,4 +1,4 @@
-"""Floquet multipliers along a branch, and curves of bifurcations in the plane of two parameters."""
+"""Draw Floquet multipliers along a branch, and two-parameter bifurcation curves."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = st
     ds
         From `pipeline.analysis.branches`.
     branch
-        Which one.
+        Number of the branch.
     frame
         Width of the figure and ranges of its axes.
 
@@ -126,7 +126,7 @@ def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
 
 
 def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw curves of bifurcations in the plane of two parameters.
+    """Draw two-parameter bifurcation curves.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     Returns
     -------
     DataFigure
-        Colour for the kind, dashes for the period. Its `data` are the curves.
+        The colour shows the kind, the dashes show the period. Its `data` are the curves.
     """
     stored = ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object])
     fig = style.new_figure(4.4, stored.assign_attrs(title="curves of bifurcations"), frame)

@@ -1,6 +1,6 @@
-"""Colours, letters and names of attractors, the same in every figure of a run.
+"""Assign colours, letters and names to attractors, the same in every figure of a run.
 
-Twelve colours go to the attractors with most cells; the others share one more. They are those of Okabe
+The twelve attractors with the most cells have a colour each; the others share one more. They come from Okabe
 & Ito (https://jfly.uni-koeln.de/color/) and five chosen for their distance from them: any two, and any
 of them and the greys of cells without an attractor, differ by 11 or more in CIELAB to normal eyes and to
 those with protanopia, deuteranopia and tritanopia (simulated after Machado et al., IEEE Trans. Vis.
@@ -69,7 +69,7 @@ _FAILED = ("step limit", "step underflow", "unreached")
 
 
 def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
-    """Cells that do not end on an attractor by the names of `GREYS`, on parameter dims, then start dims."""
+    """Count the cells without an attractor by the names of `GREYS`, on parameter dims, then start dims."""
     found: dict[str, np.ndarray] = {}
     for name, which in outcomes.other_cells(part).items():
         own = "failed" if name in _FAILED else name
@@ -79,7 +79,7 @@ def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Cast:
-    """The sets of a dataset as figures show them.
+    """The colours and names of the sets of a dataset.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Cast:
 
 
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
-    """Give the sets of a dataset their colours and names.
+    """Assign colours and names to the sets of a dataset.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
 
 
 def _grey_of(stability: xr.DataArray) -> str:
-    """Grey of a set that attracts nowhere: that of what it is most often."""
+    """Return the grey of a set that attracts nowhere, by its most frequent stability."""
     codes = stability.values[np.isin(stability.values, list(GREY_OF))]
     return GREY_OF[int(np.bincount(codes).argmax())] if codes.size else OTHERS
 
@@ -128,7 +128,7 @@ def _grey_of(stability: xr.DataArray) -> str:
 def describe(one: xr.Dataset) -> str:
     """Describe a set: periods or kinds, motions, turns if it rotates, and its stability unless it attracts.
 
-    It is described where it is present.
+    Only points where the set is present count.
     """
     present = one["kind"].values.ravel() > 0
     if not present.any():
@@ -140,14 +140,14 @@ def describe(one: xr.Dataset) -> str:
 
 
 def _stability(one: xr.Dataset) -> str:
-    """What has been shown of a set that does not attract everywhere."""
+    """Describe the stability shown for a set that does not attract everywhere."""
     found = sorted({int(code) for code in one["stability"].values.ravel()} - {ABSENT, ATTRACTS})
     words = " or ".join(STABILITIES[code].replace("_", " ") for code in found)
     return f"{words} in parts" if words and (one["stability"].values == ATTRACTS).any() else words
 
 
 def _seconds(one: xr.Dataset) -> str:
-    """Range of a limit cycle's period in seconds; of a forced system nothing: the drive tells."""
+    """Return the range of a limit cycle's period [s] as text; empty for a forced system."""
     if not model_of(one).autonomous or "period_s" not in one:
         return ""
     known = one["period_s"].values[np.isfinite(one["period_s"].values)]
@@ -184,7 +184,7 @@ def _words(one: xr.Dataset, codes: np.ndarray) -> str:
 
 
 def _turns(one: xr.Dataset, present: np.ndarray) -> str:
-    """Mean turns per drive period or return, where the motion rotates at every point and always alike."""
+    """Return mean turns per period, if the motion rotates everywhere in the same way."""
     dim = model_of(one).angle_dim
     if "rotation" not in one or dim not in one["rotation"].dims:
         return ""
@@ -221,7 +221,7 @@ def new_panel(
     frame
         Width of the figure.
     height
-        Least height [in] at full width; it grows with the legend.
+        Minimum height [in] at full width; the figure grows with the legend.
     """
     look = style.look_at(frame)
     room = frame.width_in * (1.0 if frame.compact else 0.33) - 0.35

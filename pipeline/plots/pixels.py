@@ -1,4 +1,4 @@
-"""How many points are drawn: as markers while they are few, else counted on the pixels of an image.
+"""Draw points: few as markers, many counted on the pixels of an image.
 
 In an image a pixel takes the colour of the motion that has most points in it, and is the darker the more
 there are; all panels of a figure share one scale of darkness.
@@ -45,7 +45,7 @@ class Look:
 
 
 def looks(diameter: float, shown: Sequence[int]) -> dict[int, Look]:
-    """Small dark points over larger light ones, so that both layers are seen where they coincide."""
+    """Return the markers of the layers: small dark over large light, so that both stay visible."""
     if len(shown) < 2:
         return {i: Look(diameter) for i in shown}
     dark = max(diameter, 0.95)
@@ -54,7 +54,7 @@ def looks(diameter: float, shown: Sequence[int]) -> dict[int, Look]:
 
 @dataclass(frozen=True)
 class Panel:
-    """Axes, and the layers that they show."""
+    """Axes and the layers that they show."""
 
     ax: Axes
     layers: tuple[int, ...]
@@ -115,7 +115,7 @@ def _draw_markers(panel: Panel, points: Points, view: View, diameter: float, x: 
 
 
 def distinct(x: np.ndarray, y: np.ndarray, xlim: Range, ylim: Range) -> tuple[np.ndarray, np.ndarray]:
-    """Leave one of the points that no eye can tell apart.
+    """Drop points that would be drawn on the same spot as another.
 
     Many markers on one spot would darken their smoothed rims, and dots would become squares.
     """
@@ -195,7 +195,7 @@ def _draw_images(
 
 
 def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np.ndarray]]:
-    """Largest count within a dot around each pixel, by layer and motion."""
+    """Return the largest count within a dot around each pixel, by layer and motion."""
     return {
         i: {
             code: _dilate(grid, _disc(look.diameter / 72.0 * style.DPI * SUPERSAMPLING))
@@ -252,7 +252,7 @@ def _opacity(counts: np.ndarray, faintest: float, reference: float) -> np.ndarra
 
 
 def _disc(diameter: float) -> list[tuple[int, int]]:
-    """Offsets (row, column) of the pixels of a dot."""
+    """Return the pixel offsets (row, column) of a dot."""
     radius = max(0.5, 0.5 * diameter)
     reach = math.ceil(radius)
     around = range(-reach, reach + 1)
@@ -270,7 +270,7 @@ def _dilate(grid: np.ndarray, dot: Sequence[tuple[int, int]]) -> np.ndarray:
 
 
 def _pixel_table(counts: Counts, x: Range, y: Range, view: View) -> xr.Dataset:
-    """Centres of the pixels that hold points, and how many these hold."""
+    """Return the centres of the non-empty pixels, with their counts."""
     parts = []
     for (own_layer, code), grid in counts.items():
         rows, columns = np.nonzero(grid)

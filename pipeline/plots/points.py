@@ -1,4 +1,4 @@
-"""The points of a cube, read block by block, so that memory does not grow with the cube."""
+"""Read the points of a cube block by block, so that memory does not grow with the cube."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Points:
     """Index into the layers of the view."""
 
     def inside(self, x: Range | None, y: Range | None) -> Points:
-        """Points within ranges; None is no limit."""
+        """Select the points within ranges; None is no limit."""
         kept = np.ones(self.x.size, bool)
         for values, limits in ((self.x, x), (self.y, y)):
             if limits is not None:
@@ -58,7 +58,7 @@ broadcasts to it."""
 
 @dataclass(frozen=True)
 class View:
-    """What to draw of which cube.
+    """The variables, layers and colours drawn from a cube.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class View:
             yield part.isel(selection).load()
 
     def points(self, block: xr.Dataset) -> Points:
-        """Points of a loaded part that are there to be drawn."""
+        """Return the points of a loaded part that can be drawn."""
         x, y = self.coordinates(block)
         shape = (*block["status"].shape, max(x.shape[-1], y.shape[-1]))
         x, y = np.broadcast_to(x, shape), np.broadcast_to(y, shape)
@@ -105,13 +105,13 @@ class View:
             yield self.points(block)
 
     def kinds(self, block: xr.Dataset) -> xr.DataArray:
-        """Code of each cell's colour: of its attractor if that is marked, else of its motion."""
+        """Return the colour code of each cell: of its attractor if marked, else of its motion."""
         if "_kind" in block.coords:
             return block["_kind"] + xr.zeros_like(block["status"], dtype=np.int32)
         return motion_codes(block)
 
     def layer_index(self, block: xr.Dataset) -> xr.DataArray:
-        """Index of the layer of each cell."""
+        """Return the layer index of each cell."""
         zero = xr.zeros_like(block["status"], dtype=np.int8)
         if self.layers == ("",):
             return zero
@@ -120,7 +120,7 @@ class View:
 
 
 def make_view(ds: xr.Dataset, names: tuple[str, ...], coordinates: Coordinates) -> View:
-    """Make the view of a cube whose points `coordinates` takes from the variables `names`."""
+    """Make a view of a cube; `coordinates` computes the points from the variables `names`."""
     layers: tuple[str, ...] = ("",)
     if "branch" in ds["status"].dims and "direction" in ds.coords:
         present = {str(name) for name in ds["direction"].values}
@@ -131,7 +131,7 @@ def make_view(ds: xr.Dataset, names: tuple[str, ...], coordinates: Coordinates) 
 
 @dataclass
 class Survey:
-    """What the first reading finds out.
+    """The results of the first reading: ranges, classes, cell counts.
 
     Attributes
     ----------
@@ -153,11 +153,11 @@ class Survey:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no point to draw."""
+        """Tell whether there is no point to draw."""
         return not self.classes
 
     def add(self, points: Points, n_motions: int) -> None:
-        """Take points into account."""
+        """Include points in the survey."""
         if not points.x.size:
             return
         self.x = _joined(self.x, points.x)
@@ -171,7 +171,7 @@ def _joined(known: Range, values: np.ndarray) -> Range:
 
 
 def survey(view: View, *, along: str = "", xlim: Range | None = None, ylim: Range | None = None) -> Survey:
-    """Read the cube once: ranges of what is shown, classes that occur, cells that are absent.
+    """Read the cube once: ranges of the points, classes that occur, cells that are absent.
 
     Parameters
     ----------

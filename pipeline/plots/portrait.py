@@ -1,4 +1,4 @@
-"""Panels that show one motion: a phase portrait of two states, and the path of a point of the model."""
+"""Draw panels of one motion: a phase portrait of two states, and the path of a point of the model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _AIR = 1.16
 
 @dataclass(frozen=True)
 class Motion:
-    """One motion, to be drawn in several panels.
+    """One motion to draw in several panels.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ def _dress(ax: Axes, measures: list[Measure], turning: list[bool]) -> None:
 
 
 def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: Motion) -> list[str]:
-    """Draw the path of the point that a model's drawing traces, with what does not move.
+    """Draw the path of the point that a model's drawing traces, with the fixed points.
 
     Parameters
     ----------
@@ -144,13 +144,13 @@ def _marker(fixed: Mapping[str, np.ndarray], name: str) -> str:
 
 
 def fixed_handles(drawing: Drawing, parameters: Mapping[str, float], shown: Collection[str]) -> list[Any]:
-    """Handles of a legend for the fixed points that are shown."""
+    """Return legend handles for the fixed points shown."""
     fixed = drawing.fixed(parameters)
     return [style.dot(n, "0.2", 4.0, marker=_marker(fixed, n)) for n in fixed if n in shown]
 
 
 def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
-    """Fixed points that leave the path legible: the nearest within three times its size, others within it."""
+    """Select fixed points near enough not to shrink the path: the nearest up to three times its size."""
     if not place.size:
         return list(fixed)
     size = max(float(np.ptp(place, axis=0).max()), 1e-12)
@@ -161,7 +161,7 @@ def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
 
 
 def equalise(ax: Axes) -> None:
-    """Set limits that hold what is drawn and have one scale both ways; the axes have their final place."""
+    """Set limits that hold all artists at equal scale; call it when the axes have their final place."""
     points = np.concatenate([line.get_xydata() for line in ax.get_lines()])
     box = ax.get_window_extent()
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)

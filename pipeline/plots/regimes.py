@@ -1,4 +1,4 @@
-"""Map of regimes: which attractors, periods, or how many, over two swept parameters."""
+"""Draw regime maps: attractors, periods, or their number, over two swept parameters."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def plot_regimes(
     at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw what coexists at each point of two swept parameters.
+    """Draw the coexisting attractors or periods at each point of two swept parameters.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: sty
 def _draw_multiples(
     data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame, cast: palette.Cast
 ) -> style.DataFigure:
-    """Draw a map for each member of the regimes: where it is met, and by what share of the cells."""
+    """Draw one map per member of the regimes, shaded by its share of the cells."""
     most = len(palette.COLOURS)
     total = data["share_of"].sum([x, y]).values
     chosen = np.sort(np.argsort(-total, kind="stable")[:most])
@@ -183,7 +183,7 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 
 
 def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
-    """Regime of each point, the most frequent first."""
+    """Return the regime of each point; regimes are numbered by falling frequency."""
     present = part["stability"].transpose(y, x, "attractor").values == ATTRACTS
     periods = part["orbit_period"].transpose(y, x, "attractor").values
     values = np.empty(present.shape[:2], object)
@@ -215,7 +215,7 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
 def _members(
     present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str, y: str, show: str
 ) -> xr.Dataset:
-    """Share of the cells on each attractor, or on all attractors of each period."""
+    """Return the share of cells on each attractor, or on all attractors of each period."""
     if show == "attractors":
         kinds = np.broadcast_to(np.arange(present.shape[-1]), present.shape)
         names = {i: letter(i) for i in range(present.shape[-1])}
@@ -232,7 +232,7 @@ def _members(
 
 
 def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
-    """Share of each attractor, its interval, and the bound on what was not seen."""
+    """Return each attractor's share, its interval, and the bound on unseen basins."""
     dims = (y, x, "attractor")
     share = part["share"].transpose(*dims).values
     numbers: dict[str, Any] = {
@@ -270,7 +270,7 @@ def _label(present: np.ndarray, periods: np.ndarray, show: str) -> str:
 
 
 def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]:
-    """Colour of each regime, and the legend."""
+    """Return the colour of each regime, and the legend."""
     names = [str(v) for v in data["label"].values]
     if show == "number":
         ramp = matplotlib.colormaps["cividis"]

@@ -1,4 +1,4 @@
-"""Section: the points of one parameter point in the plane of two states, and its zooms."""
+"""Draw the section points of one parameter point in the plane of two states."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def plot_section(
 
 
 def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -> list[labels.Measure]:
-    """How the states to the right and upwards are drawn."""
+    """Return the measures of the horizontal and vertical states."""
     model = model_of(part)
     names = states or section_pair(model)
     for name in names:
@@ -101,7 +101,7 @@ def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -
 
 
 def section_pair(model: Model, first: str = "") -> tuple[str, str]:
-    """States to the right and upwards: if they can, two of a portrait that differ from section to section."""
+    """Return the horizontal and vertical states: if possible a portrait pair that varies between sections."""
     states = model.section_states
     pairs = [p for p in model.portraits if set(p) <= set(states) and p[0] == (first or p[0])]
     if pairs:
@@ -112,7 +112,7 @@ def section_pair(model: Model, first: str = "") -> tuple[str, str]:
 
 
 def _view(part: xr.Dataset, measures: list[labels.Measure], attractors: xr.Dataset | None) -> View:
-    """The points, in the colours of motions or of attractors; directions are not told apart."""
+    """Return the view, coloured by motion or attractor; directions share one layer."""
 
     def coordinates(block: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
         section = block["section"].transpose(*block["status"].dims, "period_index", "state")
@@ -153,7 +153,7 @@ def _handles(view: View, found: set[int]) -> list[Any]:
 
 
 def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
-    """Colour points by the attractor that their cell ends on; other cells have the grey of what they are."""
+    """Colour points by their cell's attractor; other cells have the grey of their status."""
     chosen = attractors
     for dim in split_dims(attractors["attractor_id"])[0]:
         chosen = chosen.sel({dim: float(part[dim])})

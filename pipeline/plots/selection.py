@@ -1,4 +1,4 @@
-"""Values of axes that a figure has no room for, on the axes of a cube."""
+"""Select values of the axes that a figure does not show."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Common look of the figures: sizes, fonts, colours, and the parts that most of them have.
+"""Set the common look of the figures: sizes, fonts, colours, shared parts.
 
 The look is set on each object, never through `matplotlib.rcParams`: these are shared by all threads.
 """
@@ -46,7 +46,7 @@ SKY, GREY = "#56B4E9", "#7F7F7F"
 
 @dataclass(frozen=True)
 class Frame:
-    """How large a figure is, and what part of its plane it shows.
+    """A figure's width and the ranges of its axes.
 
     Attributes
     ----------
@@ -62,12 +62,12 @@ class Frame:
 
     @property
     def compact(self) -> bool:
-        """Whether there is no room for a legend beside the axes."""
+        """Tell whether the figure is too narrow for a legend beside the axes."""
         return self.width < COMPACT_MM
 
     @property
     def width_in(self) -> float:
-        """Width [in]."""
+        """Return the width [in]."""
         return self.width * MM
 
 
@@ -76,7 +76,7 @@ WIDE = Frame()
 
 @dataclass(frozen=True)
 class Look:
-    """Sizes of letters [pt]."""
+    """The font sizes [pt] of a figure."""
 
     label: float
     tick: float
@@ -87,7 +87,7 @@ _LOOKS = {False: Look(10.0, 9.0, 9.0), True: Look(8.0, 7.0, 7.0)}
 
 
 class DataFigure(Figure):
-    """Figure that carries what it shows.
+    """A figure that carries the data it shows.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ def new_figure(
 
 
 def look_at(frame: Frame) -> Look:
-    """Sizes of letters of a figure of this width."""
+    """Return the font sizes for a figure of this width."""
     return _LOOKS[frame.compact]
 
 
@@ -148,12 +148,12 @@ def figure_of(ax: Axes) -> DataFigure:
 
 
 def look_of(ax: Axes) -> Look:
-    """Sizes of letters of the figure that the axes are in."""
+    """Return the font sizes of the figure that holds the axes."""
     return figure_of(ax).look
 
 
 def finish(figure: DataFigure) -> None:
-    """Give every text the common font, find the places of everything, and leave them there."""
+    """Set the common font on every text, compute the layout, and fix it."""
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_fontfamily(FONT)
@@ -198,7 +198,7 @@ def few_ticks(ax: Axes, x: int = 4, y: int = 4) -> None:
 
 
 def style_bar(figure: DataFigure, bar: Colorbar, text: str) -> None:
-    """Give a bar of colours the common lines and fonts, and its label."""
+    """Style a colour bar, and set its label."""
     bar.outline.set_linewidth(LINE_PT)
     bar.ax.tick_params(labelsize=figure.look.tick, width=LINE_PT, labelfontfamily=FONT)
     bar.set_label(text, fontsize=figure.look.label)
@@ -214,7 +214,7 @@ def label_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
 
 
 def caption(ax: Axes, text: str) -> None:
-    """Write a line above the axes, folded where the figure ends."""
+    """Write a line above the axes, wrapped at the figure's edge."""
     if text:
         look = look_of(ax)
         width = figure_of(ax).frame.width_in - 0.6
@@ -233,7 +233,7 @@ def folded(text: str, width: float, size: float, indent: str = "") -> str:
 
 
 def _width(text: str, size: float) -> float:
-    """Width of a text [in], roughly: 0.48 of the size a letter."""
+    """Estimate the width of a text [in]: 0.48 of the font size per letter."""
     plain = text.replace("$", "").replace("\\", "").replace("{", "").replace("}", "")
     return 0.48 * size / 72.0 * len(plain)
 
@@ -252,7 +252,7 @@ def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | No
 
 
 def complete(figure: DataFigure, ax: Axes, text: str, handles: Sequence[Any] = ()) -> None:
-    """Write the line above the axes and a legend above all, and `finish`."""
+    """Write the caption and a legend above the axes, and `finish`."""
     caption(ax, text)
     legend_above(figure, handles)
     finish(figure)
@@ -271,7 +271,7 @@ def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
 
 
 def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
-    """Most columns of a legend that fit into the figure's width; each is as wide as its widest text."""
+    """Return how many legend columns fit the figure's width; each is as wide as its widest text."""
     width = frame.width_in - 0.15
     for rows in range(1, len(texts)):
         n = math.ceil(len(texts) / rows)
@@ -282,7 +282,7 @@ def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
 
 
 def dot(label: str, colour: Any, size: float = 5.0, *, face: Any = None, marker: str = "o") -> Line2D:
-    """Handle of a legend for points."""
+    """Return a legend handle for points."""
     return Line2D(
         [], [], linestyle="none", marker=marker, markersize=size, markeredgewidth=0.6 if face else 0.0,
         color=colour, markerfacecolor=colour if face is None else face, label=label,
@@ -296,7 +296,7 @@ def tinted(colour: str, tint: float) -> tuple[float, float, float]:
 
 
 def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
-    """Refuse a value that is not among the allowed ones.
+    """Raise ValueError unless a value is among the allowed ones.
 
     Raises
     ------
@@ -313,7 +313,7 @@ def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
 def limits(
     ax: Axes, frame: Frame, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None
 ) -> None:
-    """Set the ranges of the axes: what was asked for, else what is given here, else as they are.
+    """Set axis ranges: from the frame, else the given ones, else unchanged.
 
     Raises
     ------
@@ -335,7 +335,7 @@ def check_range(name: Literal["xlim", "ylim"] | str, range_: tuple[float, float]
 
 
 def edges(x: np.ndarray) -> np.ndarray:
-    """Limits between neighbouring values of the parameter."""
+    """Return the limits between neighbouring parameter values."""
     if x.size == 1:
         width = 0.05 * abs(float(x[0])) or 0.5
         return np.array([x[0] - width, x[0] + width])
@@ -344,7 +344,7 @@ def edges(x: np.ndarray) -> np.ndarray:
 
 
 def span(x: np.ndarray) -> tuple[float, float]:
-    """Range that the columns of a parameter's values fill."""
+    """Return the range covered by the columns of the parameter values."""
     limits = edges(np.asarray(x, dtype=np.float64))
     return float(limits.min()), float(limits.max())
 
@@ -365,5 +365,5 @@ def fill_columns(
 
 
 def join(parts: Iterable[str]) -> str:
-    """Join what there is with commas."""
+    """Join the non-empty parts with commas."""
     return ", ".join(part for part in parts if part)

@@ -1,4 +1,4 @@
-"""Time series of one trajectory, its phase portraits, and the path of a point of the model."""
+"""Draw one trajectory: time series, phase portraits, and the path of a point of the model."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def plot_trajectory(
     if frame.xlim:
         axes[-1].set_xlim(*style.check_range("xlim", frame.xlim))
     if path is not None:
-        equalise(path)  # its ticks must be known when places are found
+        equalise(path)  # set the ticks before the layout is computed
     fig.align_ylabels(axes)
     style.complete(fig, axes[0], _place(ds), handles)
     if path is not None:
@@ -106,7 +106,7 @@ def _place(ds: xr.Dataset) -> str:
 
 
 def _grids(fig: style.DataFigure, n_rows: int, n_panels: int) -> tuple[list[SubplotSpec], list[SubplotSpec]]:
-    """Places of the series, and of the portraits: beside one another, or below in a narrow figure."""
+    """Return the layout grids of the series and of the portraits (beside them, or below if narrow)."""
     if not fig.frame.compact:
         outer = fig.add_gridspec(1, 2, width_ratios=[1.35, 1.0])
         left, right = outer[0].subgridspec(n_rows, 1), outer[1].subgridspec(n_panels, 1)
@@ -147,7 +147,7 @@ def _data(ds: xr.Dataset, series: dict[str, np.ndarray], drawing: Drawing | None
 
 
 def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
-    """Instants of the stroboscopic section within the time series [s]."""
+    """Return the times of the stroboscopic section within the time series [s]."""
     if "section_times" in ds:
         times = np.asarray(ds["section_times"].values, dtype=np.float64)
     elif "frequency_hz" in ds.attrs:
@@ -162,7 +162,7 @@ def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
 
 
 def _units(model: Model) -> list[tuple[str, ...]]:
-    """States that share a panel: those of one unit, angles and what else has it apart."""
+    """Group states by panel: one per unit, with angles apart."""
     kinds: dict[tuple[str, bool], tuple[str, ...]] = {}
     for s in model.states:
         key = (s.unit, s.on_circle) if s.unit != "1" else (s.name, False)
@@ -171,7 +171,7 @@ def _units(model: Model) -> list[tuple[str, ...]]:
 
 
 def _others(ds: xr.Dataset, model: Model) -> list[tuple[str, ...]]:
-    """Further variables, a panel for each unit: the first few of each of the first few units."""
+    """Group further variables by unit: the first few of each of the first few units."""
     found: dict[str, tuple[str, ...]] = {}
     for name, values in ds.data_vars.items():
         if values.dims == ("time",) and str(name) not in (*model.state_names, "section_times"):
@@ -185,7 +185,7 @@ def _colour(pair: int) -> str:
 
 
 def _colours(model: Model) -> dict[str, str]:
-    """Colour by state: that of the first portrait that it is in."""
+    """Return the colour of each state, by the first portrait that contains it."""
     found: dict[str, str] = {}
     for k, pair in enumerate(model.portraits):
         for name in pair:
@@ -220,7 +220,7 @@ def _draw_series(
 
 
 def _draw_others(ax: Axes, ds: xr.Dataset, time: np.ndarray, names: Sequence[str]) -> None:
-    """Draw variables that are no states, with a legend of their own if there are several."""
+    """Draw variables that are not states, with a legend if there are several."""
     quantities = {q.name: q.symbol for q in model_of(ds).quantities}
     symbols = [f"${quantities[n]}$" if quantities.get(n) else n.replace("_", " ") for n in names]
     for name, symbol, look in zip(names, symbols, ("0.15", style.ORANGE), strict=False):

@@ -1,4 +1,4 @@
-"""What the pendulum looks like: joints, links and magnets in the plane, from the upper joint [m]."""
+"""Draw the pendulum: joints, links and magnets in the plane, from the upper joint [m]."""
 
 from __future__ import annotations
 

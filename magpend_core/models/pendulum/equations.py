@@ -31,7 +31,7 @@ VACUUM_PERMEABILITY = 1.25663706212e-6  # N/A2, CODATA 2018
 
 
 class LinkConstants(NamedTuple):
-    """What the equations of motion, friction and drive use, derived from the parameters."""
+    """The constants of motion, friction and drive, derived from the parameters."""
 
     B1: Any  # kg m2, J1 + e1^2 m1 + l1^2 m2
     B2: Any  # kg m2, J2 + e2^2 m2
@@ -66,7 +66,7 @@ class LinkConstants(NamedTuple):
 
 
 class FittedConstants(NamedTuple):
-    """What the fitted magnet torque uses (Eq. 18-20)."""
+    """The constants of the fitted magnet torque (Eq. 18-20)."""
 
     half_alpha1: Any  # N m
     half_alpha2: Any
@@ -95,7 +95,7 @@ class FittedConstants(NamedTuple):
 
 
 class DipoleConstants(NamedTuple):
-    """What the point-dipole torque uses (Eq. 16)."""
+    """The constants of the point-dipole torque (Eq. 16)."""
 
     strength: Any  # N m2, mu_0 pole1 pole2/(4 pi)
     l1: Any  # m

@@ -13,7 +13,7 @@ from magpend_core.validation import check_states
 
 
 class Torques(NamedTuple):
-    """What acts on the pendulum at a state.
+    """The loads on the pendulum at a state.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ def accelerations(
 
 
 def torques(t: float | np.ndarray, state: np.ndarray, parameters: Parameters, frequency_hz: float) -> Torques:
-    """Bearing loads, friction, drive and magnet torques at given states.
+    """Return bearing loads, friction, drive and magnet torques at given states.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Models as text: states, parameters and equations as expressions, parsed by a whitelist, never evaluated."""
+"""Define models as text: expressions parsed by a whitelist, never evaluated as code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a text says of a model, once it has been read and holds together."""
+"""Hold the validated definition of a text model."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class Definition:
 
     @property
     def autonomous(self) -> bool:
-        """Whether neither the equations nor the impacts need time or frequency."""
+        """Tell whether neither the equations nor the impacts need time or frequency."""
         return not {"t", "f", "phase"} & set(self.used(self.dynamics))
 
     def remarks(self) -> list[str]:
@@ -155,7 +155,7 @@ class Definition:
 
 
 def _suggestion(name: str, table: str, used: Iterable[str]) -> str:
-    """What to do about a name that nothing uses."""
+    """Suggest a remedy for a name that nothing uses."""
     near = difflib.get_close_matches(name, sorted(used), n=1, cutoff=0.6)
     meant = f"did you mean it where an expression has {near[0]}? Else" if near else ""
     effect = " (to sweep it would change nothing)" if table == "parameters" else ""

@@ -1,4 +1,4 @@
-"""Derivatives of expressions, part by part: the chain rule on the graph.
+"""Differentiate expressions by the chain rule on the graph.
 
 Each part's derivative is made once, so that the Jacobian of equations that share parts is about as large as
 the equations times the number of states, however deep definitions stand in one another.

@@ -1,4 +1,4 @@
-"""From a definition to the expressions that the engine's functions compute."""
+"""Derive the expressions of the engine's functions from a definition."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Derived:
 
     @property
     def timed_layers(self) -> bool:
-        """Whether layers need the time."""
+        """Tell whether layers need the time."""
         nodes = [n for la in self.layers for n in (la.value, la.rate, la.half_width, la.per_strength)]
         return any(n.op == "time" for n in in_order(nodes))
 
@@ -145,7 +145,7 @@ def derive(definition: Definition) -> Derived:
 
 
 def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int, float]]) -> bool:
-    """Whether rates are not the same at the begin and at the end of a period, at a generic state."""
+    """Tell whether rates differ between begin and end of a period, at a generic state."""
     leaves = [n for n in in_order(rates) if n.op == "state"]
     states = {n.number: GENERIC[int(n.value) % len(GENERIC)] for n in leaves}
     time = graph.leaf("time").number

@@ -1,4 +1,4 @@
-"""Source of the engine's functions from derived expressions.
+"""Generate the source of the engine's functions from derived expressions.
 
 No name and no character of a model's text stands in it: states, parameters and constants are numbered.
 
@@ -66,7 +66,7 @@ class Writer:
         return wanted
 
     def name(self, node: Node) -> str:
-        """How a node is called."""
+        """Return the name of a node."""
         if node.number in self.leaves:
             return self.leaves[node.number]
         if node.op == "number":

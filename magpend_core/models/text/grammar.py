@@ -1,4 +1,4 @@
-"""Arithmetic as text: a parser with a whitelist, of its own, that evaluates nothing.
+"""Parse arithmetic as text with a whitelist, without evaluating it.
 
 Numbers, names, ``+ - * / **``, comparisons, ``and or not``, and calls of `FUNCTIONS`. There is nothing else:
 no attributes, no indices, no text, no assignment. Length, nesting, and what numbers may be are bounded, so
@@ -100,7 +100,7 @@ class Tree:
 
     @property
     def is_condition(self) -> bool:
-        """Whether it is true or false and not a number."""
+        """Tell whether the value is true or false and not a number."""
         return self.kind in ("compare", "and", "or", "not")
 
 
@@ -188,7 +188,7 @@ def names(tree: Tree) -> Iterator[tuple[str, int]]:
 
 
 def name_problem(name: object) -> str | None:
-    """What is wrong with a name that someone gives, or None."""
+    """Return the problem of a name given by the user, or None."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         return "must begin with a letter and go on with letters, digits and underscores"
     if len(name) > MAX_NAME:

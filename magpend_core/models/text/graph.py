@@ -48,7 +48,7 @@ class Node:
         self.op, self.args, self.value, self.kind, self.number = op, args, value, kind, number
 
     def is_number(self, value: float) -> bool:
-        """Whether it is this number."""
+        """Tell whether the node is this number."""
         return self.op == "number" and self.value == value
 
 

@@ -1,4 +1,4 @@
-"""Expressions as LaTeX, as they were written: nothing is multiplied out or put in another order."""
+"""Write expressions as LaTeX in their original form and order."""
 
 from __future__ import annotations
 

@@ -168,7 +168,7 @@ def _scale(leaf: Node, scales: tuple[float, ...]) -> float:
 
 
 def keeps_sign(graph: Graph, node: Node) -> bool:
-    """Whether a number cannot pass zero, as far as its form tells."""
+    """Tell whether a number cannot pass zero, judged by its form."""
     return _above_zero(graph, node.args[0] if node.op == "neg" else node)
 
 

@@ -1,4 +1,4 @@
-"""Models that are read from text."""
+"""Define the models that are read from text."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class TextModel(Model):
 
     @property
     def reference(self) -> str | Mapping[str, Any]:
-        """Its name if it ships, else its text."""
+        """Return the model's name if it ships, else its text."""
         return self.name if self.shipped else self.definition.table
 
     @cached_property
@@ -92,7 +92,7 @@ class TextModel(Model):
 
     @cached_property
     def system(self) -> System:
-        """What the engine integrates; imports the compiler."""
+        """Return the system for the engine; imports the compiler."""
         from magpend_core.models.text.compiled import system_of
 
         return system_of(self.definition, self.derived, self.source)

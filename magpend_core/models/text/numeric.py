@@ -1,4 +1,4 @@
-"""Expressions evaluated by numpy as they were written: no compiler, no derivation, no execution.
+"""Evaluate expressions by numpy as they were written: no compiler, no derivation.
 
 What opening and drawing a run need of a model; and what derived and compiled functions are checked against.
 """

@@ -1,4 +1,4 @@
-"""Reads the tables of a model: names and expressions are checked, all problems told at once.
+"""Read the tables of a model: check names and expressions, and report all problems at once.
 
 Needs nothing but numpy; takes milliseconds, whatever is given.
 """

@@ -109,7 +109,7 @@ def _while_sliding(graph: Graph, mode: Node, sliding: Node, else_: Node) -> Node
 
 
 def _speed(graph: Graph, value: Node, rates: Sequence[Node]) -> Node:
-    """Rate of an expression along the motion."""
+    """Return the rate of an expression along the motion."""
     seeds = {n: rates[int(n.value)] for n in in_order([value]) if n.op == "state"}
     (found,) = derivatives(graph, (value,), {**seeds, graph.leaf("time"): graph.one})
     return found

@@ -1,4 +1,4 @@
-"""Reads what a text says beside its equations: drawing, mirror, words for motions, presets."""
+"""Read a text's other tables: drawing, mirror, motion labels, presets."""
 
 from __future__ import annotations
 
