@@ -33,6 +33,7 @@ from llvmlite import ir
 from numba.core import cgutils
 from numba.core import ir as numba_ir
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, compile_result
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import FunctionPass, PassManager, register_pass
 from numba.core.ir_utils import build_definitions
 from numba.core.registry import CPUDispatcher
@@ -437,11 +438,12 @@ class PartDispatcher(CPUDispatcher):
 
     def compile(self, sig: Any) -> Any:
         """Compile for a signature, or take the code from the cache."""
-        _COMPILED_NOW.append(self)
-        try:
-            return super().compile(sig)
-        finally:
-            _COMPILED_NOW.pop()
+        with global_compiler_lock:
+            _COMPILED_NOW.append(self)
+            try:
+                return super().compile(sig)
+            finally:
+                _COMPILED_NOW.pop()
 
     def add_overload(self, cres: Any) -> None:
         """Take note of what was compiled, which Python cannot call."""
@@ -532,21 +534,30 @@ class PartCache:
             args = _OWNERS[callee]
             returns = callee.dispatcher.overloads[args].signature.return_type
             rows.append((paths[id(callee.dispatcher)], args, callee.symbol, returns))
-        return rows
+        # two functions of one content have one symbol; those of another system need not
+        return rows if len({row[2] for row in rows}) == len(rows) else None
 
     def _rebuilt(self, record: Any, target_context: Any) -> Any:
         code, fndesc, signature, callees = record
         library = PartLibrary(target_context.codegen(), fndesc.qualname)
         library.dispatcher = self._dispatcher
         module = llvm.parse_bitcode(code)
+        declared = []
         for path, args, symbol, returns in callees:
             callee = reached(self._dispatcher.py_func, path)
             callee.compile(args)
             compiled = callee.overloads[args]
             if compiled.signature.return_type != returns:
                 return None
-            module.get_function(symbol).name = compiled.library.symbol
             library.add_linking_library(compiled.library)
+            declared.append((module.get_function(symbol), compiled.library.symbol))
+        if len({symbol for _, symbol in declared}) < len(declared):
+            return None
+        # all lose their names before one takes another's
+        for function, _ in declared:
+            function.name = ""
+        for function, symbol in declared:
+            function.name = symbol
         library._final_module = module
         library.finalize()
         return compile_result(

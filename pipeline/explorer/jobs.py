@@ -48,11 +48,6 @@ class Job:
         """Let the job end at its next look."""
         self._cancelled.set()
 
-    @property
-    def is_cancelled(self) -> bool:
-        """Whether the job is no longer wanted."""
-        return self._cancelled.is_set()
-
     def check(self) -> None:
         """Raise `CancelledError` if the job is no longer wanted."""
         if self._cancelled.is_set():
