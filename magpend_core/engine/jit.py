@@ -37,7 +37,8 @@ from numba.core import event
 
 from magpend_core.engine.digests import PACKAGE, code_digest, functions_digest
 from magpend_core.engine.kept import PartFolder, keep
-from magpend_core.engine.parts import EntryCompiler, PartDispatcher, placeholder, placeholder_of_array
+from magpend_core.engine.linking import placeholder, placeholder_of_array
+from magpend_core.engine.parts import EntryCompiler, PartDispatcher
 
 # No fast math: which products are fused is said by `fused`, and wider flags would turn isnan(nan) into
 # False. The default error model would add a branch to every division.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from magpend_core.engine import jit, parts
+from magpend_core.engine import jit, linking
 from magpend_core.engine.jit import PARTS, bound_part, entry, inline
 from magpend_core.engine.simd import WIDTH, load, load_rows, store
 
@@ -109,7 +109,7 @@ def _in_a_constant(out):
 
 
 def test_size_in_a_constant__is_an_error_and_not_a_wrong_number(monkeypatch):
-    monkeypatch.setattr(parts, "_load_sizes", lambda *_: None)
+    monkeypatch.setattr(linking, "_load_sizes", lambda *_: None)
     part = bound_part(_in_a_constant, {"N": 3}, False)
     with pytest.raises(RuntimeError, match="has N in a constant"):
         njit(lambda out: part(out))(np.zeros(1))

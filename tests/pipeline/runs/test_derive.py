@@ -220,7 +220,7 @@ def test_derive__a_damaged_cube_is_no_result(whole, compute):
 
 def test_derive__an_error_leaves_nothing(whole, monkeypatch):
     register(monkeypatch, lambda run, options: xr.Dataset({"a": ("x", np.array([object()], dtype=object))}))
-    with pytest.raises(TypeError, match="a: objects other than words"):
+    with pytest.raises(TypeError, match="a: objects other than texts"):
         derive(whole.info.directory, "mean")
     assert not any((whole.info.directory / "derived").iterdir())
 

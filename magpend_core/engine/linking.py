@@ -1,0 +1,240 @@
+"""LLVM code of an engine's parts, and what links them: libraries of numba's with sizes that come late.
+
+A *size* of a system, such as the number of its states, is a constant without a value in the code of a part.
+While numba compiles the part, an integer that occurs nowhere else stands for it (`placeholder`). In the LLVM
+code that becomes a load from a constant with a name (`sizes_as_loads`). The engine's library defines the
+constants, and LLVM folds them as if the numbers had been written in the source.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import llvmlite.binding as llvm
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils
+
+from magpend_core.engine.fused import FusedLibrary, fuse_products
+
+_PLACEHOLDER = 0x6D61_6770_0000_0000
+"""Placeholders are integers from here on; no template contains numbers of this size."""
+_PLACEHOLDER_BYTES = "pgam" if sys.byteorder == "little" else "magp"
+"""What tells a placeholder among the bytes of an array."""
+_ARRAY = re.compile(r'(?m)^((@"\.const\.array\.data[^"]*") = internal constant \[8 x i8\] c"([^"]*)".*$)')
+_NAMES: dict[str, int] = {}
+_SYMBOL = "magpend.size."
+
+
+def placeholder(name: str) -> int:
+    """Return the integer that stands for a size of the system while a part is compiled."""
+    return _NAMES.setdefault(name, _PLACEHOLDER + len(_NAMES))
+
+
+class PartLibrary(FusedLibrary):
+    """LLVM code of one part: neither linked to what it calls, nor machine code."""
+
+    dispatcher: Any = None
+    symbol = ""
+    _whole: Any = None
+
+    @property
+    def codegen(self) -> Any:
+        """The code generator."""
+        return _NoMachineCode(self._codegen)
+
+    def add_ir_module(self, ir_module: Any) -> None:
+        """Add the LLVM code of the function."""
+        fuse_products(ir_module)
+        sizes_as_loads(ir_module)
+        text = _arrays_by_name(cgutils.normalize_ir_text(str(ir_module)))
+        _check_none_left(text)
+        module = llvm.parse_assembly(text)
+        module.name = ir_module.name
+        module.verify()
+        self.add_llvm_module(module)
+
+    def finalize(self) -> None:
+        """Take in what is no part, such as numba's ``max``; the engine's library links the rest."""
+        own = _defined(self._final_module)
+        for library in dict.fromkeys(self._linking_libraries):
+            # the other library that is no part counts references, of which there are none here
+            if not isinstance(library, PartLibrary) and library.name != "nrt":
+                self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        _hide_others(self._final_module, own)
+        self._linking_libraries = [x for x in self._linking_libraries if isinstance(x, PartLibrary)]
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return 0: there is no machine code."""
+        self._ensure_finalized()
+        return 0
+
+    def own_module(self) -> Any:
+        """Return the code of this part alone."""
+        return super()._get_module_for_linking()
+
+    def _get_module_for_linking(self) -> Any:
+        """Return the code with all that it needs, for a function that numba compiles in its own way."""
+        if self._whole is None:
+            self._whole = self.own_module().clone()
+            _link(self._whole, self)
+            _hide_others(self._whole, _defined(self._final_module))
+        return self._whole
+
+
+class _NoMachineCode:
+    """Stands for the code generator where numba would look for machine code."""
+
+    def __init__(self, codegen: Any) -> None:
+        self._codegen = codegen
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._codegen, name)
+
+    def set_env(self, env_name: str, env: Any) -> None:
+        """Do nothing: without machine code nothing can be told to an environment."""
+
+
+class EntryLibrary(FusedLibrary):
+    """Machine code of an engine: its entry, linked to all parts that it reaches."""
+
+    def finalize(self) -> None:
+        """Link the parts, give the sizes their values, optimise, and make machine code."""
+        own = _defined(self._final_module)
+        _link(self._final_module, self)
+        # Parts of two engines have the same names, and other contents. The JIT would take the first for both.
+        _hide_others(self._final_module, own)
+        self._linking_libraries = []
+        super().finalize()
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Leave it to the module's optimisation, which sees everything."""
+
+    def _optimize_final_module(self) -> None:
+        # Lanes are vectors already, and loops over states are short. numba's two rounds at level 3 with a
+        # search for vectors take three times as long, and gain nothing (`tests/bench/kernel.py`).
+        options = {"opt": 1, "loop_vectorize": False, "slp_vectorize": False}
+        passes, builder = self._codegen._module_pass_manager(**options)
+        passes.run(self._final_module, builder)
+
+
+def _defined(module: Any) -> set[str]:
+    return {function.name for function in module.functions if not function.is_declaration}
+
+
+def _hide_others(module: Any, own: set[str]) -> None:
+    """Make local to a module the functions that are not its own, and the sizes."""
+    for value in (*module.functions, *module.global_variables):
+        kind = value.is_function or value.name.startswith(_SYMBOL)
+        if kind and not value.is_declaration and value.name not in own:
+            value.linkage = "internal"
+
+
+def _link(module: Any, library: Any) -> None:
+    """Link to a module the libraries that one reaches, and the sizes that these are of."""
+    sizes: dict[str, Any] = dict(library.dispatcher.sizes) if isinstance(library, PartLibrary) else {}
+    for reached_one in _reached_libraries(library):
+        if isinstance(reached_one, PartLibrary):
+            _unite(sizes, reached_one.dispatcher.sizes)
+            module.link_in(reached_one.own_module(), preserve=True)
+        else:
+            module.link_in(reached_one._get_module_for_linking(), preserve=True)
+        library._reload_init.update(reached_one._reload_init)
+    if sizes:
+        module.link_in(llvm.parse_assembly(_definitions(sizes)))
+
+
+def _unite(sizes: dict[str, Any], others: Mapping[str, Any]) -> None:
+    for name, value in others.items():
+        if not np.array_equal(sizes.setdefault(name, value), value):
+            raise RuntimeError(f"parts of one engine disagree in {name}: {sizes[name]} and {value}.")
+
+
+def _reached_libraries(library: Any) -> Iterator[Any]:
+    """Yield the libraries that one links to, and those that its parts link to, each once."""
+    seen, waiting = {library}, list(library._linking_libraries)
+    while waiting:
+        found = waiting.pop(0)
+        if found not in seen:
+            seen.add(found)
+            yield found
+            if isinstance(found, PartLibrary):
+                waiting += found._linking_libraries
+
+
+def _definitions(sizes: Mapping[str, Any]) -> str:
+    """Return the sizes as LLVM's constants: integers, and arrays of float64 or int64 by their bits."""
+    lines = []
+    for name, value in sorted(sizes.items()):
+        if isinstance(value, int):
+            lines.append(f'@"{_SYMBOL}{name}" = constant i64 {value}')
+        else:
+            bits = ", ".join(f"i64 {x}" for x in np.array(value).view(np.int64))
+            lines.append(f'@"{_SYMBOL}{name}" = constant [{len(value)} x i64] [{bits}], align 8')
+    return "\n".join(lines)
+
+
+def placeholder_of_array(name: str, array: np.ndarray) -> np.ndarray:
+    """Return the array that stands for one of the system's, of float64 or int64."""
+    return np.array([placeholder(name)]).view(array.dtype)
+
+
+def sizes_as_loads(module: ir.Module) -> None:
+    """Replace placeholders in a module by loads from constants without a value."""
+    names = {value: name for name, value in _NAMES.items()}
+    for function in module.functions:
+        if function.blocks:
+            _load_sizes(module, function, names)
+
+
+def _arrays_by_name(text: str) -> str:
+    """Replace arrays that are placeholders by constants without a value, as `sizes_as_loads` does."""
+    names = {number: name for name, number in _NAMES.items()}
+    used: set[str] = set()
+    for definition, symbol, content in _ARRAY.findall(text):
+        raw = re.sub(r"\\(..)", lambda found: chr(int(found[1], 16)), content).encode("latin-1")
+        name = names.get(int.from_bytes(raw, sys.byteorder)) if len(raw) == 8 else None
+        if name is not None:
+            used.add(name)
+            text = text.replace(definition, "").replace(symbol, f'@"{_SYMBOL}{name}"')
+    declared = [f'@"{_SYMBOL}{name}" = external constant [8 x i8]\n' for name in sorted(used)]
+    return text + "".join(declared)
+
+
+def _check_none_left(text: str) -> None:
+    left = [name for name, number in _NAMES.items() if str(number) in text]
+    if left or _PLACEHOLDER_BYTES in text:
+        what = ", ".join(left) or "an array"
+        raise RuntimeError(f"a part of an engine has {what} in a constant: mend `sizes_as_loads`.")
+
+
+def _load_sizes(module: ir.Module, function: ir.Function, names: Mapping[int, str]) -> None:
+    loads: dict[str, Any] = {}
+
+    def load(constant: Any) -> Any:
+        name = names[constant.constant]
+        if name not in loads:
+            symbol = _SYMBOL + name
+            known = module.globals.get(symbol)
+            if known is None:
+                known = ir.GlobalVariable(module, ir.IntType(64), symbol)
+                known.global_constant = True
+            # at the function's begin, where it comes before each use
+            builder = ir.IRBuilder(function.entry_basic_block)
+            builder.position_at_start(function.entry_basic_block)
+            loads[name] = builder.load(known)
+        return loads[name]
+
+    for block in function.blocks:
+        for instruction in list(block.instructions):
+            for operand in {x for x in instruction.operands if _is_placeholder(x, names)}:
+                instruction.replace_usage(operand, load(operand))
+
+
+def _is_placeholder(value: Any, names: Mapping[int, str]) -> bool:
+    constant = getattr(value, "constant", None)
+    return isinstance(value, ir.Constant) and isinstance(constant, int) and constant in names
