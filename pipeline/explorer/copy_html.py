@@ -49,12 +49,6 @@ def folder_html(title: str, generator: str, list_sha256: str) -> str:
     return _page("folder", title, generator, "explorer-folder.js", "'self'", f' data-objects="{list_sha256}"')
 
 
-def inline_bytes(objects: Mapping[str, bytes]) -> int:
-    """Return the size of objects in a page [bytes]."""
-    frame = len(_DATA)
-    return sum(frame + len(name) + 4 * -(-len(content) // 3) for name, content in objects.items())
-
-
 def _page(
     mode: str, title: str, generator: str, script_name: str, connect: str, objects: str = "", data: str = ""
 ) -> str:

@@ -48,11 +48,6 @@ class Job:
         """Ask the job to end at its next check."""
         self._cancelled.set()
 
-    @property
-    def is_cancelled(self) -> bool:
-        """Tell whether the job is cancelled."""
-        return self._cancelled.is_set()
-
     def check(self) -> None:
         """Raise `CancelledError` if the job is cancelled."""
         if self._cancelled.is_set():

@@ -238,8 +238,3 @@ def _value(ds: xr.Dataset, coordinate: xr.DataArray, is_start: bool) -> str:
 
 def _assignment(symbol: str, value: float, unit: str) -> str:
     return f"{symbol} = {value:.6g}" + ("" if unit in ("", "1") else f"\u00a0{raised(unit)}")
-
-
-def shown_at(ds: xr.Dataset, dims: Iterable[str]) -> dict[str, Any]:
-    """Return the values of the parameter dims of one point, by name."""
-    return {d: float(ds[d].values.ravel()[0]) for d in dims if d in ds.coords}
